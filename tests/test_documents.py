@@ -34,6 +34,7 @@ from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.reports import report, view
 from torchgco.judging.certificate import CHORDS
 from torchgco.judging.judge import CLEARANCES
+from torchgco.native import store
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import EagerWarning
 
@@ -162,6 +163,14 @@ MANUAL = [page for page in PAGES if page.parent != ROOT / "benchmarks" / "result
 def test_every_file_that_is_named_exists(page: Path) -> None:
     for name in re.findall(r"`((?:torchgco|tests|conf|docs)/[\w./-]+)`", page.read_text()):
         assert "NAME" in name or name == "docs/api" or (ROOT / name).exists(), name
+
+
+def test_every_variable_of_the_environment_has_its_line() -> None:
+    text = (ROOT / "docs" / "environment.md").read_text()
+    sources = [path.read_text() for path in (ROOT / "torchgco").rglob("*.py")]
+    read = {name for source in sources for name in re.findall(r"\bTORCHGCO_[A-Z]+\b", source)}
+    assert read == set(re.findall(r"^\| `(TORCHGCO_\w+)`", text, re.MULTILINE)) and len(read) == 4
+    assert f"at most {store.FILES} files" in text and f"{store.KIN} files of each kind" in text
 
 
 def test_where_is_what_names_what_is_there() -> None:

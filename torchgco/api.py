@@ -85,6 +85,8 @@ def solve(
     solver = _solver(solver, problem, check_value(record, bool, "record"))
     if U0 is None:
         problem, U0 = _start(problem, warm, solver)
+    elif for_solvers(problem) is problem:
+        problem = current(problem)  # traced once, for the solve and for the warnings after it
     multipliers = None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
     if warm is None and (told := short_horizons(problem)) is not None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.files import read_arrays, write_whole
+from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import MISTAKES, check_device, check_shape
 from torchgco.base.status import Status
 from torchgco.base.tree import take
@@ -27,7 +28,7 @@ from torchgco.explaining.record import SearchRecord as SearchRecord
 from torchgco.explaining.record import Standing as Standing
 from torchgco.judging.judge import columns as judged
 from torchgco.judging.worst import worst_rows
-from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.lagrangian import Multipliers, shifted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -108,6 +109,28 @@ class Solution:
         """
         rows = index if isinstance(index, slice) else _places(index, len(self), self.cost.device)
         return take(replace(self, trace=None, search=None), rows)
+
+    def shifted(self, steps: int = 1) -> Solution:
+        """The guess for the same problems `steps` stages later, as `solve(problem, warm=solution.shifted())` takes it.
+
+        For a receding horizon: the new problem starts where this plan is after these stages, or near there, and counts
+        its knots from there. Every knot takes the state, control, feedback and multipliers of the one `steps` later,
+        those at the end the last ones. Rows at chosen knots, such as waypoints, keep theirs. Nothing is solved yet:
+        the status is RUNNING, cost and violation are NaN.
+
+        Raises:
+            InputError: `steps` isn't a number of stages, 1 or more.
+        """
+        check_value(steps, Count, "steps")
+        last, problem = self.horizon, None if self.account is None else self.account.problem
+        stage = None if last is None else last - 1
+        U, K, d = (shifted(part, steps, last=stage) for part in (self.U, self.K, self.d))
+        X, multipliers = shifted(self.X, steps, last=last), self.multipliers.shifted(steps, problem)
+        lost, none = torch.full_like(self.cost, torch.nan), torch.zeros_like(self.status)
+        return replace(
+            self, X=X, U=U, K=K, d=d, multipliers=multipliers, cost=lost, violation=lost, status=none, iterations=none,
+            outer_iterations=none, guided=none, trace=None, search=None,
+        )  # fmt: skip
 
     def __getitem__(self, index: Any) -> Solution:
         """As `take`; a single place gives a batch of one."""

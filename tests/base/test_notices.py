@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from torchgco.base import notices
+from torchgco.native import compiler
 from torchgco.native.compiler import find_compiler
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,6 +41,43 @@ def test_a_log_gets_the_line_and_no_bar(capsys) -> None:
 def test_a_terminal_shows_the_line_in_place_of_a_bar(shown) -> None:
     notices.notice("working")
     assert shown.getvalue() == f"{notices.CLEAR}torchgco: working\n"
+
+
+def test_something_brief_is_shown_to_those_who_watch(shown, capsys, monkeypatch) -> None:
+    notices.notice("working", brief=True)
+    assert "working" in shown.getvalue()
+    monkeypatch.undo()
+    notices.notice("working", brief=True)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("lines", "flags", "said"),
+    [
+        (100, (), None),
+        (1900, (), None),
+        (2600, (), "about 2 s"),
+        (2600, ("-O3", "-O1"), None),
+        (50_000, ("-O3",), "about 14 s"),
+        (50_000, ("-O1", "-g"), "about 7 s"),
+        (10**6, (), "about 23 minutes"),
+    ],
+)
+def test_a_log_says_how_long_the_compiler_takes_where_that_is_long(lines, flags, said, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(compiler, "_begun", {})
+    compiler._announce("\n" * lines, flags)
+    text = capsys.readouterr().err
+    assert (text == "") if said is None else f"compiling native kernels (once for this form of problem, {said})" in text
+
+
+def test_compilers_at_the_same_time_are_announced_once(capsys, monkeypatch) -> None:
+    running = SimpleNamespace(owner=os.getpid(), process=SimpleNamespace(poll=lambda: None))
+    monkeypatch.setattr(compiler, "_begun", {"key": running})
+    compiler._announce("\n" * 10_000, ())
+    assert capsys.readouterr().err == ""
+    running.process.poll = lambda: 0
+    compiler._announce("\n" * 10_000, ())
+    assert "compiling" in capsys.readouterr().err
 
 
 def test_a_notebook_shows_the_line(monkeypatch) -> None:

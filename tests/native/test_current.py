@@ -28,6 +28,7 @@ from torchgco import (
     judge,
 )
 from torchgco.base.shapes import lead
+from torchgco.native import engine
 from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.native.identity import signature
 
@@ -191,6 +192,19 @@ def test_kernels_are_those_of_the_same_computation_only() -> None:
     assert signature(boat()) is None
     boxed = Problem(planar.dynamics, planar.cost, [Boxes([[9.0, 9.0]], [[1.0, 1.0]])], planar.x0, N)
     assert signature(boxed) != signature(planar)
+
+
+@pytest.mark.parametrize("solver", ["gco", "gco_paper", "al_ilqr", "interior_point"])
+def test_a_solve_traces_a_model_once(monkeypatch, solver: str) -> None:
+    traced: list[Problem] = []
+    trace = engine.trace_model
+    monkeypatch.setattr(engine, "trace_model", lambda problem: traced.append(problem) or trace(problem))
+    far = torchgco.Spheres([[2.0, 0.4], [50.0, 50.0], [60.0, 50.0], [70.0, 50.0]], [0.3] * 4, 0.1)
+    problem = boat(constraints=[ControlBounds(-3, 3), far])
+    first = torchgco.solve(problem, solver=solver)
+    torchgco.solve(problem, solver=solver, warm=first)
+    torchgco.solve(problem, first.U, solver)
+    assert len(traced) == 3
 
 
 class Scalar(Cost):

@@ -52,6 +52,12 @@ def test_they_are_never_worse_and_find_cheaper_swings() -> None:
     assert bool((again.iterations > once.iterations).all())
 
 
+def test_nothing_is_solved_where_nothing_is_left(monkeypatch) -> None:
+    begun: list[int] = []
+    monkeypatch.setattr(Starts, "_solve", lambda self, search, rows: begun.append(len(rows)))
+    assert solved(SWINGS, Starts()).status.tolist() == [Status.CONVERGED] * 5 and not begun
+
+
 def test_more_starts_are_the_same_and_more() -> None:
     """Of n starts, the first are those of a pass with fewer."""
     problem = swing_up(0.0, -0.2, -1.2, N=60)

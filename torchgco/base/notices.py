@@ -22,12 +22,12 @@ def speak(yes: bool | None) -> None:
     _speaks = yes
 
 
-def notice(text: str) -> None:
-    """Show a line, or log it."""
+def notice(text: str, brief: bool = False) -> None:
+    """Show a line, or log it; on something `brief` it is shown only where somebody watches."""
     if LOG.isEnabledFor(logging.INFO):
         LOG.info(text)
         return
-    if _may_speak() and sys.stderr is not None:
+    if _may_speak() and sys.stderr is not None and (watched() or not brief):
         print(f"{CLEAR if _in_terminal() else ''}torchgco: {text}", file=sys.stderr, flush=True)
 
 

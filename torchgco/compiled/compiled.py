@@ -331,7 +331,7 @@ class Compiled:
         now = self._now() if problem is None else problem
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
         seconds = None if until == math.inf else max(1e-3, until - time.perf_counter())
-        warm = None if shift is None or self._last is None else _shifted(self._last, shift)
+        warm = None if shift is None or self._last is None else self._last.shifted(shift) if shift else self._last
         return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:
@@ -348,19 +348,6 @@ class Compiled:
         ended = status.numpy()
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
         return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began)
-
-
-def _shifted(last: Solution, by: int) -> Solution:
-    """The solution with everything `by` stages earlier, its last knots repeated."""
-    if by == 0:
-        return last
-
-    def moved(part: Tensor) -> Tensor:
-        K = part.shape[1]
-        return part[:, torch.arange(by, K + by).clamp(max=K - 1)] if K > 1 else part
-
-    multipliers = Multipliers(tuple(map(moved, last.multipliers.lam)), last.multipliers.mu)
-    return replace(last, X=moved(last.X), U=moved(last.U), multipliers=multipliers)
 
 
 def _renewed(part: Any) -> Any:

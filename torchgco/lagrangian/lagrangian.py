@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,7 @@ from torchgco.base.tree import Rows, take
 from torchgco.constraints.base import Sense
 from torchgco.lagrangian.expansion import quadratise
 from torchgco.lagrangian.penalties import Penalty
+from torchgco.problem.horizons import counted
 from torchgco.problem.problem import Problem
 
 
@@ -39,9 +41,22 @@ class Multipliers:
         """The multipliers and penalties of the same problems with their costs times `factor` (B,)."""
         return Multipliers(tuple(factor.view(-1, 1, 1) * lam for lam in self.lam), factor * self.mu)
 
-    def shifted(self) -> Multipliers:
-        """Those of the same problems one stage later: every knot takes the values of the next one."""
-        return Multipliers(tuple(shifted(lam) for lam in self.lam), self.mu)
+    def shifted(self, steps: int = 1, problem: Problem | None = None) -> Multipliers:
+        """Those of the same problems some stages later: every knot takes the values of a later one; see `shifted`.
+
+        Args:
+            problem: says at which knots the rows are, and the horizons; None: at knots that follow each other.
+        """
+        if problem is None:
+            return Multipliers(tuple(shifted(lam, steps) for lam in self.lam), self.mu)
+        all_knots, lam = torch.arange(problem.N + 1, device=problem.x0.device), []
+        for own, part in zip(self.lam, problem.constraints, strict=True):
+            knots = all_knots[part.knots]
+            last = None
+            if problem.horizon is not None:
+                last = counted(part, problem.horizon, problem.N).long().cumprod(-1).sum(-1) - 1
+            lam.append(shifted(own, steps, knots.tolist(), last))
+        return Multipliers(tuple(lam), self.mu)
 
     def check(self, problem: Problem) -> None:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
@@ -56,9 +71,28 @@ class Multipliers:
             check_tensor(part, "warm", problem.x0)
 
 
-def shifted(values: Tensor) -> Tensor:
-    """Values (B, K, ...) of knots one stage later; the last knot keeps its own."""
-    return torch.cat((values[:, 1:], values[:, -1:]), dim=1)
+def later(knots: Sequence[int], steps: int) -> list[int]:
+    """The places of the knots `steps` stages later: the last one beyond the end, a knot's own where there is none."""
+    place = {knot: i for i, knot in enumerate(knots)}
+    end = len(knots) - 1
+    return [place.get(knot + steps, end if knot + steps > max(knots) else i) for i, knot in enumerate(knots)]
+
+
+def shifted(values: Tensor, steps: int = 1, knots: Sequence[int] | None = None, last: Tensor | None = None) -> Tensor:
+    """Values (B, K, ...) of knots some stages later: those beyond the last one are its own.
+
+    Args:
+        knots: K of them, to which the values belong; where the later one isn't among them, a knot keeps its value.
+            None: they follow each other.
+        last: int64 (B,), the place of each problem's last knot; the values after it stay. None: K - 1.
+    """
+    K = values.shape[1]
+    at = torch.tensor(later(range(K) if knots is None else knots, steps), dtype=torch.int64, device=values.device)
+    if last is None:
+        return values[:, at]
+    own, last = torch.arange(K, device=values.device), last.unsqueeze(-1)
+    at = torch.where(own > last, own, torch.minimum(at, last))
+    return values[torch.arange(len(values), device=values.device).unsqueeze(-1), at]
 
 
 def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:

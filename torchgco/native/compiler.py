@@ -25,14 +25,24 @@ from types import FrameType
 from torchgco.base.notices import notice
 from torchgco.native import store
 
-# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact.
-FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
+# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Below -O2 gcc clears the
+# upper halves of vector registers before calls of the C library only with -fexpensive-optimizations: otherwise such a
+# call, a tanh for instance, takes many times as long on some processors.
+FLAGS = (
+    "-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
+    "-fexpensive-optimizations",
+)  # fmt: skip
 # No warning where a vector type is wider than the registers: within one library that does no harm.
 _QUIET = ("-Wno-psabi",)
 _ERROR_LINES = 5
 _ERROR = re.compile(r"error|fail|cannot|can't|No space", re.IGNORECASE)
 # What drivers add when the reason has been said, and lines of the source that are shown beside it.
 _SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? generated|^\d*\s*\|", re.IGNORECASE)
+# What gcc 12 takes: s a line of the solvers' own text, loops over vectors, and of the straight code of a model, beyond
+# _SOLVER lines, twice as long where there are _LONG of these; and the share of it at other levels than -O3.
+_LOOPS, _GENERATED, _SOLVER, _LONG = 1.0e-3, 0.2e-3, 2000, 170_000
+_SHARES = {"-O0": 0.2, "-Og": 0.3, "-O1": 0.5, "-O2": 0.7, "-O3": 1.0}
+_BRIEF = 2.0  # s: compilations that are shorter are announced only to those who watch
 _AMD_HALVES = 25  # family of AMD processors, at most, that compute vectors of 512 bits in two steps
 
 
@@ -58,7 +68,7 @@ def find_compiler() -> Compiler | None:
     """The first that works of CC, cc, gcc, clang, and zig from the package ziglang; None where there is none.
 
     TORCHGCO_CC names the only compiler that is tried; a word such as "none" turns native kernels off. The words of
-    TORCHGCO_CFLAGS are further flags: with -O1 compiling takes a third of the time, and solves up to twice as long.
+    TORCHGCO_CFLAGS are further flags: with -O1 compiling takes half of the time, and solves up to twice as long.
     """
     return _find_compiler(*map(os.environ.get, ("TORCHGCO_CC", "CC", "PATH", "TORCHGCO_CFLAGS")))
 
@@ -94,6 +104,7 @@ def begin(source: str) -> None:
     flags = (*compiler.flags, *compiler.further)
     key = _key(compiler, source, flags)
     if key not in _begun and store.find(key, ".so") is None:
+        _announce(source, flags)
         with suppress(OSError), _held():
             room = TemporaryDirectory(prefix="torchgco-")
             _begun[key] = _Begun(os.getpid(), room, _start(compiler, source, flags, Path(room.name)))
@@ -113,7 +124,9 @@ _begun: dict[str, _Begun] = {}
 
 
 def _key(compiler: Compiler, source: str, flags: tuple[str, ...]) -> str:
-    return store.key_of(("library 1", source, *flags, compiler.identity, _processor()))
+    # Libraries are of a kin whose sources differ in numbers alone, decimal or hexadecimal, be it in names.
+    kin = source.encode(errors="surrogateescape").translate(None, b"0123456789abcdefxp.+-").decode(errors="replace")
+    return store.key_of(("library 1", source, *flags, compiler.identity, _processor()), kin)
 
 
 def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
@@ -153,7 +166,8 @@ def _own(library: bytes) -> ctypes.CDLL:
 def _compile(
     compiler: Compiler, source: str, flags: tuple[str, ...], room: Path, begun: subprocess.Popen[str] | None = None
 ) -> Path:
-    notice("compiling native kernels (once for this form of problem, some seconds) ...")
+    if begun is None:
+        _announce(source, flags)
     returncode, errors = _finished(lambda: begun or _start(compiler, source, flags, room))
     if returncode:
         said = [line.strip() for line in errors.splitlines() if line.strip()] or [_ended(returncode)]
@@ -162,6 +176,24 @@ def _compile(
         lines = [f"{shlex.join(compiler.command)} failed: {telling[-1]}", *telling[:-1][:_ERROR_LINES]]
         raise NativeError("\n".join(lines))
     return room / "kernels.so"
+
+
+def _announce(source: str, flags: Sequence[str]) -> None:
+    """A line on a compiler that is to be started; none where another one runs, which has been announced."""
+    if any(begun.owner == os.getpid() and begun.process.poll() is None for begun in _begun.values()):
+        return
+    seconds = _expected(source, flags)
+    about = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} minutes"
+    known = f"about {about}" if seconds >= 1.0 else "a moment"
+    notice(f"compiling native kernels (once for this form of problem, {known}) ...", brief=seconds <= _BRIEF)
+
+
+def _expected(source: str, flags: Sequence[str]) -> float:
+    """Seconds that gcc takes for a source, within a factor of two on an AMD EPYC that has nothing else to do."""
+    lines = source.count("\n")
+    own, straight = min(lines, _SOLVER), max(0, lines - _SOLVER)
+    level = next((flag for flag in reversed(flags) if flag in _SHARES), "-O3")
+    return _SHARES[level] * (_LOOPS * own + _GENERATED * straight * (1.0 + straight / _LONG))
 
 
 def _start(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> subprocess.Popen[str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import functools
+import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from typing import Any
 
@@ -244,19 +246,35 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure, first
     if count == 0:
         return
     groups = -(-count // group)
-    parts = min(torch.get_num_threads(), groups)
-    if parts <= 1:
-        done = [function(ctypes.byref(argument), ctypes.c_int64(first), ctypes.c_int64(first + count))]
-    else:
-        edges = [first + group * (groups * i // parts) for i in range(parts)] + [first + count]
-        with ThreadPoolExecutor(parts) as pool:
-            calls = [
-                pool.submit(function, ctypes.byref(argument), ctypes.c_int64(a), ctypes.c_int64(b))
-                for a, b in pairwise(edges)
-            ]
-            done = [call.result() for call in calls]
+    threads = torch.get_num_threads()
+    parts = min(threads, groups)
+    edges = [first + group * (groups * i // parts) for i in range(parts)] + [first + count]
+    spans = [(ctypes.byref(argument), ctypes.c_int64(a), ctypes.c_int64(b)) for a, b in pairwise(edges)]
+    done = [function(*spans[0])] if parts == 1 else _at_once(function, spans, _helpers(threads - 1))
     if not all(done):
         raise MemoryError("native kernels: no memory")
+
+
+def _at_once(function: Any, spans: list[tuple[Any, ...]], helpers: ThreadPoolExecutor) -> list[int]:
+    """What the function returns for each of these arguments; this thread takes the first."""
+    calls: list[Future[int]] = []
+    try:
+        calls += (helpers.submit(function, *span) for span in spans[1:])
+        return [function(*spans[0]), *(call.result() for call in calls)]
+    except BaseException:  # Ctrl-C: nothing may still write to what the caller goes on with
+        for call in calls:
+            call.cancel()
+        wait(calls)
+        raise
+
+
+@functools.cache
+def _helpers(count: int) -> ThreadPoolExecutor:
+    """Threads that are kept, and end with the process: starting them takes as long as a small call."""
+    return ThreadPoolExecutor(count, thread_name_prefix="torchgco")
+
+
+os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child has none of its parent's threads
 
 
 def _measured(part: Constraint) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.lagrangian.lagrangian import later
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers
 from torchgco.native.codegen.cost import cost_arrays
@@ -49,6 +51,9 @@ class Kept:
         self.worst = like.new_zeros(B)
         # The same memory by NumPy, which takes a small share of PyTorch's time for a few numbers.
         self._moving = [part.numpy() for part in (self.X, self.U, *self.lam)]
+        at_rows = [torch.arange(N + 1)[part.knots].tolist() for part in problem.constraints]
+        self._knots: list[Sequence[int]] = [range(N + 1), range(N), *at_rows]
+        self._later = dict[int, list[np.ndarray]]()
         self._rolled = [part.numpy() for part in self.rolled]
         self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
         self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
@@ -81,10 +86,11 @@ class Kept:
         return self.gains[..., :-1]
 
     def shift(self, by: int) -> None:
-        """Let all trajectories and multipliers begin `by` stages later; the last knots are repeated."""
-        for part in self._moving:
-            if 0 < by < part.shape[1]:
-                part[:, :-by] = part[:, by:]
+        """Let all trajectories and multipliers begin `by` stages later, as `Solution.shifted` does."""
+        if by not in self._later:
+            self._later[by] = [np.array(later(knots, by), dtype=np.intp) for knots in self._knots]
+        for part, at in zip(self._moving, self._later[by], strict=True):
+            part[:] = part[:, at]
 
     def refresh_constraint(self, i: int) -> None:
         """Read the numbers of constraint i again, after its tensors have changed."""

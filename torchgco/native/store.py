@@ -2,6 +2,8 @@
 
 A file is called KEY-CHECKSUM and a suffix, with the checksum of its content. It is written under another name and
 renamed, so processes that write the same file at once do no harm; a damaged, truncated or swapped file is deleted.
+The first digits of a key are those of its kin: code that differs in numbers alone, as in a loop that trains a model. Of
+such a kin only so many files are kept, so a loop displaces its own oldest files and not those of other problems.
 A folder that is missing or can't be written costs time, never correctness: nothing here raises OSError.
 
 Libraries are code, and the checksum is no signature: anybody can compute it. So a folder or file that others own or may
@@ -25,6 +27,8 @@ from typing import Any, NamedTuple
 from torchgco.base.files import PART, write_whole
 
 FILES = 1000  # at most, some 150 MB; the least recently used are removed
+KIN = 100  # at most of one kin: a tenth of all, as a solve makes four or so
+_PREFIX = 8  # digits of a key that name its kin
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
 _OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
 
@@ -46,9 +50,9 @@ class Made(NamedTuple):
 _made: dict[tuple[str, str], Made] = {}
 
 
-def made(parts: Sequence[str], make: Callable[[str], dict[str, Any]]) -> Made:
+def made(parts: Sequence[str], make: Callable[[str], dict[str, Any]], kin: str = "") -> Made:
     """What `make` generates for the key of `parts`: of this process, else from the folder, else made now and stored."""
-    key, place = key_of(parts), str(folder())
+    key, place = key_of(parts, kin), str(folder())
     if (key, place) not in _made:
         known = read(key, ".json")
         if known is None:
@@ -69,13 +73,14 @@ def folder() -> Path:
     return Path(shared or os.path.expanduser("~/.cache")) / "torchgco"
 
 
-def key_of(parts: Iterable[str]) -> str:
-    """A key that differs from that of any other sequence of texts."""
+def key_of(parts: Iterable[str], kin: str = "") -> str:
+    """A key that differs from that of any other sequence of texts; of the `kin` that a text names, or of none."""
     digest = hashlib.sha256()
     for part in parts:
         text = part.encode(errors="surrogateescape")
         digest.update(f"{len(text)}:".encode() + text)
-    return digest.hexdigest()[:32]
+    own = digest.hexdigest()[:32]
+    return key_of((kin,))[:_PREFIX] + own[_PREFIX:] if kin else own
 
 
 def find(key: str, suffix: str) -> Path | None:
@@ -136,7 +141,7 @@ def save(key: str, suffix: str, content: bytes) -> Path | None:
         write_whole(path, lambda file: file.write(content))
     except OSError:
         return None
-    _tidy(place)
+    _tidy(place, key[:_PREFIX])
     return path
 
 
@@ -145,8 +150,10 @@ def _name(key: str, suffix: str, content: bytes) -> str:
     return f"{key}-{hashlib.sha256(key.encode() + content).hexdigest()[:32]}{suffix}"
 
 
-def _tidy(place: Path) -> None:
-    """Remove the least recently used files over the limit; another process may use or remove them meanwhile."""
+def _tidy(place: Path, kin: str) -> None:
+    """Remove the least recently used files over the limits, of a kin and of all; another process may use or remove
+    them meanwhile.
+    """
     ages: list[tuple[float, str]] = []
     with suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
@@ -156,6 +163,9 @@ def _tidy(place: Path) -> None:
                     ages.append((age, entry.path))
                 elif entry.name.startswith(PART[0]) and entry.name.endswith(PART[1]) and age > _ABANDONED:
                     os.unlink(entry.path)
-    for _, path in sorted(ages)[FILES:]:
+    ages.sort()
+    over = [one for one in ages if os.path.basename(one[1]).startswith(kin)][KIN:]
+    over += [one for one in ages if one not in over][FILES:]
+    for _, path in over:
         with suppress(OSError):
             os.unlink(path)

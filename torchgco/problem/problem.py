@@ -22,7 +22,7 @@ from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.obstacles.base import Obstacles, warn_of_small
-from torchgco.problem.border import check_constraint, check_cost, check_dynamics
+from torchgco.problem.border import check_code
 from torchgco.problem.free_start import chooses_position, moved_inside, start_mask
 from torchgco.problem.goal import Goal
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
@@ -75,13 +75,14 @@ class Problem:
             self._bind()
 
     def _bind(self) -> None:
-        dims = self._dimensions(self.x0)
-        object.__setattr__(self, "dynamics", self.dynamics.bind(dims))
+        dims, dynamics, cost, constraints = self._dimensions(self.x0), self.dynamics, self.cost, self.constraints
+        object.__setattr__(self, "dynamics", dynamics.bind(dims))
         self._check_dynamics()
-        object.__setattr__(self, "cost", self.cost.bind(dims))
-        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+        object.__setattr__(self, "cost", cost.bind(dims))
+        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in constraints))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
-        self._check_code(self.dynamics, self.cost, self.constraints)
+        rows = zip(constraints, self.constraints, strict=True)
+        check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
         for i, part in enumerate(self.constraints):
             if isinstance(part, Obstacles):
                 warn_of_small(part, f"constraints[{i}]")
@@ -89,17 +90,6 @@ class Problem:
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "form", {})
-
-    def _check_code(self, dynamics: Dynamics | None, cost: Cost | None, constraints: Sequence[Constraint]) -> None:
-        """Try what a user's code does; bound constraints."""
-        if dynamics is not None:
-            check_dynamics(dynamics, self.x0, self.N)
-        if cost is not None:
-            check_cost(cost, self.x0, self.N, self.m)
-        for i, constraint in enumerate(constraints):
-            name = getattr(constraint, "name", None)
-            field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
-            check_constraint(constraint, field, self.x0, self.N, self.m)
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
@@ -322,8 +312,9 @@ class Problem:
                     parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
             known = set(map(id, self.constraints))
-            new = [b for b, given in zip(bound, constraints, strict=True) if id(given) not in known]
-            started._check_code(parts.get("dynamics"), parts.get("cost"), new)
+            new = [pair for pair in zip(constraints, bound, strict=True) if id(pair[0]) not in known]
+            model = None if dynamics is None else (dynamics, parts["dynamics"])
+            check_code(dims, started.x0, model, None if cost is None else (cost, parts["cost"]), new)
         return started
 
     def cast(self, dtype: torch.dtype) -> Self:

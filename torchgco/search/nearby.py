@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.base.tree import put
 from torchgco.constraints.base import Constraint
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.native.dispatch import chord_clearance, measured
+from torchgco.native.dispatch import chord_clearance, engine_of, measured
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.problem.problem import ROWS, Problem
 from torchgco.solution import Solution
@@ -99,6 +99,7 @@ def without_obstacles(problem: Problem) -> Problem | None:
 
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
+    engine_of(problem)  # which both then share: two forms would trace the problem twice
     other = problem._with({"constraints": constraints}, form=dict(problem.form))
     other.form.pop(ROWS, None)
     return other

@@ -61,8 +61,11 @@ class Starts:
         problem = search.call.problem
         if problem.B == 0 or not Converge.begins(problem):
             return
+        left = self._rows(search)
+        if left.numel() == 0:  # which `split` would make one empty batch of
+            return
         slots = search.solver.slots or problem.B * self.count
-        for rows in self._rows(search).split(max(1, slots // self.count)):
+        for rows in left.split(max(1, slots // self.count)):
             if search.call.late:
                 return
             self._solve(search, rows)

@@ -138,6 +138,11 @@ class Traced:
         own = dict(zip(self._own, self._own_shapes, strict=True))
         return fingerprint(variables, own, self._constants, self._symbolic, self._result)
 
+    @property
+    def kin(self) -> str:
+        """A text that functions share which differ in numbers alone, and few others."""
+        return f"{self._shapes} {self._own_shapes} {' '.join(name_of(one.function) for one in self._symbolic)}"
+
     def __call__(
         self, parameters: np.ndarray, *variables: np.ndarray, constants: np.ndarray | None = None
     ) -> np.ndarray:

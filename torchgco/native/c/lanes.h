@@ -86,15 +86,18 @@ TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hy
 #define TGCO_QUARTER_1 0x1.921fb544p+0
 #define TGCO_QUARTER_2 0x1.0b4611a6p-34
 #define TGCO_QUARTER_3 0x1.3198a2e037073p-69
-#define TGCO_TERMS 8
 #else
 #define TGCO_WHOLE 0x1.8p23
 #define TGCO_FAR 1e4
 #define TGCO_QUARTER_1 0x1.92p+0
 #define TGCO_QUARTER_2 0x1.fb4p-12
 #define TGCO_QUARTER_3 0x1.4442dp-24
-#define TGCO_TERMS 4
 #endif
+
+/* Term i of both series, written out: in a loop that isn't unrolled its factors are quotients computed at run time. */
+#define TGCO_TERM(i) \
+    sine = SET(1.0) - s * SET(1.0 / (2 * (i) * (2 * (i) + 1))) * sine; \
+    cosine = SET(1.0) - s * SET(1.0 / ((2 * (i)-1) * (2 * (i)))) * cosine;
 
 static inline V tgco_wave(V x, int shift) {
     V t = x * SET(0x1.45f306dc9c883p-1) + SET(TGCO_WHOLE), k = t - SET(TGCO_WHOLE);
@@ -104,10 +107,10 @@ static inline V tgco_wave(V x, int shift) {
     r = r - k * SET(TGCO_QUARTER_3);
     /* sin r = r (1 - s/(2 3) (1 - s/(4 5) (...))), cos r = 1 - s/(1 2) (1 - s/(3 4) (...)), s = r^2 */
     V s = r * r, sine = SET(1.0), cosine = SET(1.0);
-    for (int i = TGCO_TERMS; i > 0; i--) {
-        sine = SET(1.0) - s * SET(1.0 / (2 * i * (2 * i + 1))) * sine;
-        cosine = SET(1.0) - s * SET(1.0 / ((2 * i - 1) * (2 * i))) * cosine;
-    }
+#if TGCO_IS_DOUBLE
+    TGCO_TERM(8) TGCO_TERM(7) TGCO_TERM(6) TGCO_TERM(5)
+#endif
+    TGCO_TERM(4) TGCO_TERM(3) TGCO_TERM(2) TGCO_TERM(1)
     V value = tgco_choose((quarter & 1) != 0, cosine, r * sine);
     I sign = (quarter & 2) << (8 * (int)sizeof(REAL) - 2);
     return (V)((I)value ^ sign);

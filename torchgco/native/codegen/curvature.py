@@ -41,7 +41,8 @@ def _model_code(model: DynamicsSource) -> str:
         total = ca.dot(y, ca.densify(ca.vertcat(*ahead)))
         return {"code": _curves("tgco_curve", [x, u, p, y], total, ca.vertcat(x, u))}
 
-    return store.made(("curvature", model.key, *makers(__file__)), make).content["code"]
+    key = "curvature", model.key, *makers(__file__)
+    return store.made(key, make, f"curvature {model.traced.kin}").content["code"]
 
 
 def _stage_code(knot: Knot, _: str) -> str:

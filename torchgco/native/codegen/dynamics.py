@@ -91,7 +91,8 @@ def trace_dynamics(
     dynamics = apart(dynamics)
     own = own_tensors(dynamics)
     traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
-    parts = store.made(("model", traced.fingerprint(), *makers()), lambda _: _made(traced, n, m))
+    key = "model", traced.fingerprint(), *makers()
+    parts = store.made(key, lambda _: _made(traced, n, m), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
     return DynamicsSource(n, m, traced.count, parts.content["code"], **lists, key=parts.key, traced=traced, own=own)
 

@@ -116,7 +116,8 @@ def knot_parts(
         name = store.key_of((kind, str((span.n, span.m, *_form(function))), *makers(__file__, *files)))[:16]
         return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "places": places}
 
-    _, parts = store.made((kind, shape, span.traced.fingerprint(), *makers(__file__, *files)), make)
+    key = kind, shape, span.traced.fingerprint(), *makers(__file__, *files)
+    _, parts = store.made(key, make, f"{kind} {shape} {span.traced.kin}")
     places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
     return KnotSource(parts["code"], parts["name"], parts["size"], places, span), parts
 
