@@ -42,10 +42,11 @@ from torchgco.problem.problem import Problem
 
 
 def solve(
-    problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+    model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
 ) -> dict[str, Tensor]:
     """As `native.interior.InteriorEngine.solve`, for any device and dtype."""
-    how, model, flat = How(**options), Model.of(problem), _flat(problem, multipliers, X)
+    problem, how = model.problem, How(**options)
+    flat = _flat(problem, multipliers, X)
     equality = _of_rows(problem, X, [part.sense == "equality" for part in problem.constraints])
     kinds = Kinds(equality, how, how.constant, how.least_cost, barrier.clone(), problem.N, problem.n)
     B = problem.B

@@ -82,12 +82,14 @@ class Model:
         z = torch.cat((X[:, :-1], U), dim=-1)
         return cls(problem, groups_of(problem), bends(lambda z: one.along.step(z[..., :n], z[..., n:]), z))
 
+    def among(self, problem: Problem) -> Model:
+        """The model of other problems of the same form."""
+        return replace(self, problem=problem, groups=tuple(group.of(problem) for group in self.groups))
+
     def take(self, rows: Tensor) -> Model:
         """The model of the problems `rows` (int64)."""
         some = self.problem.take(rows)
-        return self if some is self.problem else replace(
-            self, problem=some, groups=tuple(group.of(some) for group in self.groups)
-        )  # fmt: skip
+        return self if some is self.problem else self.among(some)
 
     def values(self, X: Tensor, U: Tensor, rows: int) -> Values:
         """Cost, rows and gaps."""

@@ -151,7 +151,7 @@ class Group:
             return self.slopes(X, U)
         function, w = self._function(X, U)
         J, curvature = with_curvature(function, w, self.place.of(lam))
-        if not _is_function(self.part):
+        if not is_function(self.part):
             curvature = curvature[:, self.place.knots]
         H[(slice(None), *_square(self.place.knots, self.place.columns))] += curvature
         return Dense(self.place, J)
@@ -159,7 +159,7 @@ class Group:
     def _function(self, X: Tensor, U: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor]:
         """The rows (b, K, p) as a function of the columns that they read, w: of their knots, or of all."""
         part, n = self.part, X.shape[-1]
-        if _is_function(part):
+        if is_function(part):
             assert isinstance(part, FunctionConstraint)
             k = torch.arange(X.shape[1], device=X.device)[part.knots]
             given = [(X if of == "x" else U)[:, part.knots] for of in part.of]
@@ -199,14 +199,14 @@ def _bends(group: Group, problem: Problem) -> bool:
     return bends(function, w)
 
 
-def _is_function(part: Constraint) -> bool:
+def is_function(part: Constraint) -> bool:
     """Whether rows are a function of their own knot's x, u or both."""
     return isinstance(part, FunctionConstraint) and type(part).value is FunctionConstraint.value
 
 
 def _columns(part: Constraint, problem: Problem) -> slice:
     n, S = problem.n, problem.n + problem.m
-    if _is_function(part):
+    if is_function(part):
         return {"x": slice(0, n), "u": slice(n, S), "xu": slice(0, S)}[part.of]  # type: ignore[attr-defined]
     return part.position if type(part) in BY_POSITION else slice(0, S)  # type: ignore[attr-defined]
 
