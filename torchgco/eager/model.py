@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.eager.curvature import bends, with_curvature
+from torchgco.eager.curvature import Expansion, expansion_of
 from torchgco.eager.rows import Group, Slopes, groups_of, joined
 from torchgco.problem.problem import Problem
 
@@ -67,12 +67,12 @@ class Model:
     """The functions of a batch of problems.
 
     Attributes:
-        bends: whether PyTorch differentiates the dynamics twice; where it doesn't, their curvature counts as 0.
+        expansion: how PyTorch differentiates the dynamics.
     """
 
     problem: Problem
     groups: tuple[Group, ...]
-    bends: bool
+    expansion: Expansion
 
     @classmethod
     def of(cls, problem: Problem) -> Model:
@@ -80,7 +80,7 @@ class Model:
         one = problem.take(slice(0, 1))
         n, (X, U) = problem.n, one.at_rest
         z = torch.cat((X[:, :-1], U), dim=-1)
-        return cls(problem, groups_of(problem), bends(lambda z: one.along.step(z[..., :n], z[..., n:]), z))
+        return cls(problem, groups_of(problem), expansion_of(lambda z: one.along.step(z[..., :n], z[..., n:]), z))
 
     def among(self, problem: Problem) -> Model:
         """The model of other problems of the same form."""
@@ -138,10 +138,8 @@ class Model:
     def _dynamics(self, X: Tensor, U: Tensor, y: Tensor, H: Tensor) -> Tensor:
         """[fx fu] (b, N, n, S); the curvature of y' step is added to H."""
         model, n = self.problem.along, self.problem.n
-        if not self.bends:
-            return torch.cat(model.jacobians(X[:, :-1], U), dim=-1)
         z = joined(X, U)[:, :-1]
-        F, curvature = with_curvature(lambda z: model.step(z[..., :n], z[..., n:]), z, y[:, 1:])
+        F, curvature = self.expansion(lambda z: model.step(z[..., :n], z[..., n:]), z, y[:, 1:])
         H[:, :-1] += curvature
         return F
 

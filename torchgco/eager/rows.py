@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.base.autodiff import jacobian
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.eager.curvature import bends, with_curvature
+from torchgco.eager.curvature import Expansion, expansion_of, flat
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -117,7 +117,7 @@ class Group:
     part: Constraint
     number: int  # among the constraints
     place: Place
-    bends: bool = True  # whether PyTorch differentiates it twice
+    expansion: Expansion = flat  # how PyTorch differentiates it; bounds are not
 
     def of(self, problem: Problem) -> Group:
         """The same of a subset of the problems."""
@@ -147,12 +147,12 @@ class Group:
 
     def expand(self, X: Tensor, U: Tensor, lam: Tensor, H: Tensor) -> Slopes:
         """First derivatives; the second ones of lam' c, for multipliers lam (b, R), are added to H (b, N+1, S, S)."""
-        if self.is_bound or not self.bends:
+        if self.is_bound or self.expansion is flat:
             return self.slopes(X, U)
         function, w = self._function(X, U)
-        J, curvature = with_curvature(function, w, self.place.of(lam))
+        J, curvature = self.expansion(function, w, self.place.of(lam))
         if not is_function(self.part):
-            curvature = curvature[:, self.place.knots]
+            J, curvature = (part if part.shape[1] == self.place.K else part[:, self.place.knots] for part in (J, curvature))
         H[(slice(None), *_square(self.place.knots, self.place.columns))] += curvature
         return Dense(self.place, J)
 
@@ -186,17 +186,17 @@ def groups_of(problem: Problem) -> tuple[Group, ...]:
         group = Group(part, number, place)
         if place.K > 0:
             if not group.is_bound:
-                group = replace(group, bends=_bends(group, problem))
+                group = replace(group, expansion=_expansion(group, problem))
             found.append(group)
         first += K * p
     return tuple(found)
 
 
-def _bends(group: Group, problem: Problem) -> bool:
+def _expansion(group: Group, problem: Problem) -> Expansion:
     one = problem.take(slice(0, 1))
     part = group.part.take(slice(0, 1))
     function, w = replace(group, part=part)._function(*one.at_rest)
-    return bends(function, w)
+    return expansion_of(function, w)
 
 
 def is_function(part: Constraint) -> bool:
