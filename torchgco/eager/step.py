@@ -40,30 +40,33 @@ def factor(F: Tensor, H: Tensor, shift: Tensor, pivot: float, free: Tensor | Non
         free: which components of the start are variables (b, n); None: none.
     """
     n, S = F.shape[-2:]
-    eye = torch.eye(S, dtype=H.dtype, device=H.device)
-    F, H = F.transpose(0, 1).contiguous(), (H + shift.view(-1, 1, 1, 1) * eye).transpose(0, 1).contiguous()
-    P, Ps, Ls, Ys, wholes, infos = H[-1, :, :n, :n], [], [], [], [], []
-    Ps.append(P)
+    H = H.clone()
+    H.diagonal(dim1=-2, dim2=-1).add_(shift.view(-1, 1, 1))
+    F, H = F.transpose(0, 1).contiguous(), H.transpose(0, 1).contiguous()
+    P, Ps, Ls, Ys, infos = H[-1, :, :n, :n], [], [], [], []
     for f, h in zip(reversed(F.unbind(0)), reversed(H[:-1].unbind(0)), strict=True):
-        Q = torch.baddbmm(h, f.mT, torch.bmm(P, f))
-        L, info = torch.linalg.cholesky_ex(Q[:, n:, n:])
-        Y = torch.linalg.solve_triangular(L, Q[:, n:, :n], upper=False)
-        P = torch.baddbmm(Q[:, :n, :n], Y.mT, Y, alpha=-1.0)
-        P = 0.5 * (P + P.mT)
         Ps.append(P)
+        Q = torch.baddbmm(h, f.mT, torch.bmm(P, f))
+        Qx, Qu = Q.split((n, S - n), dim=-1)
+        L, info = torch.linalg.cholesky_ex(Qu[:, n:])
+        Y = torch.linalg.solve_triangular(L, Qx[:, n:], upper=False)
+        P = torch.baddbmm(Qx[:, :n], Y.mT, Y, alpha=-1.0)
+        P = P.add(P.mT).mul_(0.5)
         Ls.append(L)
-        infos.append(info)
         Ys.append(Y)
-        wholes.append(Q.diagonal(dim1=-2, dim2=-1)[:, n:])
-    L, Y = torch.stack(Ls[::-1]), torch.stack(Ys[::-1])
-    pivots, whole = L.diagonal(dim1=-2, dim2=-1).square(), torch.stack(wholes[::-1])
+        infos.append(info)
+    Ps.append(P)
+    P_all, L, Y = torch.stack(Ps[::-1]), torch.stack(Ls[::-1]), torch.stack(Ys[::-1])
+    fu = F[..., n:]
+    whole = H[:-1].diagonal(dim1=-2, dim2=-1)[..., n:] + (fu * (P_all[1:] @ fu)).sum(-2)
+    pivots = L.diagonal(dim1=-2, dim2=-1).square()
     good = ((pivots > pivot * whole.abs()) & torch.isfinite(pivots)).all(-1).all(0) & (torch.stack(infos) == 0).all(0)
     K = -torch.linalg.solve_triangular(L.mT, Y, upper=True)
     start = None
     if free is not None:
         start, positive = _factor_start(P, free, pivot)
         good = good & positive
-    return Factors(F, torch.stack(Ps[::-1]), L, K, F[..., :n] + F[..., n:] @ K, start, free, good)
+    return Factors(F, P_all, L, K, F[..., :n] + fu @ K, start, free, good)
 
 
 def _factor_start(P: Tensor, free: Tensor, pivot: float) -> tuple[Tensor, Tensor]:
