@@ -57,9 +57,10 @@ class EagerInterior:
 def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:
     """Options for a precision: as they are in float64.
 
-    Shares of rounding (pivots) grow with the unit of the last bit, by 2^29 in float32; errors that Newton's method
-    meets, the end test's tolerance (1e-8 becomes 2.3e-4) and the dual regularisation, whose inverse is added to
-    curvatures, with its root. Rows are met to 100 units of the last bit at least (1.2e-5).
+    Shares of rounding (pivots) grow with the unit of the last bit, by 2^29 in float32, and the dual regularisation,
+    whose inverse is added to curvatures, with its root. The end test asks for an error that grows with the third root
+    (1e-8 becomes 8e-6), and takes one that falls no further below the root (2.3e-4) for rounding. Rows are met to 100
+    units of the last bit at least (1.2e-5).
     """
     coarser = torch.finfo(dtype).eps / torch.finfo(torch.float64).eps
     if coarser == 1.0:
@@ -67,7 +68,9 @@ def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:
     return {
         "pivot": options["pivot"] * coarser,
         "closest": 1.0 - (1.0 - options["closest"]) * coarser,
-        **{name: options[name] * coarser**0.5 for name in ("tolerance", "rounding", "soft")},
+        "soft": options["soft"] * coarser**0.5,
+        "tolerance": options["tolerance"] * coarser ** (1.0 / 3.0),
+        "rounding": options["tolerance"] * coarser**0.5,
         "violation": least_violation(options["violation"], dtype),
     }
 

@@ -57,7 +57,8 @@ def solve(
         "error": X.new_zeros(B), "theta": X.new_zeros(B),
     }  # fmt: skip
     loop = _Loop(kinds, model, blank(problem, X, U, flat))
-    begin(kinds, model, loop.t)
+    if B > 0:
+        begin(kinds, model, loop.t)
     while loop.t.rows.numel() > 0:
         status, error = loop.iterate()
         ended = (status != Status.RUNNING).nonzero().flatten()
@@ -75,7 +76,7 @@ def solve(
         split_multipliers(part, t, lam)
         flat[rows] = lam
         loop.keep((status == Status.RUNNING).nonzero().flatten())
-    for lam, part in zip(multipliers, flat.split([lam[0].numel() for lam in multipliers], dim=-1), strict=True):
+    for lam, part in zip(multipliers, flat.split([knots * rows for knots, rows in problem.row_shapes], dim=-1), strict=True):
         lam.copy_(part.view_as(lam))
     return out
 

@@ -73,7 +73,7 @@ class InteriorPoint(Solver):
     costs within 1e-6.
 
     Args:
-        tolerance: of the optimality conditions, scaled as in the paper; in float32 2.3e4 times as much.
+        tolerance: of the optimality conditions, scaled as in the paper; in float32 8e-6, or what rounding allows.
         violation_tolerance: residual (metres for lengths) up to which a trajectory counts as feasible; in float32
             1.2e-5 at least.
         max_iterations: of each problem.
