@@ -1,4 +1,4 @@
-"""Steps of the interior point, in C and in PyTorch, against dense linear systems in NumPy (tests/reference/interior.py)."""
+"""Steps of the interior point, in C and in PyTorch, against dense linear systems (tests/reference/interior.py)."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.rows import Group, joined
-from torchgco.eager.state import Kinds, State, column, renew, settle
+from torchgco.eager.state import Kinds, State, renew, settle
 
 NUDGE = 1e-3  # how far from the iterate a row's slope is looked at again: it may vanish in one point alone
 GOLDEN = 0.6180339887498949
@@ -53,7 +53,7 @@ def _looked_at(model: Model, tight: Tensor) -> Tensor:
 
 def _measure_room(group: Group, t: State) -> None:
     """The room between two bounds of a variable; where they coincide, the upper one holds as an equality."""
-    for j, l in _pairs(group):  # noqa: E741
+    for j, l in _pairs(group):
         c, room, out = group.place.of(t.c), group.place.of(t.room), group.place.of(t.out)
         half = -0.5 * (c[..., j] + c[..., l])
         room[..., j] = room[..., l] = half.clamp(max=1.0)
@@ -68,7 +68,7 @@ def _pairs(group: Group) -> Iterator[tuple[int, int]]:
     if not group.is_bound:
         return
     above, below = (part.tolist() for part in group.variables(0))
-    for l, variable in enumerate(below):  # noqa: E741
+    for l, variable in enumerate(below):
         if variable in above:
             yield above.index(variable), len(above) + l
 
@@ -200,7 +200,7 @@ def breaks_rows_left_out(kinds: Kinds, t: State) -> Tensor:
 def split_multipliers(model: Model, t: State, lam: Tensor) -> None:
     """Multipliers lam (b, R) of two bounds that coincide: each has the sign of an inequality's; in place."""
     for group in model.groups:
-        for j, l in _pairs(group):  # noqa: E741
+        for j, l in _pairs(group):
             own, fixes = group.place.of(lam), group.place.of(t.fixes)[..., j]
             below = fixes & (own[..., j] < 0.0)
             own[..., l] = torch.where(below, -own[..., j], own[..., l])
@@ -210,6 +210,6 @@ def split_multipliers(model: Model, t: State, lam: Tensor) -> None:
 def join_multipliers(model: Model, t: State) -> None:
     """The same the other way round for a warm start: the equality takes both."""
     for group in model.groups:
-        for j, l in _pairs(group):  # noqa: E741
+        for j, l in _pairs(group):
             own = group.place.of(t.z)
             own[..., j] = torch.where(group.place.of(t.fixes)[..., j], own[..., j] - own[..., l], own[..., j])

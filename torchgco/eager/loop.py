@@ -76,7 +76,8 @@ def solve(
         split_multipliers(part, t, lam)
         flat[rows] = lam
         loop.keep((status == Status.RUNNING).nonzero().flatten())
-    for lam, part in zip(multipliers, flat.split([knots * rows for knots, rows in problem.row_shapes], dim=-1), strict=True):
+    sizes = [knots * rows for knots, rows in problem.row_shapes]
+    for lam, part in zip(multipliers, flat.split(sizes, dim=-1), strict=True):
         lam.copy_(part.view_as(lam))
     return out
 
@@ -192,9 +193,9 @@ class _Loop:
     def _remember_shift(self, won: Tensor) -> None:
         """Where only short steps are accepted, the step reaches further than the model: more curvature shortens it."""
         t, how = self.t, self.kinds.how
-        lower = how.recovery_decay * t.forced
-        higher = torch.where(t.shift > how.shift_crawl, how.recovery_growth * t.shift, t.last.clamp(min=how.shift_crawl))
-        lower = torch.where(lower >= how.shift_crawl, lower, 0.0)
+        lower, floor = how.recovery_decay * t.forced, how.shift_crawl
+        higher = torch.where(t.shift > floor, how.recovery_growth * t.shift, t.last.clamp(min=floor))
+        lower = torch.where(lower >= floor, lower, 0.0)
         t.forced = torch.where(won & ~t.restoring, torch.where(t.crawls, higher, lower), t.forced)
 
     # The direction --------------------------------------------------------------------------------------------------
@@ -224,10 +225,8 @@ class _Loop:
         return step, moving
 
     def _factor(self, step: Step, rows: Tensor) -> None:
-        free = self.model.problem.free_start
-        new = riccati.factor(
-            step.at.F[rows], step.H[rows], self.t.shift[rows], self.kinds.how.pivot, None if free is None else free[rows]
-        )
+        free, at = self.model.problem.free_start, (step.at.F[rows], step.H[rows], self.t.shift[rows])
+        new = riccati.factor(*at, self.kinds.how.pivot, None if free is None else free[rows])
         riccati.put(step.factors, rows, new)
 
     def _shifted(self, step: Step, of: Tensor) -> Tensor:

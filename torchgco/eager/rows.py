@@ -152,7 +152,8 @@ class Group:
         function, w = self._function(X, U)
         J, curvature = self.expansion(function, w, self.place.of(lam))
         if not is_function(self.part):
-            J, curvature = (part if part.shape[1] == self.place.K else part[:, self.place.knots] for part in (J, curvature))
+            J = J if J.shape[1] == self.place.K else J[:, self.place.knots]
+            curvature = curvature[:, self.place.knots]
         H[(slice(None), *_square(self.place.knots, self.place.columns))] += curvature
         return Dense(self.place, J)
 

@@ -56,7 +56,8 @@ def part_of(step: Step, rows: Tensor) -> Step:
     """The step of the problems `rows`, to be made anew: `H`, and derivatives by reference, are those of all."""
     factors = riccati.take(step.factors, rows)
     names = ("aim", "r", "dx", "du", "yn", "ds", "dz")
-    return replace(step, factors=factors, at=taken(step.at, rows), **{name: getattr(step, name)[rows] for name in names})
+    own = {name: getattr(step, name)[rows] for name in names}
+    return replace(step, factors=factors, at=taken(step.at, rows), **own)
 
 
 def taken(at: Derivatives, rows: Tensor) -> Derivatives:
@@ -99,9 +100,7 @@ def _remember(kinds: Kinds, t: State, of: Tensor) -> None:
     t.filter = torch.where(of.view(-1, 1, 1), new, t.filter)
 
 
-def _good(
-    kinds: Kinds, t: State, alpha: Tensor, slope: Tensor, theta: Tensor, phi: Tensor
-) -> tuple[Tensor, Tensor]:
+def _good(kinds: Kinds, t: State, alpha: Tensor, slope: Tensor, theta: Tensor, phi: Tensor) -> tuple[Tensor, Tensor]:
     """Which trials are accepted, and which of these by the Armijo condition; `slope` is that of phi."""
     how, old = kinds.how, t.theta
     noise = how.noise * torch.finfo(phi.dtype).eps * t.phi.abs()
