@@ -10,6 +10,7 @@ from the last knot to the first. One factorisation serves several right hand sid
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -92,9 +93,9 @@ def take(factors: Factors, rows: Tensor) -> Factors:
     """The factors of the problems `rows`."""
     if rows.numel() == factors.good.numel():
         return factors
-    parts = (getattr(factors, name)[:, rows] for name in ("F", "P", "L", "K", "closed"))
+    parts: dict[str, Any] = {name: getattr(factors, name)[:, rows] for name in ("F", "P", "L", "K", "closed")}
     start, free = (None if part is None else part[rows] for part in (factors.start, factors.free))
-    return Factors(*parts, start, free, factors.good[rows])
+    return Factors(**parts, start=start, free=free, good=factors.good[rows])
 
 
 def solve(factors: Factors, g: Tensor, aim: Tensor) -> tuple[Tensor, Tensor, Tensor]:
