@@ -85,7 +85,7 @@ def put(factors: Factors, rows: Tensor, new: Factors) -> None:
     for name in ("F", "P", "L", "K", "closed"):
         getattr(factors, name)[:, rows] = getattr(new, name)
     factors.good[rows] = new.good
-    if factors.start is not None:
+    if factors.start is not None and new.start is not None:
         factors.start[rows] = new.start
 
 
