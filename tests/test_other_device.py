@@ -23,6 +23,7 @@ from torchgco import (
     ControlBounds,
     FunctionConstraint,
     Goal,
+    InteriorPoint,
     OscillatingBoxes,
     Planar,
     Polish,
@@ -107,6 +108,21 @@ def test_local_solves_are_judged_and_certified(kind: str) -> None:
     def work(problem: Problem, U0: Tensor) -> list[Tensor]:
         found, parts = solved(problem, U0)
         return [*parts, *vars(judge(problem, found.U)).values(), *vars(certify(problem, found.X, found.U)).values()]
+
+    on_both(work, kind)
+
+
+@pytest.mark.parametrize("kind", ["boxes", "map", *SLOW])
+def test_the_interior_point_solves(kind: str) -> None:
+    """Another device has the same iterates; a part of the start is free, and a bound has no room."""
+
+    def work(problem: Problem, U0: Tensor) -> list[Tensor]:
+        bounds = StateBounds(problem.x0, problem.x0 + 1.0, knots=[0])
+        free = Problem(
+            problem.dynamics, problem.cost, [*problem.constraints, bounds], problem.x0, N, problem.goal,
+            free_start=torch.tensor([False, False, True, False, False, False], device=problem.x0.device),
+        )  # fmt: skip
+        return solved(free, U0, InteriorPoint(max_iterations=3))[1]
 
     on_both(work, kind)
 

@@ -16,6 +16,7 @@ LAYERS = [
     ["maps"],
     ["problem"],
     ["lagrangian", "judging"],
+    ["eager"],
     ["explaining"],
     ["solution", "native"],
     ["solvers", "roadmap"],

@@ -133,7 +133,7 @@ def gco_max(space: Space) -> Restarts:
 
 
 def gco_exact(space: Space) -> Restarts:
-    """`gco` with its last steps taken to a violation and KKT residual of 1e-8; it needs native kernels.
+    """`gco` with its last steps taken to a violation and KKT residual of 1e-8; in float64.
 
     The tolerance of the interior point is smaller: it counts in units of the cost's steepest slope or curvature, while
     a residual is a share of the terms that cancel in a control's slope, which may be far smaller.

@@ -1,4 +1,4 @@
-"""Steps of the interior point in C against dense linear systems in NumPy (tests/reference/interior.py)."""
+"""Steps of the interior point, in C and in PyTorch, against dense linear systems (tests/reference/interior.py)."""
 
 from __future__ import annotations
 
@@ -27,15 +27,13 @@ from torchgco import (
     StateBounds,
 )
 from torchgco.maps import OccupancyGrid
-from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import interior_of
 from torchgco.problem.rates import with_controls_before
 from torchgco.solvers.interior import FILTER
 
 pytestmark = [
-    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
     pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"),
-    pytest.mark.usefixtures("as_shipped"),
+    pytest.mark.usefixtures("as_shipped", "native"),
 ]
 
 B, D = 9, torch.float64  # one problem more than lanes
@@ -194,11 +192,9 @@ def multipliers(problem: Problem, X: Tensor, U: Tensor, seed: int | None) -> tup
 def iterates(
     problem: Problem, X: Tensor, U: Tensor, lam: tuple[Tensor, ...], mu: float, count: int, warm: bool
 ) -> dict[str, Any]:
-    """The state of all problems after `count` iterations in C."""
+    """The state of all problems after `count` iterations."""
     X, U, lam, mus = X.clone(), U.clone(), tuple(part.clone() for part in lam), torch.full((B,), mu, dtype=D)
-    kernels = interior_of(problem)
-    assert kernels is not None
-    out = kernels.solve(problem, X, U, lam, mus, warm=int(warm), max_iterations=count, **PLAIN)
+    out = interior_of(problem).solve(problem, X, U, lam, mus, warm=int(warm), max_iterations=count, **PLAIN)
     return {"X": X, "U": U, "lam": lam, "mu": mus, **out}
 
 

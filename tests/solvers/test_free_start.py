@@ -26,7 +26,6 @@ from torchgco import (
     Status,
     certify,
     judge,
-    kernels,
 )
 from torchgco.baselines import CasADiSolver
 from torchgco.native.compiler import find_compiler
@@ -131,12 +130,6 @@ def test_a_start_that_is_held_is_named_and_not_called_optimal() -> None:
     with pytest.warns(StartWarning, match="AugmentedLagrangian"):
         held = torchgco.solve(problem, solver="al_ilqr")
     assert torch.equal(held.X[:, 0], problem.x0) and held.statuses[0] == Status.FEASIBLE
-    kernels.use_native(False)
-    try:
-        with pytest.warns(StartWarning, match="Restarts"):
-            torchgco.solve(problem)
-    finally:
-        kernels.use_native(True)
 
 
 def denham(limit: float, low: float | list[float] = -INF, v0: float = 0.0) -> Problem:

@@ -94,11 +94,13 @@ def test_what_does_not_fit_is_refused() -> None:
     assert isinstance(solver.passes[-1], Starts)
 
 
-def test_without_kernels_they_are_refused() -> None:
+def test_without_native_kernels_they_are_taken_too() -> None:
+    swing = SWINGS.take(torch.tensor([0]))
+    native = solve(swing, solver="interior_point", X0=turns(0.5)[:1])
     kernels.use_native(False)
     try:
-        for name in ("interior_point", "gco"):
-            with pytest.raises(InputError, match=r"^X0"):
-                solve(SWINGS, solver=name, X0=turns(0.5))
+        found = solve(swing, solver="interior_point", X0=turns(0.5)[:1])
     finally:
         kernels.use_native(True)
+    assert found.statuses == native.statuses
+    torch.testing.assert_close(found.cost, native.cost, rtol=1e-6, atol=0)

@@ -25,6 +25,7 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.dispatch import cost_unit, current, interior_of
 from torchgco.native.engine import Engine
+from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.presets import named
@@ -136,7 +137,7 @@ class Compiled:
         self._kept: Kept | None = None
         if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
             kernels = interior_of(form)
-            if kernels is not None:
+            if isinstance(kernels, InteriorEngine):
                 self._problem, self._unit = form, cost_unit(form)
                 self._kept = Kept(kernels, form, **self._options(form))
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.constraints.separation import Separation
 from torchgco.dynamics import rollout
+from torchgco.eager.kernels import EagerInterior
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.native.compiler import NativeError, find_compiler
@@ -27,8 +29,8 @@ from torchgco.problem.problem import Problem
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
 CURRENT = "current"  # marks the form of problems that a solve works on
 INTERIOR = "interior"  # marks the library of the interior point
+EAGER_INTERIOR = "eager interior"  # marks the interior point's kernels in PyTorch
 EXPECTED = "expected"  # marks that the interior point will be asked for
-REASON = "reason"  # why there is no engine
 EAGER = "eager"  # marks that PyTorch's kernels have differentiated a user's parts
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines of problems without a user's code, the most recent ones
@@ -36,7 +38,7 @@ AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last 
 
 
 class EagerWarning(UserWarning):
-    """Native kernels can't be used for a problem; PyTorch's are, which takes longer and may leave passes out."""
+    """Native kernels can't be used for a problem; PyTorch's are, which takes longer."""
 
 
 def current(problem: Problem) -> Problem:
@@ -70,7 +72,7 @@ def engine_of(problem: Problem) -> Engine | None:
         except (InputError, NativeError) as error:
             problem.form["engine"] = None
             check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
-            problem.form[REASON] = reason = str(error).splitlines()[0]
+            reason = str(error).splitlines()[0]
             warned = problem.form.setdefault(WARNED, set())
             if reason not in warned:
                 warned.add(reason)
@@ -78,30 +80,9 @@ def engine_of(problem: Problem) -> Engine | None:
     return problem.form["engine"]
 
 
-def why_eager(problem: Problem) -> str | None:
-    """Why PyTorch's kernels solve these problems, in words; None where native ones do."""
-    if engine_of(problem) is not None:
-        return None
-    if problem.x0.device.type != "cpu":
-        return f"x0 is on the device {problem.x0.device.type}"
-    if problem.x0.dtype != torch.float64:
-        return f"x0 is {str(problem.x0.dtype).removeprefix('torch.')}"
-    return "this process has chosen them" if not native() else problem.form[REASON]
-
-
 def kernels_of(problem: Problem) -> str:
     """The kernels that have worked on problems of this form: "native" or "pytorch"."""
     return "pytorch" if problem.form.get("engine") is None or not native() else "native"
-
-
-def warn_of_left_out(problem: Problem, parts: Sequence[str]) -> None:
-    """An EagerWarning that names what a solver leaves out for these problems without native kernels, once for them."""
-    reason = why_eager(problem) if parts else None
-    warned = problem.form.setdefault(WARNED, set())
-    if reason is not None and (told := (reason, *parts)) not in warned:
-        warned.add(told)
-        text = f"solved by PyTorch's kernels, as {reason}. Without native ones (float64 on a CPU, with a C compiler) "
-        warnings.warn(f"{text}the solver leaves out: {'; '.join(parts)}", EagerWarning, stacklevel=4)
 
 
 def expect_interior(problem: Problem) -> None:
@@ -139,11 +120,27 @@ def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
     return problem.form[dtype]
 
 
-def interior_of(problem: Problem) -> InteriorEngine | None:
-    """The library of the interior point for problems of this form; None where there is none."""
+class InteriorKernels(Protocol):
+    """The interior point: `native.interior.InteriorEngine` in C, `eager.kernels.EagerInterior` in PyTorch."""
+
+    def solve(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+    ) -> dict[str, Tensor]:
+        """See `InteriorEngine.solve`."""
+        ...
+
+
+def interior_of(problem: Problem) -> InteriorKernels:
+    """The interior point's kernels for problems of this form: in C where there are native kernels, else PyTorch's.
+
+    Raises:
+        InputError: rows that join knots.
+    """
     engine = engine_of(problem)
     if engine is None:
-        return None
+        if EAGER_INTERIOR not in problem.form:
+            problem.form[EAGER_INTERIOR] = EagerInterior.of(problem)
+        return problem.form[EAGER_INTERIOR]
     if INTERIOR not in vars(engine):
         vars(engine)[INTERIOR] = InteriorEngine(engine)
     return vars(engine)[INTERIOR]

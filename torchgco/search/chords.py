@@ -15,8 +15,7 @@ from torchgco.base.options import Count, check_options
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived
-from torchgco.native.dispatch import chord_clearance, interior_of, measured
-from torchgco.problem.problem import Problem
+from torchgco.native.dispatch import chord_clearance, measured
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued
 from torchgco.solvers.interior import InteriorPoint
@@ -65,18 +64,13 @@ class ClearChords:
             call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
             new = best.attempt(call)
             serves, now[rows] = self._kept(search, rows, new, clearance[rows])
-            if interior_of(problem) is not None:
-                tight = continued(self.solver, replace(call, callback=None), new.best)
-                least = torch.where(serves & is_over(tight.status), now[rows].clamp(max=0.0), torch.inf)
-                too, clear = self._kept(search, rows, tight, least)
-                now[rows] = torch.where(too, clear, now[rows])
+            tight = continued(self.solver, replace(call, callback=None), new.best)
+            least = torch.where(serves & is_over(tight.status), now[rows].clamp(max=0.0), torch.inf)
+            too, clear = self._kept(search, rows, tight, least)
+            now[rows] = torch.where(too, clear, now[rows])
             clearance[rows] = torch.where(serves, now[rows], clearance[rows])
             rows = rows[clearance[rows] < 0]
         best.restore(touching, clearance[touching] < 0)
-
-    def left_out(self, problem: Problem) -> str | None:
-        """As of `Converge`."""
-        return "the interior point's ends of trajectories that touched between knots" if problem.geometric else None
 
     def _kept(self, search: Search, rows: Tensor, new: SolveEnd, least: Tensor) -> tuple[Tensor, Tensor]:
         """Where new trajectories of `rows` serve, with more clearance than `least`, they replace the best.

@@ -13,7 +13,7 @@ from torchgco.base.status import Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.maps.field import BoundField
-from torchgco.native.dispatch import chord_clearance, interior_of
+from torchgco.native.dispatch import chord_clearance
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.nearby import Nearby
@@ -21,18 +21,12 @@ from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.state import Iterate, SolveEnd
 
-LEFT_OUT = {
-    "first": "the first solve by the interior point", "mapped": "the interior point's solves in maps",
-    "last": "the interior point at the end",
-}  # fmt: skip
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
 
 @dataclass(frozen=True)
 class Converge:
     """Solves by the interior point, to its own tight tolerance.
-
-    It needs native kernels; where there are none, the other passes are left to solve.
 
     Args:
         solver: of these solves.
@@ -54,7 +48,7 @@ class Converge:
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem = search.call.problem
-        if problem.B == 0 or not self.serves(problem):
+        if problem.B == 0 or not self.worth(problem):
             return
         if self.when == "last":
             self._tighten(search)
@@ -68,18 +62,6 @@ class Converge:
             rows = _unsolved(search)
             search.best.improve(rows, search.call.take(rows))
 
-    def left_out(self, problem: Problem) -> str | None:
-        """What these problems lose without native kernels, in words; None: nothing."""
-        of_these = {"first": not problem.geometric, "mapped": _mapped(problem), "last": True}[self.when]
-        if not (of_these and self.worth(problem)):
-            return None
-        return f"{LEFT_OUT[self.when]} (violation {self.solver.violation_tolerance:g})"
-
-    @staticmethod
-    def serves(problem: Problem) -> bool:
-        """Whether these problems have more to them than AL-iLQR's inner solver, and native kernels."""
-        return Converge.worth(problem) and interior_of(problem) is not None
-
     @staticmethod
     def worth(problem: Problem) -> bool:
         """Whether these problems have more to them than AL-iLQR's inner solver."""
@@ -88,7 +70,7 @@ class Converge:
     @classmethod
     def begins(cls, problem: Problem) -> bool:
         """Whether the first solve of these problems is one by the interior point: they have no obstacles, too."""
-        return not problem.geometric and cls.serves(problem)
+        return not problem.geometric and cls.worth(problem)
 
     def _tighten(self, search: Search) -> None:
         best, rows = search.best, _unsolved(search)

@@ -10,7 +10,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
-from torchgco.native.dispatch import expect_interior, interior_of
+from torchgco.native.dispatch import expect_interior
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
@@ -76,17 +76,12 @@ class Restarts(Solver):
         if self._finishes and Converge.worth(problem):
             expect_interior(problem)
 
-    def left_out(self, problem: Problem) -> list[str]:
-        """What the passes say of themselves."""
-        said = (one.left_out(problem) for one in self.passes if isinstance(one, Converge | ClearChords | Starts))
-        return [part for part in said if part is not None]
-
     def frees_start(self, problem: Problem) -> bool:
-        """Where a pass is the interior point's, and there are native kernels."""
-        return self._finishes and interior_of(problem) is not None
+        """Where a pass is the interior point's."""
+        return self._finishes
 
     def take_states(self, problem: Problem) -> bool:
-        """Where the first solve is the interior point's: without obstacles, where there are native kernels."""
+        """Where the first solve is the interior point's: without obstacles."""
         first = any(isinstance(one, Converge) and one.when == "first" for one in self.passes)
         return first and Converge.begins(problem)
 

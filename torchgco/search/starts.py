@@ -13,7 +13,6 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import is_preferred
-from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import Converge
 from torchgco.search.finish import STREAM, half_ranges
@@ -33,7 +32,7 @@ class Starts:
     A guess has states on the straight line from the start to the end of the best trajectory, bent by smooth noise, and
     the controls given, with smooth noise: swing-ups and manoeuvres have many local minima, and random controls alone
     lead chaotic systems far away. A result is better that is feasible, or cheaper by more than a stationary trajectory
-    may leave to save. Guesses are keyed by (seed, id, start). Without native kernels nothing is done.
+    may leave to save. Guesses are keyed by (seed, id, start).
 
     Args:
         count: of guesses.
@@ -70,11 +69,6 @@ class Starts:
                 return
             self._solve(search, rows)
 
-    def left_out(self, problem: Problem) -> str | None:
-        """As of `Converge`."""
-        serves = Converge.worth(problem) and not problem.geometric
-        return f"{self.count} further starts by the interior point" if serves else None
-
     def _rows(self, search: Search) -> Tensor:
         """The problems to solve again, (b,)."""
         if self.when == "all":
@@ -107,11 +101,12 @@ class Starts:
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep results that are better than the best so far, by more than rounding, and as feasible as tolerated."""
         old, new = take(search.best.end.best, rows), end.best
+        admitted = self.solver.admitted(search.call.problem)
         # A solve that failed counts as lost where it violates by more than those that succeed.
         solved = is_over(search.best.end.status[rows])
-        limit = torch.where(solved, search.solver.violation_tolerance, self.solver.violation_tolerance)
+        limit = torch.where(solved, search.solver.violation_tolerance, admitted)
         lost = ~(old.violation <= limit)
         cheaper = new.cost < old.cost - STATIONARY * old.cost.abs()
-        tight = (end.status == SOLVED) & (new.violation <= old.violation.clamp(min=self.solver.violation_tolerance))
+        tight = (end.status == SOLVED) & (new.violation <= old.violation.clamp(min=admitted))
         better = is_preferred(search.call.problem.take(rows), new, old, limit) & (lost | (cheaper & tight))
         search.best.replace(rows, better, new, end)

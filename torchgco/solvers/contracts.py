@@ -21,7 +21,7 @@ from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.native.dispatch import cost_unit, current, kernels_of, open_loop, warn_of_left_out
+from torchgco.native.dispatch import cost_unit, current, kernels_of, open_loop
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
@@ -192,10 +192,9 @@ class Solver(Brief):
             self.announce(call.problem)
             call = call if X0 is None else self._from_states(call, X0, problem)
             if problem.free_start is not None and bool(problem.free_start.any()) and not self.frees_start(call.problem):
-                expected = "InteriorPoint, also within gco, does where there are native kernels (float64 on a CPU)"
+                expected = "InteriorPoint, also within gco, does"
                 held = f"free_start: the start is held at x0, as {type(self).__name__} doesn't choose it; {expected}"
                 warnings.warn(held, StartWarning, stacklevel=2)
-            warn_of_left_out(call.problem, self.left_out(call.problem))
             found = self.run(call)
             found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
             return replace(found, account=Account(problem, self, kernels=self.kernels or kernels_of(call.problem)))
@@ -207,10 +206,6 @@ class Solver(Brief):
     def announce(self, problem: Problem) -> None:
         """Say which libraries `run` will ask for, so that they are compiled side by side; called before any is."""
 
-    def left_out(self, problem: Problem) -> list[str]:
-        """What `run` does with these problems by native kernels alone, in words: left out where there are none."""
-        return []
-
     def take_states(self, problem: Problem) -> bool:
         """Whether `run` can begin these problems with states that their controls don't lead to."""
         return False
@@ -220,7 +215,7 @@ class Solver(Brief):
         check_tensor(X0, "X0", problem.x0)
         check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
         if not self.take_states(call.problem):
-            able = "interior_point or, without obstacles, gco, both with native kernels (float64 on a CPU); or ipopt"
+            able = "interior_point or, without obstacles, gco; or ipopt"
             raise InputError("X0", f"None, or a solver that can begin with states: {able}", type(self).__name__)
         if call.problem is not problem:  # controls before, where their change is bounded
             X0 = torch.cat((X0, open_loop(call.problem, call.U0)[..., problem.n :]), dim=-1)

@@ -13,18 +13,23 @@ from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.eager.kernels import least_violation
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.unmoved import unmoved
-from torchgco.native.dispatch import cost_unit, expect_interior, followed, interior_of, measured, open_loop
-from torchgco.native.interior import InteriorEngine
-from torchgco.problem.horizons import for_solvers
+from torchgco.native.dispatch import (
+    InteriorKernels,
+    cost_unit,
+    expect_interior,
+    followed,
+    interior_of,
+    measured,
+    open_loop,
+)
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
-from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.solvers.ending import STATIONARY, least_cost, start_status
-from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
@@ -63,12 +68,14 @@ class InteriorPoint(Solver):
     """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
 
     States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
-    anything; Hessians are exact. Returned trajectories are rollouts. What native kernels can't serve is solved by
-    AL-iLQR instead.
+    anything; Hessians are exact. Returned trajectories are rollouts. What kernels in C can't serve (single precision,
+    other devices, code that can't be traced) is solved by the same algorithm in PyTorch: statuses are the same, and
+    costs within 1e-6.
 
     Args:
-        tolerance: of the optimality conditions, scaled as in the paper.
-        violation_tolerance: residual (metres for lengths) up to which a trajectory counts as feasible.
+        tolerance: of the optimality conditions, scaled as in the paper; in float32 8e-6, or what rounding allows.
+        violation_tolerance: residual (metres for lengths) up to which a trajectory counts as feasible; in float32
+            1.2e-5 at least.
         max_iterations: of each problem.
         initial_barrier: the barrier parameter mu at the start.
         warm_barrier: the same for a call with multipliers of an earlier solution.
@@ -88,30 +95,28 @@ class InteriorPoint(Solver):
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
-        if interior_of(call.problem) is None:
-            return self._without_kernels().run(call)
-        session = Session(call, RAW)
+        session, admitted = Session(call, RAW), self.admitted(call.problem)
         end = self._no_worse(session.call, self.solved(session.call))
-        return session.finished(least_violated(session.call, end, self.violation_tolerance), self.violation_tolerance)
+        return session.finished(least_violated(session.call, end, admitted), admitted)
+
+    def admitted(self, problem: Problem) -> float:
+        """The violation tolerance, or what rounding in the problem's precision allows."""
+        return least_violation(self.violation_tolerance, problem.x0.dtype)
 
     def announce(self, problem: Problem) -> None:
         """For every problem."""
         expect_interior(problem)
 
-    def left_out(self, problem: Problem) -> list[str]:
-        """All of it."""
-        return ["the interior point, in whose place AL-iLQR solves"]
-
     def frees_start(self, problem: Problem) -> bool:
-        """Where there are native kernels."""
-        return interior_of(problem) is not None
+        """Always."""
+        return True
 
     def take_states(self, problem: Problem) -> bool:
-        """Where there are native kernels."""
-        return interior_of(problem) is not None
+        """Always."""
+        return True
 
     def solve_from(self, problem: Problem, X0: Tensor, U0: Tensor, max_seconds: float | None = None) -> Solution:
-        """Solve from states that the controls need not lead to, such as waypoints; without kernels, from U0 alone.
+        """Solve from states that the controls need not lead to, such as waypoints.
 
         Args:
             X0: (B, N+1, n); the first states are those of the problem, whatever is given, but where these are free.
@@ -124,11 +129,10 @@ class InteriorPoint(Solver):
         check_problem(problem)
         check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
         check_tensor(X0, "X0", problem.x0)
-        serves = self.take_states(for_solvers(problem))
-        return self.solve(problem, U0, max_seconds=max_seconds, X0=X0 if serves else None)
+        return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
 
     def solved(self, call: Call, X0: Tensor | None = None) -> SolveEnd:
-        """The solve without its verdict, in the units of the call, by native kernels.
+        """The solve without its verdict, in the units of the call.
 
         Args:
             X0: states to begin with, (B, N+1, n), of the first those components that are free; None: the call's, else
@@ -136,7 +140,6 @@ class InteriorPoint(Solver):
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         kernels = interior_of(problem)
-        assert kernels is not None
         rollout = open_loop(problem, call.U0)
         X = rollout if X0 is None else torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
@@ -164,7 +167,7 @@ class InteriorPoint(Solver):
         X = open_loop(problem, call.U0)
         cost, worst = problem.cost.total(X, call.U0), measured(problem, X, call.U0)
         lost = ~(torch.isfinite(found.cost) & torch.isfinite(found.violation))
-        worse = is_better(cost, worst, found.cost, found.violation, self.violation_tolerance) | lost
+        worse = is_better(cost, worst, found.cost, found.violation, self.admitted(problem)) | lost
         rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
         if rows.numel() > 0:
             multipliers = take(found.multipliers, rows)
@@ -172,7 +175,7 @@ class InteriorPoint(Solver):
             put(found, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
         return end
 
-    def _some(self, kernels: InteriorEngine, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
+    def _some(self, kernels: InteriorKernels, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
         """Solves problems, and puts how they ended into `end` at `rows`."""
         problem, warm = call.problem, call.warm
         if warm is None:
@@ -196,18 +199,11 @@ class InteriorPoint(Solver):
         status = torch.where(status == Status.CONVERGED, SOLVED, status)
         broken = (status == Status.INFEASIBLE).nonzero().flatten()  # rows that were left out
         if broken.numel() > 0:
-            fixed = unmoved(problem.take(broken), X[broken], U[broken], self.violation_tolerance)
+            fixed = unmoved(problem.take(broken), X[broken], U[broken], self.admitted(problem))
             status[broken] = torch.where(fixed, UNMOVED, int(Status.LINE_SEARCH_FAILED))
         sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
         end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]
-
-    def _without_kernels(self) -> AugmentedLagrangian:
-        """AL-iLQR to the same violation, with limits that few problems reach."""
-        return AugmentedLagrangian(
-            ILQR(max_iterations=200, damp_below=0.125), initial_penalty=2.0, max_outer_iterations=100,
-            stalled_growth=10.0, patience=8, violation_tolerance=self.violation_tolerance,
-        )  # fmt: skip
 
 
 def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor, Tensor]:

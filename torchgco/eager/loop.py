@@ -1,0 +1,290 @@
+"""The interior point of Waechter and Biegler (2006) in PyTorch's kernels, for a batch of problems at once.
+
+The algorithm is that of native/c/interior.c, step by step; solvers/interior says what its options mean. Problems that
+have ended leave the batch.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.status import Status
+from torchgco.eager import step as riccati
+from torchgco.eager.fixed import (
+    breaks_rows_left_out,
+    join_multipliers,
+    readmit,
+    relax,
+    sort_rows,
+    split_multipliers,
+)
+from torchgco.eager.model import Derivatives, Model
+from torchgco.eager.search import Step, curvature, go_back, search, stepped
+from torchgco.eager.state import (
+    How,
+    Kinds,
+    State,
+    adjoin,
+    blank,
+    column,
+    errors,
+    find_solved,
+    lower_barrier,
+    remeasure,
+    renew,
+    residuals,
+    settle,
+)
+from torchgco.problem.problem import Problem
+
+
+def solve(
+    model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+) -> dict[str, Tensor]:
+    """As `native.interior.InteriorEngine.solve`, for any device and dtype."""
+    problem, how = model.problem, How(**options)
+    flat = _flat(problem, multipliers, X)
+    equality = _of_rows(problem, X, [part.sense == "equality" for part in problem.constraints])
+    kinds = Kinds(equality, how, how.constant, how.least_cost, barrier.clone(), problem.N, problem.n)
+    B, until = problem.B, time.monotonic() + how.seconds
+    out = {
+        "status": torch.zeros(B, dtype=torch.int32, device=X.device),
+        "iterations": torch.zeros(B, dtype=torch.int64, device=X.device),
+        "gains": X.new_zeros(B, problem.N, problem.m, problem.n + 1),
+        "error": X.new_zeros(B), "theta": X.new_zeros(B),
+    }  # fmt: skip
+    loop = _Loop(kinds, model, blank(problem, X, U, flat))
+    if B > 0:
+        begin(kinds, model, loop.t)
+    while loop.t.rows.numel() > 0:
+        status, error = loop.iterate()
+        if time.monotonic() > until:
+            status = torch.where(status == Status.RUNNING, int(Status.TIME_LIMIT), status)
+        ended = (status != Status.RUNNING).nonzero().flatten()
+        if ended.numel() == 0:
+            continue
+        t, part = loop.t.take(ended), loop.model.take(ended)
+        rows = t.rows
+        end = torch.where((status[ended] == Status.CONVERGED) & breaks_rows_left_out(kinds, t), int(Status.INFEASIBLE),
+                          status[ended])  # fmt: skip
+        out["status"][rows], out["iterations"][rows] = end.to(torch.int32), t.made
+        out["error"][rows], out["theta"][rows] = error[ended], t.theta
+        out["gains"][rows, ..., : problem.n] = gains(kinds, part, t)
+        X[rows], U[rows], barrier[rows] = t.X, t.U, t.mu
+        lam = t.z / column(t.scale)
+        split_multipliers(part, t, lam)
+        flat[rows] = lam
+        loop.keep((status == Status.RUNNING).nonzero().flatten())
+    sizes = [knots * rows for knots, rows in problem.row_shapes]
+    for lam, part in zip(multipliers, flat.split(sizes, dim=-1), strict=True):
+        lam.copy_(part.view_as(lam))
+    return out
+
+
+def _flat(problem: Problem, multipliers: tuple[Tensor, ...], X: Tensor) -> Tensor:
+    """Multipliers of all rows, (B, R)."""
+    return torch.cat([X.new_zeros(problem.B, 0), *(lam.flatten(1) for lam in multipliers)], dim=-1)
+
+
+def _of_rows(problem: Problem, X: Tensor, flags: list[bool]) -> Tensor:
+    """A flag of each constraint, of each of its rows (R,)."""
+    found = [torch.zeros(0, dtype=torch.bool, device=X.device)]
+    for flag, (knots, rows) in zip(flags, problem.row_shapes, strict=True):
+        found.append(torch.full((knots * rows,), flag, device=X.device))
+    return torch.cat(found)
+
+
+def begin(kinds: Kinds, model: Model, t: State) -> None:
+    """The scale of the cost, slacks and multipliers."""
+    how = kinds.how
+    t.mu, t.soft = kinds.barrier[t.rows], torch.full_like(t.mu, how.soft)
+    slopes, H = model.cost_model(t.X, t.U)
+    largest = torch.maximum(slopes.abs().flatten(1).amax(-1), H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1))
+    scale = how.steepest / largest
+    t.scale = torch.where(torch.isfinite(scale) & (largest > 0.0), scale, t.scale)
+    settle(kinds, model, t)
+    sort_rows(kinds, model, t)
+    t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
+    remeasure(kinds, t)
+    if not how.warm:
+        renew(kinds, model, t)
+        return
+    join_multipliers(model, t)
+    z = column(t.scale) * t.z
+    inside = torch.maximum(z, column(t.mu) / (how.central * t.s))
+    t.z = torch.where(kinds.inside(t), inside, torch.where(kinds.fixed(t), z, 0.0))
+    adjoin(kinds, model.slopes(t.X, t.U), t)
+
+
+def gains(kinds: Kinds, model: Model, t: State) -> Tensor:
+    """The gains K (b, N, m, n) along the trajectories."""
+    at = model.expand(t.X, t.U, t.scale * t.objective, column(t.objective).unsqueeze(-1) * t.y,
+                      column(t.objective) * t.z)  # fmt: skip
+    H = curvature(kinds, at, t)
+    return riccati.factor(at.F, H, t.shift, kinds.how.pivot, model.problem.free_start).K.transpose(0, 1)
+
+
+class _Loop:
+    """The problems that are running, t; others have left."""
+
+    def __init__(self, kinds: Kinds, model: Model, t: State) -> None:
+        self.kinds, self.model, self.t = kinds, model, t
+
+    def keep(self, rows: Tensor) -> None:
+        """Go on with some of the problems."""
+        self.t, self.model = self.t.take(rows), self.model.take(rows)
+
+    def iterate(self) -> tuple[Tensor, Tensor]:
+        """One iteration; the statuses (b,) of the problems that end, RUNNING for others, and the errors (b,)."""
+        kinds, model, t, how = self.kinds, self.model, self.t, self.kinds.how
+        every = torch.ones_like(t.watching)
+        readmit(kinds, model, t, every, how.highest)  # beyond which no residual is accepted
+        relax(kinds, model, t)
+        at, r = self._expanded(), residuals(kinds, t, t.c, t.s)
+        test = errors(kinds, at, t, r, model.problem.free_start)
+        status = torch.full_like(t.made, int(Status.RUNNING))
+        astray = t.watching & ~torch.isfinite(test.whole)
+        small = (test.whole <= max(how.tolerance, how.rounding)) & (test.primal <= how.violation) & ~t.restoring
+        if bool(astray.any()):
+            go_back(t, astray)
+        solved = find_solved(kinds, t, test, ~astray)
+        again = readmit(kinds, model, t, solved, how.violation)
+        if bool(again.any()):
+            at, r = self._expanded(), residuals(kinds, t, t.c, t.s)
+        over = t.made >= how.max_iterations
+        limit = torch.where(small, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
+        ended = torch.where(over, limit, status)
+        ended = torch.where(torch.isfinite(test.whole), ended, int(Status.NON_FINITE))
+        ended = torch.where(solved, torch.where(again, status, int(Status.CONVERGED)), ended)
+        status = torch.where(astray, status, ended)
+        running = (status == Status.RUNNING) & ~astray
+        if bool(running.any()):
+            lower_barrier(kinds, t, test, running)
+            self._move(status, running, small, at, r)
+        return status, test.whole
+
+    def _expanded(self) -> Derivatives:
+        t, objective = self.t, column(self.t.objective)
+        return self.model.expand(t.X, t.U, t.scale * t.objective, objective.unsqueeze(-1) * t.y, objective * t.z)
+
+    def _move(self, status: Tensor, running: Tensor, small: Tensor, at: Derivatives, r: Tensor) -> None:
+        """A step of the problems `running`; the statuses of those that end, in place."""
+        kinds, t, how = self.kinds, self.t, self.kinds.how
+        step, moving = self._directed(running, at, r)
+        t.last = torch.where(moving & (t.shift > 0.0), t.shift, t.last)
+        astray = running & ~moving & t.watching
+        if bool(astray.any()):
+            go_back(t, astray)
+        lost = running & ~moving & ~astray
+        indefinite = torch.where(small, int(Status.CONVERGED), int(Status.NOT_POSITIVE_DEFINITE))
+        status[:] = torch.where(lost, indefinite, status)
+        tau = torch.clamp(1.0 - t.mu, min=how.boundary, max=how.closest)
+        won = search(kinds, self.model, t, step, moving, tau)
+        t.made = t.made + running.to(t.made.dtype)
+        self._remember_shift(won)
+        t.soft = torch.where(won, (how.soft_decay * t.soft).clamp(min=how.soft), t.soft)
+        t.failures = torch.where(won & ~t.restoring & (t.forced == 0.0), 0, t.failures)
+        status[:] = torch.where(moving & ~won & small, int(Status.CONVERGED), status)
+        lost = self._recover(moving & ~won & ~small)
+        status[:] = torch.where(lost, int(Status.LINE_SEARCH_FAILED), status)
+        self._resume(status == Status.RUNNING)
+
+    def _remember_shift(self, won: Tensor) -> None:
+        """Where only short steps are accepted, the step reaches further than the model: more curvature shortens it."""
+        t, how = self.t, self.kinds.how
+        lower, floor = how.recovery_decay * t.forced, how.shift_crawl
+        higher = torch.where(t.shift > floor, how.recovery_growth * t.shift, t.last.clamp(min=floor))
+        lower = torch.where(lower >= floor, lower, 0.0)
+        t.forced = torch.where(won & ~t.restoring, torch.where(t.crawls, higher, lower), t.forced)
+
+    # The direction --------------------------------------------------------------------------------------------------
+
+    def _directed(self, running: Tensor, at: Derivatives, r: Tensor) -> tuple[Step, Tensor]:
+        """The step of the problems `running`, and which of them have one."""
+        kinds, t, how = self.kinds, self.t, self.kinds.how
+        t.shift = torch.where(running, t.forced, t.shift)
+        H, free = curvature(kinds, at, t), self.model.problem.free_start
+        none = torch.zeros_like(t.c)
+        factors = riccati.factor(at.F, H, t.shift, how.pivot, free)
+        step = Step(at, H, factors, t.gap.clone(), r.clone(), t.X, t.U, t.y, none, none)
+        moving = self._shifted(step, running)
+        stepped(kinds, step, t)
+        while t.z.shape[1] > 0:
+            # Where equalities contradict each other to first order, their multipliers explode: a softer step is taken.
+            largest = torch.where(kinds.fixed(t), (t.z + step.dz).abs(), 0.0).amax(-1)
+            large = moving & (largest > how.explodes) & (t.soft < how.softest)
+            if not bool(large.any()):
+                break
+            t.soft = torch.where(large, how.soft_growth * t.soft, t.soft)
+            step.H, t.shift = curvature(kinds, at, t), torch.where(large, t.forced, t.shift)
+            rows = large.nonzero().flatten()
+            self._factor(step, rows)
+            moving = moving & (~large | self._shifted(step, large))
+            stepped(kinds, step, t)
+        return step, moving
+
+    def _factor(self, step: Step, rows: Tensor) -> None:
+        free, at = self.model.problem.free_start, (step.at.F[rows], step.H[rows], self.t.shift[rows])
+        new = riccati.factor(*at, self.kinds.how.pivot, None if free is None else free[rows])
+        riccati.put(step.factors, rows, new)
+
+    def _shifted(self, step: Step, of: Tensor) -> Tensor:
+        """Factors of the problems `of` with the least shift of the ladder that makes them positive definite.
+
+        Returns which have one.
+        """
+        t, how = self.t, self.kinds.how
+        lost, never = torch.zeros_like(of), t.last == 0.0
+        while True:
+            bad = of & ~lost & ~step.factors.good
+            if not bool(bad.any()):
+                return of & ~lost
+            first = torch.where(never, how.shift_first, (how.shift_decay * t.last).clamp(min=how.shift_least))
+            growth = torch.where(never, how.shift_growth_first, torch.full_like(t.last, how.shift_growth))
+            following = torch.where(t.shift == 0.0, first, growth * t.shift)
+            t.shift = torch.where(bad, following, t.shift)
+            lost = lost | (bad & ~(t.shift <= how.shift_max))
+            self._factor(step, bad.nonzero().flatten())
+
+    # Feasibility alone ----------------------------------------------------------------------------------------------
+
+    def _recover(self, failed: Tensor) -> Tensor:
+        """Problems whose line search failed look for feasibility alone: steps of least length that close residuals.
+
+        Where there is nothing to close, they start anew with new multipliers and a shift. Returns those that give up.
+        """
+        t, how = self.t, self.kinds.how
+        if not bool(failed.any()):
+            return failed
+        t.failures = t.failures + failed.to(t.failures.dtype)
+        lost = failed & (t.failures > how.failures)
+        renewed = failed & ~lost
+        seeks = renewed & (t.theta > how.violation) & ~t.restoring
+        t.forced = torch.where(renewed, (how.forced_growth * t.forced).clamp(min=how.shift_recovery), t.forced)
+        t.entered = torch.where(seeks, t.theta, t.entered)
+        t.restoring = torch.where(renewed, seeks, t.restoring)
+        t.objective = torch.where(renewed, (~seeks).to(t.objective.dtype), t.objective)
+        self._anew(renewed)
+        return lost
+
+    def _resume(self, of: Tensor) -> None:
+        """Problems that have become feasible enough go on with the cost."""
+        t, how = self.t, self.kinds.how
+        done = of & t.restoring & ((t.theta <= how.restored * t.entered) | (t.theta <= how.violation))
+        t.restoring = t.restoring & ~done
+        t.objective = torch.where(done, 1.0, t.objective)
+        self._anew(done)
+
+    def _anew(self, of: Tensor) -> None:
+        """New multipliers and filters of the problems `of`."""
+        rows = of.nonzero().flatten()
+        if rows.numel() == 0:
+            return
+        some, part = self.t.take(rows), self.model.take(rows)
+        renew(self.kinds, part, some)
+        remeasure(self.kinds, some)
+        self.t.put(rows, some)
