@@ -33,7 +33,7 @@ from torchgco.problem.goal import Goal
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
-from torchgco.solvers.ending import least_cost
+from torchgco.solvers.ending import constant_cost, least_cost
 from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
 
 SOLVERS = "gco", "interior_point"
@@ -146,7 +146,7 @@ class Compiled:
         return FILTER | {
             "push": interior.warm_barrier, "warm": 1, "max_iterations": interior.max_iterations,
             "tolerance": interior.tolerance, "violation": interior.violation_tolerance, "seconds": math.inf,
-            "constant": problem.cost_scale.constant, "least_cost": least_cost(problem),
+            "constant": constant_cost(problem), "least_cost": least_cost(problem),
         }  # fmt: skip
 
     def __call__(

@@ -56,9 +56,15 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
-    cost = (problem.cost.total(X, U) - problem.cost_scale.constant).abs() + least_cost(problem)
+    cost = least_cost(problem) + (problem.cost.total(X, U) - constant_cost(problem)).abs()
     G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
     return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
+
+
+def constant_cost(problem: Problem) -> Tensor:
+    """What is constant in each problem's cost, (B,), where it dwarfs the rest; 0 elsewhere."""
+    cost_unit(problem)  # by native kernels, where PyTorch would differentiate
+    return problem.cost_scale.constant
 
 
 def least_cost(problem: Problem) -> Tensor:

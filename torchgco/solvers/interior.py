@@ -29,7 +29,7 @@ from torchgco.native.dispatch import (
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
-from torchgco.solvers.ending import STATIONARY, least_cost, start_status
+from torchgco.solvers.ending import STATIONARY, constant_cost, least_cost, start_status
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
@@ -188,7 +188,7 @@ class InteriorPoint(Solver):
         fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
         out = kernels.solve(
             problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
-            constant=problem.cost_scale.constant, least_cost=least_cost(problem), seconds=call.seconds_left,
+            constant=constant_cost(problem), least_cost=least_cost(problem), seconds=call.seconds_left,
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
         X, U = followed(problem, X, U, out["gains"][..., :-1])

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchgco.native.dispatch import cost_unit, measured, open_loop
 from torchgco.problem.problem import Problem
-from torchgco.solvers.ending import STATIONARY
+from torchgco.solvers.ending import STATIONARY, constant_cost
 from torchgco.solvers.state import Iterate
 
 # Falls of the cost from that of the guess, as multiples of the size of that cost plus the cost unit of all stages.
@@ -39,7 +39,7 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     fall, size, times = before - costs, before.abs() + unit, cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
     linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP * size)
     rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
-    without = (cost - held.cost_scale.constant).abs() + unit
+    without = (cost - constant_cost(held)).abs() + unit
     by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]
     falls[rows] = (fall[0] >= BOTTOMLESS * size) | ((linear | by_decades) & clear)
     return falls
