@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,12 +47,20 @@ class EagerInterior:
         return cls(Model.of(problem))
 
     def solve(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+        self,
+        problem: Problem,
+        X: Tensor,
+        U: Tensor,
+        multipliers: tuple[Tensor, ...],
+        barrier: Tensor,
+        late: Callable[[], bool] = lambda: False,
+        **options: Any,
     ) -> dict[str, Tensor]:
         """As `native.interior.InteriorEngine.solve`; options that rounding in the problem's dtype can't meet are raised
         to what it can (`fitted`).
         """
-        return solve(self.model.among(problem), X, U, multipliers, barrier, **options | fitted(options, X.dtype))
+        options |= fitted(options, X.dtype)
+        return solve(self.model.among(problem), X, U, multipliers, barrier, late, **options)
 
 
 def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:

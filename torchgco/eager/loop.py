@@ -6,6 +6,7 @@ have ended leave the batch.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -42,7 +43,13 @@ from torchgco.problem.problem import Problem
 
 
 def solve(
-    model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+    model: Model,
+    X: Tensor,
+    U: Tensor,
+    multipliers: tuple[Tensor, ...],
+    barrier: Tensor,
+    late: Callable[[], bool],
+    **options: Any,
 ) -> dict[str, Tensor]:
     """As `native.interior.InteriorEngine.solve`, for any device and dtype."""
     problem, how = model.problem, How(**options)
@@ -61,6 +68,8 @@ def solve(
         begin(kinds, model, loop.t)
     while loop.t.rows.numel() > 0:
         status, error = loop.iterate()
+        if late():
+            status = torch.where(status == Status.RUNNING, int(Status.TIME_LIMIT), status)
         ended = (status != Status.RUNNING).nonzero().flatten()
         if ended.numel() == 0:
             continue

@@ -124,7 +124,14 @@ class InteriorKernels(Protocol):
     """The interior point: `native.interior.InteriorEngine` in C, `eager.kernels.EagerInterior` in PyTorch."""
 
     def solve(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+        self,
+        problem: Problem,
+        X: Tensor,
+        U: Tensor,
+        multipliers: tuple[Tensor, ...],
+        barrier: Tensor,
+        late: Callable[[], bool],
+        **options: Any,
     ) -> dict[str, Tensor]:
         """See `InteriorEngine.solve`."""
         ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -31,7 +32,14 @@ class InteriorEngine:
         self.library = load(_source(engine), STRUCTURES)
 
     def solve(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+        self,
+        problem: Problem,
+        X: Tensor,
+        U: Tensor,
+        multipliers: tuple[Tensor, ...],
+        barrier: Tensor,
+        late: Callable[[], bool] = lambda: False,
+        **options: Any,
     ) -> dict[str, Tensor]:
         """States, controls, multipliers and barrier parameters in place; X begins with the problem's start, or
         a guess of what is free in it.
@@ -40,6 +48,7 @@ class InteriorEngine:
             X, U: (B, N+1, n), (B, N, m), contiguous.
             multipliers: of every constraint, (B, K, p), contiguous.
             barrier: mu (B,).
+            late: whether the time is over; PyTorch's kernels ask after every iteration, and C doesn't.
             options: the fields of `structures.Interior`.
 
         Returns:

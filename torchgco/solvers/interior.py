@@ -187,7 +187,7 @@ class InteriorPoint(Solver):
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
         fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
         out = kernels.solve(
-            problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
+            problem, X, U, multipliers, X.new_full((problem.B,), mu), lambda: call.late, warm=int(warm is not None),
             constant=problem.cost_scale.constant, least_cost=least_cost(problem),
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
