@@ -56,7 +56,8 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
-    cost = (problem.cost.total(X, U) - problem.cost_scale.constant).abs() + least_cost(problem)
+    least = least_cost(problem)  # first: native kernels know the scale without PyTorch's derivatives
+    cost = (problem.cost.total(X, U) - problem.cost_scale.constant).abs() + least
     G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
     return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
 
