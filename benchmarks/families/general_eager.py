@@ -56,8 +56,7 @@ def table(sets: Sequence[int], families: Sequence[str], seed: int, batch: int) -
     every = pd.concat(rows)
     ratios = every.drop_duplicates("family").ratio
     said = (
-        f"{int(every.same.sum())} of {len(every)} statuses are the same, "
-        f"and {int((every.change <= SAME).sum())} costs; "
+        f"Of {len(every)} statuses {int(every.same.sum())} are the same, of costs {int((every.change <= SAME).sum())}; "
         f"times in PyTorch are {ratios.min():.0f} to {ratios.max():.0f} times those in C, {ratios.median():.0f} in the "
         "median of families."
     )

@@ -218,3 +218,9 @@ def test_every_solve_ends_at_its_limit() -> None:
     with by_pytorch():
         solution = torchgco.solve(cart(), solver=InteriorPoint(max_iterations=2), verbose=False)
     assert solution.iterations.tolist() == [2, 2, 2] and Status.CONVERGED not in solution.statuses
+
+
+def test_the_time_is_looked_at_in_every_iteration() -> None:
+    with by_pytorch():
+        solution = InteriorPoint().solve(cart(), torch.zeros(3, 12, 1, dtype=D), max_seconds=1e-9)
+        assert set(solution.statuses) <= {Status.TIME_LIMIT, Status.FEASIBLE} and int(solution.iterations.max()) <= 1

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgco.base.autodiff import jacobian
 from torchgco.base.shapes import MISTAKES
 
-AT_ONCE = 2**21  # numbers of w, over all directions, that are differentiated together: bounds the memory
+AT_ONCE = 2**20  # numbers of w, over all directions, that are differentiated together: bounds the memory
 
 Function = Callable[[Tensor], Tensor]  # of w (b, K', v): rows (b, K, p)
 Expansion = Callable[[Function, Tensor, Tensor], tuple[Tensor, Tensor]]

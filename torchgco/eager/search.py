@@ -31,6 +31,9 @@ class Step:
     dz: Tensor
 
 
+MADE = "aim", "r", "dx", "du", "yn", "ds", "dz"  # of a step for each problem, by `stepped`
+
+
 def curvature(kinds: Kinds, at: Derivatives, t: State) -> Tensor:
     """The Hessian of the condensed system (b, N+1, S, S)."""
     hold = torch.where(kinds.fixed(t), 1.0 / column(t.soft), 0.0)
@@ -53,11 +56,9 @@ def stepped(kinds: Kinds, step: Step, t: State) -> None:
 
 
 def part_of(step: Step, rows: Tensor) -> Step:
-    """The step of the problems `rows`, to be made anew: `H`, and derivatives by reference, are those of all."""
-    factors = riccati.take(step.factors, rows)
-    names = ("aim", "r", "dx", "du", "yn", "ds", "dz")
-    own = {name: getattr(step, name)[rows] for name in names}
-    return replace(step, factors=factors, at=taken(step.at, rows), **own)
+    """The step of the problems `rows`; what the factors are made of, and these, are those of all."""
+    own = {name: getattr(step, name)[rows] for name in MADE}
+    return replace(step, at=taken(step.at, rows), **own)
 
 
 def taken(at: Derivatives, rows: Tensor) -> Derivatives:
@@ -70,7 +71,7 @@ def taken(at: Derivatives, rows: Tensor) -> Derivatives:
 
 def put_step(step: Step, rows: Tensor, some: Step) -> None:
     """Write what `stepped` makes of some problems."""
-    for name in ("aim", "r", "dx", "du", "yn", "ds", "dz"):
+    for name in MADE:
         getattr(step, name)[rows] = getattr(some, name)
 
 
@@ -250,7 +251,7 @@ def search(kinds: Kinds, model: Model, t: State, step: Step, moving: Tensor, tau
     _watch(kinds, t, moving, slope, full)
     open_ = moving.nonzero().flatten()
     won, corrected = torch.zeros_like(t.watching), torch.zeros_like(t.watching)
-    first = True
+    every, plain, first = torch.arange(len(alpha), device=alpha.device), step, True  # plain: before corrections
     while open_.numel() > 0:
         some, part, own = (t, model, step) if open_.numel() == len(alpha) else (
             t.take(open_), model.take(open_), part_of(step, open_)
@@ -264,14 +265,17 @@ def search(kinds: Kinds, model: Model, t: State, step: Step, moving: Tensor, tau
         done = found.good | found.back
         halves = ~done & ~found.again
         a = torch.where(halves, 0.5 * torch.where(corrected[open_], full[open_], a), a)
-        redone = (found.again | found.undo).nonzero().flatten()
-        if redone.numel() > 0:
-            _redirect(kinds, some, own, trial, redone, alpha[open_], first)
-            p, q = _longest(kinds, some, own, tau[open_])
-            a, d = torch.where(found.again, p, a), torch.where(found.again | found.undo, q, d)
         if some is not t:
             t.put(open_, some)
-            put_step(step, open_, own)
+        again, undo = open_[found.again], open_[found.undo]
+        if again.numel() > 0:
+            plain = part_of(step, every)
+            _correct(kinds, t, step, trial, found.again, again, alpha[again])
+        if undo.numel() > 0:
+            put_step(step, undo, part_of(plain, undo))
+        if again.numel() + undo.numel() > 0:
+            p, q = (length[open_] for length in _longest(kinds, t, step, tau))
+            a, d = torch.where(found.again, p, a), torch.where(found.again | found.undo, q, d)
         alpha[open_], dual[open_] = a, d
         won[open_] = done
         corrected[open_] = found.again
@@ -280,14 +284,14 @@ def search(kinds: Kinds, model: Model, t: State, step: Step, moving: Tensor, tau
     return won
 
 
-def _redirect(kinds: Kinds, t: State, step: Step, trial: Trial, rows: Tensor, alpha: Tensor, corrects: bool) -> None:
-    """Second-order corrections: steps that close what trials at alpha left, too; or back to the uncorrected ones."""
+def _correct(kinds: Kinds, t: State, step: Step, trial: Trial, of: Tensor, rows: Tensor, alpha: Tensor) -> None:
+    """Second-order corrections of the problems `rows`: steps that close what trials at alpha left, too; in place.
+
+    `of` are their places among the trials.
+    """
     some, own = t.take(rows), part_of(step, rows)
-    r = residuals(kinds, some, some.c, some.s)
-    if corrects:
-        left, by = residuals(kinds, some, trial.c[rows], trial.s[rows]), alpha[rows]
-        own.aim, own.r = by.view(-1, 1, 1) * own.aim + trial.gap[rows], column(by) * own.r + left
-    else:
-        own.aim, own.r = some.gap, r
+    own.factors = riccati.take(step.factors, rows)
+    left = residuals(kinds, some, trial.c[of], trial.s[of])
+    own.aim, own.r = alpha.view(-1, 1, 1) * own.aim + trial.gap[of], column(alpha) * own.r + left
     stepped(kinds, own, some)
     put_step(step, rows, own)
