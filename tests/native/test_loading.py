@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("cache")
 def compilations(monkeypatch) -> list[str]:
     """The lines that announce them."""
     seen: list[str] = []
-    monkeypatch.setattr(compiler, "notice", seen.append)
+    monkeypatch.setattr(compiler, "notice", lambda text, brief=False: seen.append(text))
     return seen
 
 
