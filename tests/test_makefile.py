@@ -57,6 +57,7 @@ def test_a_machine_without_a_compiler_gets_one(tmp_path: Path) -> None:
     assert [call.split()[-1] for call in calls] == [".", ".[native]"]
 
 
+@pytest.mark.slow
 def test_a_machine_with_a_compiler_gets_none(tmp_path: Path) -> None:
     said, calls = make_study(tmp_path, compiler=True)
     assert "No C compiler" not in said and [call.split()[-1] for call in calls] == ["."]
@@ -67,6 +68,7 @@ def test_who_names_a_compiler_or_wants_none_gets_none(tmp_path: Path) -> None:
     assert [call.split()[-1] for call in calls] == ["."]
 
 
+@pytest.mark.slow
 def test_an_extra_that_cannot_be_installed_does_not_stop_the_study(tmp_path: Path) -> None:
     said, calls = make_study(tmp_path, code=1)
     assert "It can't be installed here" in said and len(calls) == 2

@@ -24,7 +24,8 @@ START = np.array([0.0, 0.0, 0.0, 3.0])
 FIRST = 5  # periods that aren't timed
 ROOM = RADIUS + VEHICLE + 0.7  # m from a disc's centre that a car at 3 m/s needs to turn away; nearer discs vanish
 NOISE = np.array([0.1, 0.1, 0.05, 0.3])  # standard deviation of a disturbance, times its share
-Controller = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, int, bool]]
+Report = Callable[[], tuple[int, bool]]  # iterations, and whether the period is solved: asked for after it is timed
+Controller = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, Report]]
 
 
 def rates(x: Tensor, u: Tensor) -> Tensor:
@@ -78,8 +79,9 @@ def drive(control: Controller, periods: int, noise: float = 0.0) -> Drive:
             centers = np.stack((ahead, 2 * np.sin(0.5 * ahead / 3) + np.array([1.2, -1.0])), -1)
             centers = centers - 10.0 * (np.linalg.norm(centers - x[:2], axis=1) < ROOM)[:, None]
         began = time.thread_time()
-        u, iterations, solved = control(x, reference(t), centers)
+        u, report = control(x, reference(t), centers)
         found.seconds.append(time.thread_time() - began)
+        iterations, solved = report()
         found.iterations.append(iterations)
         found.solved += solved
         x = CAR.step(torch.tensor(x[None]), torch.tensor(u[None]))[0].numpy()
@@ -91,9 +93,9 @@ def compiled(solver: str) -> Controller:
     """By `torchgco.compile`."""
     mpc = torchgco.compile(problem(START[None], reference(0.0)[None], CENTERS), solver, receding=True)
 
-    def control(x: np.ndarray, x_ref: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, int, bool]:
+    def control(x: np.ndarray, x_ref: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, Report]:
         answer = mpc(x0=x, x_ref=x_ref, centers=centers)
-        return answer.U[0, 0].numpy(), int(answer.iterations), answer.statuses[0] == Status.CONVERGED
+        return answer.U[0, 0].numpy(), lambda: (int(answer.iterations), answer.statuses[0] == Status.CONVERGED)
 
     return control
 
@@ -102,11 +104,11 @@ def plain(solver: str) -> Controller:
     """By a new problem and `torchgco.solve` in every period, warm."""
     last: list[torchgco.Solution] = []
 
-    def control(x: np.ndarray, x_ref: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, int, bool]:
+    def control(x: np.ndarray, x_ref: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, Report]:
         now = problem(x[None], x_ref[None], centers)
         found = torchgco.solve(now, solver=solver, warm=last[-1] if last else None, verbose=False)
         last[:] = [found]
-        return found.U[0, 0].numpy(), int(found.iterations), found.statuses[0] == Status.CONVERGED
+        return found.U[0, 0].numpy(), lambda: (int(found.iterations), found.statuses[0] == Status.CONVERGED)
 
     return control
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 N, DT = 20, 0.1
+Report = Callable[[], tuple[int, bool]]
 CASES = (  # name, plugin, compiled, the last solution shifted by a stage
     ("fatrop", "fatrop", False, False), ("fatrop, compiled", "fatrop", True, False),
     ("fatrop, compiled, shifted", "fatrop", True, True), ("ipopt, compiled, shifted", "ipopt", True, True),
@@ -19,7 +20,7 @@ FLAGS = {"compiler": "shell", "jit": True, "jit_options": {"flags": ["-O3", "-ma
 
 @dataclass
 class Peer:
-    """A controller: control(x, x_ref, centers) gives the first controls, the iterations, and whether it succeeded."""
+    """A controller: control(x, x_ref, centers) gives the first controls, and what to ask for the iterations."""
 
     name: str
     plugin: str
@@ -46,13 +47,16 @@ class Peer:
         self.solver = ca.nlpsol("car", self.plugin, program, options)
         self.last = {"x0": np.zeros(program["x"].shape[0])}
 
-    def __call__(self, x: np.ndarray, x_ref: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, int, bool]:
+    def __call__(self, x: np.ndarray, x_ref: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, Report]:
         found = self.solver(p=np.concatenate((x, x_ref.ravel(), centers.ravel())), **self.bounds, **self.last)
         z = np.array(found["x"]).ravel()
         start = np.concatenate((z[6:], z[-6:])) if self.shifted else z
         self.last = {"x0": start, "lam_x0": found["lam_x"], "lam_g0": found["lam_g"]}
+        return z[4:6], self._report
+
+    def _report(self) -> tuple[int, bool]:
         stats = self.solver.stats()
-        return z[4:6], int(stats["iter_count"]), bool(stats["success"])
+        return int(stats["iter_count"]), bool(stats["success"])
 
 
 def _step(x: ca.SX, u: ca.SX) -> ca.SX:

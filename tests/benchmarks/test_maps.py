@@ -34,6 +34,7 @@ def test_a_map_has_the_shapes_and_a_way_around_them(name: str) -> None:
         assert beside >= free
 
 
+@pytest.mark.slow
 def test_a_world_in_the_plane_is_drawn(tmp_path: Path) -> None:
     assert main(["planar_random:0:0.2", "--path", str(tmp_path / "maps.png")]) == 0
     with Image.open(tmp_path / "maps.png") as picture:

@@ -105,6 +105,7 @@ def test_success_is_judged_with_the_current_best_cost(tmp_path: Path, monkeypatc
     assert quality.succeeded(there, lower)["success"].tolist() == [False, False]
 
 
+@pytest.mark.slow
 def test_the_generators_draw_the_families_of_the_files() -> None:
     """Fresh layouts have as many obstacles as the files' layouts, of the same size, and the same start and goal."""
     for family in FAMILIES.values():

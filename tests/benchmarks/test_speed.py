@@ -67,13 +67,19 @@ def tiny(folder: Path) -> Bench:
     return Bench(TINY, Results(folder / "results.csv"), provenance("cpu"), say=lambda text: None)
 
 
+SLOW = batch, cores, families, first_use, growth, mppi, paper, scaling, share
+
+
 def numbers(bench: Bench, quantity: str) -> list[float]:
     return [float(row["value"]) for row in bench.results.rows if row["quantity"] == quantity]
 
 
 @pytest.mark.parametrize(
     "section",
-    [batch, cores, families, first_use, growth, latency, loop, mppi, own_model, paper, scaling, share, targets],
+    [
+        latency, loop, own_model, targets,
+        *(pytest.param(section, marks=pytest.mark.slow) for section in SLOW),
+    ],
 )
 def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
     bench = tiny(tmp_path)

@@ -148,6 +148,7 @@ def test_bad_missions_are_refused_in_one_line(run, tmp_path, words: list[str], f
     ],
     ids=["woods", "mazes"],
 )
+@pytest.mark.slow
 def test_missions_fly_through_woods_and_mazes(run, tmp_path, experiment: str, words: list[str]) -> None:
     several = experiment == "mission_study"  # whose figures are those of each mission, drawn for the other experiment
     layouts = ["study.layouts=1", "study.baselines=[al_ilqr]", "study.figures=false"] if several else []

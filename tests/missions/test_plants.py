@@ -236,6 +236,7 @@ def mission_problem(free: bool) -> Problem:
 
 
 @needs_drone_models
+@pytest.mark.slow
 def test_the_plants_agree_on_a_short_mission() -> None:
     """In closed loop, without obstacles, measured 1.5e-6.
 

@@ -170,6 +170,9 @@ def with_rows_without_room(seed: int) -> tuple[Problem, Problem]:
 MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart, "maps": maps, "narrow": narrow}
 
 
+USUAL = "curved", "obstacles", "narrow"  # the others are among the slow tests
+
+
 def guess(problem: Problem, seed: int) -> tuple[Tensor, Tensor]:
     """States and controls that don't fit each other."""
     random = draw(seed)
@@ -217,7 +220,9 @@ def length_of(step: Array, moved: Array, longest: float) -> float:
 
 
 @pytest.mark.parametrize("warm", [False, True], ids=["cold", "warm"])
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(
+    "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.slow) for name in MAKERS]
+)
 def test_steps_are_those_of_a_dense_system(name: str, warm: bool) -> None:
     """Four iterations: states, controls, all multipliers, slacks, mu and the shift of indefinite curvature."""
     problem = MAKERS[name](3)
