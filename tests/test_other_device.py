@@ -43,6 +43,7 @@ from torchgco.missions import RotorPlant
 from torchgco.native.kernels import use_native
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
+from torchgco.search.reach import longest_step
 
 N, R = 3, 0.06
 DOUBLE: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
@@ -110,6 +111,16 @@ def test_local_solves_are_judged_and_certified(kind: str) -> None:
         return [*parts, *vars(judge(problem, found.U)).values(), *vars(certify(problem, found.X, found.U)).values()]
 
     on_both(work, kind)
+
+
+def test_the_longest_step_is_found() -> None:
+    def work(problem: Problem, U0: Tensor) -> list[Tensor]:
+        with computing_on(problem.x0.device):
+            found = longest_step(problem)
+        assert found is not None
+        return [found]
+
+    on_both(work, "states")
 
 
 @pytest.mark.parametrize("kind", ["boxes", "map", *SLOW])

@@ -175,7 +175,6 @@ class Compiled:
         if not self._lock.acquire(blocking=False):
             raise InputError("mpc", "one call at a time: a compiled problem per thread", "a call during another one")
         try:
-            self._write({**(numbers or {}), **named})
             if shift is None:
                 shift = int(self.receding)
             elif type(shift) is not int or shift < 0:
@@ -183,7 +182,10 @@ class Compiled:
             until = math.inf
             if max_seconds is not None:
                 until = began + check_value(max_seconds, Positive, "max_seconds")
-            return self._solved(bool(warm), shift, began, until)
+            self._write({**(numbers or {}), **named})
+            able = self._warm if warm else np.zeros_like(self._warm)
+            self._warm = np.zeros_like(self._warm)  # an error or an interrupt leaves nothing to begin with
+            return self._solved(able, shift, began, until)
         finally:
             self._lock.release()
 
@@ -263,9 +265,8 @@ class Compiled:
             now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, form)
         return now
 
-    def _solved(self, warm: bool, shift: int, began: float, until: float) -> Answer:
+    def _solved(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
         kept = self._kept
-        able = self._warm if warm else np.zeros_like(self._warm)
         if kept is None:
             return self._by_solver_alone(able, shift, began, until)
         if shift:
@@ -276,8 +277,10 @@ class Compiled:
             left = math.inf if until == math.inf else max(0.0, until - time.perf_counter())
             kept.solve(able, self.interior.warm_barrier, seconds=left)
             status, worst = kept.statuses, kept.violations if kept.engine.measures else self._violation().numpy()
-            late = able & (status == TIME_LIMIT)
-            good = able & (status == CONVERGED) & (worst <= self.interior.violation_tolerance)
+            X, U = (part.numpy() for part in kept.rolled)
+            finite = np.isfinite(X).all(axis=(1, 2)) & np.isfinite(U).all(axis=(1, 2))
+            late = able & finite & (status == TIME_LIMIT)
+            good = able & finite & (status == CONVERGED) & (worst <= self.interior.violation_tolerance)
         else:
             kept.iterations.zero_()
         self._found = None
@@ -312,7 +315,7 @@ class Compiled:
         none, cost = torch.zeros_like(kept.iterations), X.new_full((X.shape[0],), torch.nan)
         return Solution(
             X, U, kept.feedback.clone(), torch.zeros_like(U), multipliers, cost, self._violation().clone(),
-            torch.from_numpy(status.astype(np.int64)), kept.iterations.clone(), none, none,
+            torch.from_numpy(status.astype(np.int64)), kept.iterations.clone(), none, none.clone(),
         )  # fmt: skip
 
     def _again(self, found: Solution, rows: Tensor, until: float) -> None:

@@ -184,7 +184,7 @@ def numbers_of(problem: Problem) -> list[Number]:
             found += _of_bounds(part, name, i)
         elif isinstance(part, BoundSpheres):
             found += _of_spheres(part, name, i)
-        elif isinstance(part, BoundBoxes):
+        elif isinstance(part, BoundBoxes) and not bool(part.absent.any()):
             found.append(Number(f"{name}.centers", (_view(part.centers),), i, True, _present))
         elif not isinstance(part, Obstacles):
             found += _of_part(part, name, i)
@@ -244,6 +244,8 @@ def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
     vehicle = part.vehicle_radius.unsqueeze(-1)
     radii = part.inflated_radii - vehicle
     inflate = lambda: torch.add(radii, vehicle, out=part.inflated_radii)
+    if bool(part.absent.any()):  # padding: which of them are there isn't a number
+        return []
     found = [
         Number(f"{name}.centers", (_view(part.centers),), i, False, _present),
         Number(f"{name}.radii", (_view(radii),), i, True, _lengths, inflate),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -55,6 +57,7 @@ class Kept:
         self._knots: list[Sequence[int]] = [range(N + 1), range(N), *at_rows]
         self._later = dict[int, list[np.ndarray]]()
         self._rolled = [part.numpy() for part in self.rolled]
+        self._gains = self.gains.numpy()
         self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
         self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
         self._follow = self.packed.copy()
@@ -69,12 +72,15 @@ class Kept:
         feedback, and `worst` (B,) their violation.
         """
         B, library = self.problem.B, self.engine.library
+        until = time.monotonic() + options.get("seconds", math.inf)
         self.how.fill(options)
         self._barrier[:] = mu
         self.statuses[:] = 0
         self._iterations[:] = 0
         for first, last in _spans(rows):
             run(self.library.tgco_interior, last - first, self.lanes, self.how, first)
+            self.how.fill({"seconds": max(0.0, until - time.monotonic())})
+        np.nan_to_num(self._gains, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         self._rolled[0][:], self._rolled[1][:] = self._moving[:2]
         run(library.tgco_closed_loop, B, LANES, self._follow)
         if self.engine.measures:

@@ -60,8 +60,8 @@ def longest_step(problem: Problem) -> Tensor | None:
         return None
     low, high = _box(problem)
     bounded = torch.isfinite(low) & torch.isfinite(high)
-    count, size = problem.n + problem.m, (problem.B, SAMPLES)
-    share = torch.rand(*size, count, dtype=low.dtype, generator=torch.Generator().manual_seed(SEED)).to(low)
+    draws = torch.Generator("cpu").manual_seed(SEED)  # the same for every problem and device
+    share = torch.rand(1, SAMPLES, problem.n + problem.m, dtype=low.dtype, generator=draws, device="cpu").to(low.device)
     least, most = torch.where(bounded, low, -WIDE).unsqueeze(1), torch.where(bounded, high, WIDE).unsqueeze(1)
     z = least + share * (most - least)
     (slopes,) = gradients(lambda z: _way(problem, z), z)

@@ -46,6 +46,7 @@ static void begin(Barrier *t, Track *k, I of) {
     k->last = tgco_choose(of, zero, k->last); k->forced = tgco_choose(of, zero, k->forced);
     k->made = tgco_choose(of, zero, k->made);
     k->least = tgco_choose(of, SET(INFINITY), k->least);
+    t->shift = tgco_choose(of, zero, t->shift); /* gains of a problem that ends at once don't know the lane's last one */
     k->restoring &= ~of; k->watching &= ~of;
     k->relaxed &= ~of; k->presses &= ~of;
     if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
