@@ -182,7 +182,7 @@ class Compiled:
             until = math.inf
             if max_seconds is not None:
                 until = began + check_value(max_seconds, Positive, "max_seconds")
-            self._write({**(numbers or {}), **named})
+            self.numbers.write({**(numbers or {}), **named})
             able = self._warm if warm else np.zeros_like(self._warm)
             self._warm = np.zeros_like(self._warm)  # an error or an interrupt leaves nothing to begin with
             return self._solved(able, shift, began, until)
@@ -232,9 +232,6 @@ class Compiled:
         problem = state.pop("problem")
         vars(self).update(state)
         self._begin(with_own_numbers(problem))
-
-    def _write(self, values: Mapping[str, Any]) -> None:
-        self.numbers.write(values)
 
     def _note(self, number: Number) -> None:
         if number.derived:

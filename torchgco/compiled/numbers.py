@@ -241,11 +241,11 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
 
 
 def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
+    if bool(part.absent.any()):  # padding: which of them are there isn't a number
+        return []
     vehicle = part.vehicle_radius.unsqueeze(-1)
     radii = part.inflated_radii - vehicle
     inflate = lambda: torch.add(radii, vehicle, out=part.inflated_radii)
-    if bool(part.absent.any()):  # padding: which of them are there isn't a number
-        return []
     found = [
         Number(f"{name}.centers", (_view(part.centers),), i, False, _present),
         Number(f"{name}.radii", (_view(radii),), i, True, _lengths, inflate),

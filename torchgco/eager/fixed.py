@@ -20,6 +20,7 @@ from torchgco.eager.state import Kinds, State, renew, settle
 
 NUDGE = 1e-3  # how far from the iterate a row's slope is looked at again: it may vanish in one point alone
 GOLDEN = 0.6180339887498949
+ROUNDINGS = 2.0**12  # units of the last bit of its terms, up to which a change may be rounding along the stages
 
 
 def sort_rows(kinds: Kinds, model: Model, t: State) -> None:
@@ -130,7 +131,7 @@ def _moves(model: Model, t: State) -> Tensor:
     A row may be flat in one point alone. A change that is within rounding of its terms is none.
     """
     x, u = _changes(model, t)
-    rounded, found = 2.0**12 * torch.finfo(t.X.dtype).eps, torch.zeros_like(t.out)
+    rounded, found = ROUNDINGS * torch.finfo(t.X.dtype).eps, torch.zeros_like(t.out)
     for X, U in ((t.X, t.U), _nearby(model, t, x, u)):
         at = model.slopes(X, U)
         dz = _responses(at.F, x, u)

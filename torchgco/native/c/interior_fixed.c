@@ -5,12 +5,11 @@
    at its end: what is feasible there, with no multiplier, is optimal with the row, too. Of two bounds that coincide, the
    upper one becomes an equality, and the lower one stays out. */
 
-#define NUDGE 1e-3 /* how far from the iterate a row's slope is looked at again: it may vanish in one point alone */
-#define ROUNDED 0x1p-40 /* share of its terms, up to which a change may be due to rounding along the stages */
+/* NUDGE, GOLDEN and ROUNDINGS are those of eager/fixed.py, which says what they mean. */
 
 /* A number in [1, 2) for variable i: no row and no model is likely to let a sum of these cancel. */
 static inline double uneven(int64_t i) {
-    double golden = 0.6180339887498949 * (double)(i + 1);
+    double golden = GOLDEN * (double)(i + 1);
     return 1.0 + golden - __builtin_floor(golden);
 }
 
@@ -68,7 +67,7 @@ static void find_moved(const Barrier *t, int64_t i, int64_t k, const Response *a
             along(t, i, k, at->x, u, own, part);
             for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
         }
-        for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= SET(ROUNDED) * terms[j]);
+        for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= SET(ROUNDINGS * __DBL_EPSILON__) * terms[j]);
     }
 }
 
