@@ -82,6 +82,9 @@ UNARY |= {
 # Solved as they are; what they read beside that isn't looked for.
 BRANCHES = ("caught", "equal", "close", "none chosen")
 ROUGH = ("single",)  # of single precision, in which the two kinds of kernels differ by its rounding
+# States that leave this range come from models that grow in finite time: they multiply rounding by as much, and the
+# solvers of the two kinds of kernels part.
+RANGE = 1e3
 FAULTS = (
     "numpy", "dropout", "randn", "python random", "one column", "scalar", "coupled", "integer", "missing", "joined",
     "joined far away", "pushed apart", "number of problems", "written",
@@ -264,8 +267,10 @@ def outcome(seed: int) -> str:
     for turn in range(3):
         found, fresh = solved(problem, native=True), make()
         expected = solved(fresh, native=False)
+        kept = expected.X.abs().amax((1, 2)) < RANGE
         for name in ("X", "U", "cost", "violation"):
-            if not torch.allclose(getattr(found, name), getattr(expected, name), rtol=tolerance, atol=0.1 * tolerance):
+            pair = getattr(found, name)[kept], getattr(expected, name)[kept]
+            if not torch.allclose(*pair, rtol=tolerance, atol=0.1 * tolerance):
                 return f"wrong: {name} after {turn} changes of {parts}"
         if not torch.allclose(
             open_loop(fresh.dynamics, fresh.x0, found.U), found.X, rtol=1e-3 * tolerance, atol=1e-3 * tolerance
