@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 import torchgco
 from torchgco import (
@@ -59,6 +60,25 @@ def test_through_a_map_the_way_is_the_roadmaps() -> None:
         warnings.simplefilter("error", HorizonWarning)
         torchgco.solve(problem, solver="hold", warm=solution)  # the horizon of an MPC ends before the goal
         torchgco.solve(task(POINT, [both], 10, [[2.0, 1.0]], None), solver="hold")  # a goal that nobody stated
+
+
+def test_a_longest_step_inside_the_bounds_is_climbed_to() -> None:
+    """A tricycle drives the farthest with its front wheel straight, which is no corner of its bounds."""
+
+    def field(x: Tensor, u: Tensor) -> Tensor:
+        heading, speed, steering = x[..., 2], x[..., 3], x[..., 4]
+        ahead = speed * steering.cos()
+        turning = torch.stack((ahead * heading.cos(), ahead * heading.sin(), speed * steering.sin()), -1)
+        return torch.cat((turning, u), -1)
+
+    model = FunctionDynamics(field, 5, 2, 0.1, "euler", slice(0, 2))
+    bounds = StateBounds([-FREE, -FREE, -FREE, -1.0, -0.9], [FREE, FREE, FREE, 3.0, 0.5])
+    goal = Goal([10.0, 0.0], 0.05)
+    for N, fits in ((34, True), (33, False)):  # 9.95 m, 0.3 m a stage
+        problem = task(model, [bounds], N, [[0.0] * 5], goal)
+        assert float(longest_step(problem)[0]) < 0.2999  # type: ignore
+        said = short_horizons(problem)
+        assert (said is None) == fits and (said is None or "N = 34 would do" in said)
 
 
 def test_a_limit_is_seen_where_there_is_one_alone() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.view.browser import NAMES
+from benchmarks.picture import BROWSERS
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ("bash", "env", "grep", "sh", "tail", "timeout")
@@ -54,6 +54,6 @@ def test_root_installs_one(tmp_path: Path) -> None:
 
 
 def test_the_script_and_the_tests_know_the_same_names() -> None:
-    assert f"for name in {' '.join(NAMES)}; do" in (ROOT / ".ci" / "browser").read_text()
+    assert f"for name in {' '.join(BROWSERS)}; do" in (ROOT / ".ci" / "browser").read_text()
     assert os.access(ROOT / ".ci" / "browser", os.X_OK)
     assert "\n.ci/browser\n" in (ROOT / ".ci" / "run").read_text()

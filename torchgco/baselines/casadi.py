@@ -21,6 +21,7 @@ from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
 from torchgco.dynamics.rollout import open_loop
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Callback, Progress, Solver
@@ -51,7 +52,7 @@ class CasADiSolver(Solver):
     plugin: Literal["ipopt", "fatrop"] = "ipopt"
     max_iterations: Count = 1000
     tolerance: Positive = 1e-8
-    violation_tolerance: Positive = 1e-3
+    violation_tolerance: Positive = ADMITTED
     options: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ from torchgco.base.status import Status
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.dispatch import measured
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
@@ -28,7 +29,7 @@ class Hold(Solver):
         InputError: a field out of its range.
     """
 
-    violation_tolerance: Positive = 1e-3
+    violation_tolerance: Positive = ADMITTED
 
     def __post_init__(self) -> None:
         check_options(self, "solver")

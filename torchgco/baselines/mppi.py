@@ -15,6 +15,7 @@ from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_sampler
 from torchgco.lagrangian.quality import is_better
 from torchgco.native.dispatch import measured
+from torchgco.obstacles.base import ADMITTED
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 
@@ -37,7 +38,7 @@ class IteratedMPPI(Solver):
 
     sampler: MPPI = MPPI()
     iterations: Count = 20
-    violation_tolerance: Positive = 1e-3
+    violation_tolerance: Positive = ADMITTED
 
     def __post_init__(self) -> None:
         check_options(self, "solver")

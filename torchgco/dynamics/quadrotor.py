@@ -20,6 +20,7 @@ from torchgco.dynamics.integrators import Integrator
 
 Components = tuple[Tensor, ...]
 Row = tuple[float, float, float]
+Limits = tuple[float | None, ...]
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,11 @@ class Airframe:
     def hover_thrust(self) -> float:
         """Of each rotor where the four carry the weight, m g / 4, N."""
         return self.mass * self.gravity / 4.0
+
+    @property
+    def accelerations(self) -> tuple[float, float]:
+        """The least and the greatest joint acceleration of the four rotors, 4 f_min / m and 4 f_max / m, m/s^2."""
+        return 4.0 * self.thrust_min / self.mass, 4.0 * self.thrust_max / self.mass
 
     @property
     def thrust_coefficient(self) -> float:
@@ -130,7 +136,8 @@ class QuadrotorPlanning(Dynamics):
         p' = v,  v' = a R(q) e3 - g e3,  q' = 1/2 Qx(w) q,  w' = (w_c - w)/T_w,  a' = (a_c - a)/T_a
 
     q isn't renormalised, as in the paper's planner. The time constants may be tensors (B,). Of the airframe the model
-    takes g alone; a mission takes all of it, for the vehicle that follows the plans.
+    takes g alone, and its mass and limits of thrust for `control_limits`; a mission takes all of it, for the vehicle
+    that follows the plans.
 
     Raises:
         InputError: a field out of its range or of another kind.
@@ -149,6 +156,12 @@ class QuadrotorPlanning(Dynamics):
 
     def __post_init__(self) -> None:
         check_options(self, "quadrotor")
+
+    @property
+    def control_limits(self) -> tuple[Limits, Limits]:
+        """The least and greatest controls that the vehicle can follow, None where there is no limit."""
+        low, high = self.airframe.accelerations
+        return (None, None, None, low), (None, None, None, high)
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         states, controls = components(x), components(u)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from torchgco.base.errors import InputError
+from torchgco.native.compiler import NativeError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 OWN = (signal.default_int_handler, signal.SIG_DFL)  # handlers of Python and of the system
@@ -32,12 +33,13 @@ class Terminated(KeyboardInterrupt):
 def ended(command: str, work: Callable[[], int]) -> int:
     """Run a command; returns its exit code.
 
-    That is the code of `work`; 2, with a line for each mistake, for malformed input; 130 for Ctrl-C; 143 for SIGTERM.
+    That is the code of `work`; 2, with a line for each mistake, for malformed input, or a C compiler that is needed and
+    fails; 130 for Ctrl-C; 143 for SIGTERM.
     """
     try:
         with raised():
             return work()
-    except (InputError, Refused) as error:
+    except (InputError, Refused, NativeError) as error:
         for line in error.lines if isinstance(error, Refused) else (error,):
             print(f"{command}: {_visible(str(line))}", file=sys.stderr)
         return 2

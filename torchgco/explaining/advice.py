@@ -21,8 +21,8 @@ BY_STATUS = {
     "in dynamics, cost and constraints.",
     Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost.",
     Status.NON_FINITE: 'Another U0, bounds on the controls, a smaller dt, or integrator="rk4".',
-    Status.INFEASIBLE: "Another guess U0, a longer horizon N, wider bounds; or loosen the row named above, to see "
-    "whether it is what makes the problem infeasible.",
+    Status.INFEASIBLE: "Another guess U0, a longer horizon N, wider bounds; or loosen {row}, to see whether it is what "
+    "makes the problem infeasible.",
     Status.TIME_LIMIT: 'A larger max_seconds, or solver="gco_fast".',
     Status.UNBOUNDED: "Bounds on what grows, or a cost that keeps it small.",
     Status.INVALID_START: "A start x0 outside the obstacles, whose radii here include the vehicle's.",
@@ -54,6 +54,7 @@ class Facts:
         passage: the largest radius, m, that some way has room for; 0: none.
         in_unknown: whether the start is invalid for unknown cells of a map alone.
         unmoved: whether all violated rows have the same values for all controls.
+        named: whether the row that is violated most is named to the reader before.
     """
 
     status: Status
@@ -69,6 +70,7 @@ class Facts:
     passage: float = 0.0
     in_unknown: bool = False
     unmoved: bool = False
+    named: bool = False
 
     @property
     def told(self) -> list[str]:
@@ -102,7 +104,8 @@ def advice(facts: Facts) -> list[str]:
         found.append("A longer horizon N, or a larger terminal weight: the trajectory stops short of the goal.")
     elif facts.status in BY_STATUS:
         limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
-        found.append(BY_STATUS[facts.status].format(limits=f" ({', '.join(limits)})" if limits else ""))
+        row = "the row named above" if facts.named else "one constraint after the other"
+        found.append(BY_STATUS[facts.status].format(limits=f" ({', '.join(limits)})" if limits else "", row=row))
     if tells_to_record(facts):
         found.append("torchgco.solve(..., record=True), after which explain tells what each pass did.")
     return found

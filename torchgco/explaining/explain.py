@@ -143,6 +143,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
         unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.X, one.U, ADMITTED)),
+        named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
     )
 

@@ -32,6 +32,7 @@ from torchgco.missions.sensing.sensors import Depth, Lidar
 from torchgco.missions.tracker import Reference, Tracker, Tracking
 from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import Explorer, SensorName, Unknown
+from torchgco.native.compiler import find_compiler
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
@@ -94,6 +95,9 @@ class Mission:
             raise InputError("plant.airframe", f"that of the planning model, {planned}", given)
         if self.substeps(float(dynamics.dt)) is None:
             raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
+        if self.sensor != "full" and find_compiler() is None:
+            wanted = "full on a machine without a C compiler: sensors and their maps are computed in C (TORCHGCO_CC)"
+            raise InputError("mission.sensor", wanted, self.sensor)
 
     def substeps(self, period: float) -> int | None:
         """Time steps of the plant in a control period, s; None where they don't fit."""

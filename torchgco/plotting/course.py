@@ -16,6 +16,7 @@ from matplotlib.patches import Circle
 
 from torchgco.base.errors import InputError
 from torchgco.maps.distance import DistanceField
+from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import Ball, Body
 from torchgco.plotting.maps import draw_map, unknown_handles
@@ -25,7 +26,6 @@ from torchgco.plotting.style import INK, PALETTE
 VEHICLE = PALETTE[5]
 VIEWS: tuple[draw.Plane, draw.Plane] = (draw.ABOVE, draw.SIDE)
 POSITION = ("x0", "x1", "x2")
-INSIDE = 1e-3  # m: knots deeper in an obstacle are crossed
 CONTACT: dict[str, Any] = {
     "marker": "X", "color": draw.CROSS, "markeredgecolor": "white", "markersize": 9, "linestyle": "none",
 }  # fmt: skip
@@ -70,7 +70,7 @@ class Course:
 
     def infeasible(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Which positions (T, 3) at times t (T,), s, lie more than a millimetre inside an obstacle grown by r_veh."""
-        return np.any(self.distances(positions, t) < self.reaches[:, None] - INSIDE, axis=0)
+        return np.any(self.distances(positions, t) < self.reaches[:, None] - ADMITTED, axis=0)
 
     def nearness(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Smallest of `distances` as a share of r_obs + r_veh, (T,), at times t (T,), s; inf without obstacles."""

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
+from torchgco.judging.judge import SUCCESS_VIOLATION
 from torchgco.plotting.style import INK, legend, panels, solver_colours, tasks_of, tidy
 
 FLOOR = 1e-12
-TOLERANCE = 1e-3  # violations up to this count as none, metres for lengths
 SIZE = (5.2, 3.2)  # of a panel, inches
 SPACE = 0.04  # share of the axis left free at both ends
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")  # matplotlib's own formulas take long to load
@@ -55,7 +55,7 @@ def violation_figure(trials: pd.DataFrame) -> Figure:
     for ax, (title, task) in zip(axes, tasks, strict=True):
         decades = {name: np.log10(values.clip(FLOOR)) for name, values in _by_solver(task, "violation").items()}
         # A linear axis of exponents: its lower end stands for all below.
-        _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(TOLERANCE))
+        _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(SUCCESS_VIOLATION))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.xaxis.set_major_formatter(FuncFormatter(_power))
         tidy(ax, title)

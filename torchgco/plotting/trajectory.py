@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
+from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT
 
 Plane = tuple[int, int]
@@ -30,7 +31,7 @@ STONE, EDGE = "#DDD8CD", "#A39B8B"
 CROSS, PLAN, SAMPLE, REGION = "#D00000", PALETTE[2], "#8CC8EA", "#BFE5D3"
 
 
-def inside(positions: np.ndarray, centers: np.ndarray, radii: np.ndarray, tolerance: float = 1e-3) -> np.ndarray:
+def inside(positions: np.ndarray, centers: np.ndarray, radii: np.ndarray, tolerance: float = ADMITTED) -> np.ndarray:
     """Which knots (N+1,) lie deeper than `tolerance`, m, in a sphere; absent spheres have a nan or zero radius.
 
     centers (M, d), or (N+1, M, d) where they move, and radii (M,), the vehicle's radius included.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -26,7 +26,8 @@ from torchgco.problem.problem import Problem
 from torchgco.scenarios.layouts import SINES, Layouts
 
 STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
-CONTROLS = ("control_weight", "control_reference", "control_lower", "control_upper")
+LIMITS = ("control_lower", "control_upper")
+CONTROLS = ("control_weight", "control_reference", *LIMITS)
 # The models of conf/model: dimension of space and number of states.
 BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "quadrotor": (3, 14)}
 
@@ -51,7 +52,8 @@ class Vehicle:
         dynamics: planning model; the layouts' time step overrides its own.
         state_weight, control_weight, terminal_weight: diagonals of Q, R, Qf.
         control_reference: u_ref (m,), also the initial guess: the vehicle at rest.
-        control_lower, control_upper: (m,), in the units of the inputs.
+        control_lower, control_upper: (m,), in the units of the inputs; None for an input: the limit of the dynamics
+            themselves (`control_limits`, as QuadrotorPlanning has them).
         start, goal: states (n,).
         radius: r_veh, m.
         goal_radius: m.
@@ -68,8 +70,8 @@ class Vehicle:
     control_weight: Sequence[float]
     terminal_weight: Sequence[float]
     control_reference: Sequence[float]
-    control_lower: Sequence[Extended]
-    control_upper: Sequence[Extended]
+    control_lower: Sequence[Extended | None]
+    control_upper: Sequence[Extended | None]
     start: Sequence[float]
     goal: Sequence[float]
     radius: Annotated[float, AtLeast(0, "m")]
@@ -83,12 +85,29 @@ class Vehicle:
             for name in names:
                 if len(getattr(self, name)) != length:
                     raise InputError(f"vehicle.{name}", f"{length} numbers", repr(getattr(self, name)))
+        for name in LIMITS:
+            self.limits(name)
 
     @property
     def dimension(self) -> int:
         """d of the space that the vehicle moves in; 0 for dynamics without a position."""
         position = self.dynamics.position
         return 0 if position is None else position.stop - position.start
+
+    def limits(self, name: Literal["control_lower", "control_upper"]) -> list[float]:
+        """The bounds (m,), with those of the dynamics where the vehicle gives none.
+
+        Raises:
+            InputError: none in a place where the dynamics have no limit either.
+        """
+        own = getattr(self.dynamics, "control_limits", ([None] * self.dynamics.m,) * 2)[LIMITS.index(name)]
+        found = list[float]()
+        for i, (given, limit) in enumerate(zip(getattr(self, name), own, strict=True)):
+            bound = limit if given is None else given
+            if bound is None:
+                raise InputError(f"vehicle.{name}[{i}]", "a number: the dynamics have no limit here", None)
+            found.append(bound)
+        return found
 
     def task(self, layouts: Layouts, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64) -> Task:
         """The planning problems of these layouts: quadratic cost to the goal, obstacles, control bounds (section 5).
@@ -122,8 +141,8 @@ class Vehicle:
                 None if layouts.velocities is None else tensor(layouts.velocities),
             ),
             ControlBounds(
-                tensor(_given(layouts.control_lower, self.control_lower)),
-                tensor(_given(layouts.control_upper, self.control_upper)),
+                tensor(_given(layouts.control_lower, self.limits("control_lower"))),
+                tensor(_given(layouts.control_upper, self.limits("control_upper"))),
             ),
         ]
         if layouts.box_centers is not None:

@@ -14,6 +14,7 @@ from torchgco.base.tree import LastTaken, put, take
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.native.dispatch import chord_clearance, measured, value
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import at_rest_after
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
@@ -48,7 +49,7 @@ class Refine:
 
     top: Count = 1
     rounds: Count = 20
-    violation: Positive = 1e-3
+    violation: Positive = ADMITTED
     cut: Positive = 0.049
     needed: bool = False
 

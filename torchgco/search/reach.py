@@ -19,6 +19,7 @@ from torchgco.roadmap.scene import scene_of
 SAMPLES = 64  # states and controls at which a step's length is looked at
 WIDE = 3.0  # the range, around 0, of what has no bounds
 INERT = 1e-9  # slope, as a share of the largest, of what a step's length doesn't depend on
+CLIMBS = 40  # rounds of ascent from the samples, which halve a step of half the box to 5e-13 of it
 NAMED = 5  # problems that the sentence names
 SEED = 0x5EED
 
@@ -39,7 +40,10 @@ def short_horizons(problem: Problem) -> str | None:
         far = goal.distance(problem.x0[:, problem.position])
         reach = problem.stages * step + goal.radius
         far = torch.maximum(far, torch.where(far <= reach, _ways(problem, far <= reach), 0.0))
-    short = (far > reach).nonzero().flatten().tolist()
+        if bool((far > reach).any()):  # the longest step may lie between the samples
+            step = longest_step(problem, CLIMBS)
+            assert step is not None
+    short = (far > problem.stages * step + goal.radius).nonzero().flatten().tolist()
     if not short:
         return None
     first, named = short[0], ", ".join(map(str, short[:NAMED])) + (", ..." if len(short) > NAMED else "")
@@ -51,10 +55,11 @@ def short_horizons(problem: Problem) -> str | None:
     )
 
 
-def longest_step(problem: Problem) -> Tensor | None:
+def longest_step(problem: Problem, climbs: int = 0) -> Tensor | None:
     """The longest way (B,), m, of a stage within the bounds on states and controls; None where nothing limits it.
 
-    Looked at in samples and corners of what it depends on, which has bounds at all knots.
+    The greatest of samples and corners of what it depends on, which has bounds at all knots, after so many rounds of
+    projected gradient ascent from each.
     """
     if problem.dynamics.position is None or problem.dynamics.at(0) is not problem.dynamics:
         return None
@@ -68,8 +73,23 @@ def longest_step(problem: Problem) -> Tensor | None:
     depends = (slopes.abs() > INERT * slopes.abs().amax()).flatten(0, 1).any(0)
     if not bool(bounded[:, depends].all()):
         return None
-    ends = least + (share > 0.5) * (most - least)
-    return torch.cat((_way(problem, z), _way(problem, ends)), dim=1).amax(-1).sqrt()
+    z = torch.cat((z, least + (share > 0.5) * (most - least)), dim=1)
+    return _climbed(problem, z, least, most, climbs).amax(-1).sqrt()
+
+
+def _climbed(problem: Problem, z: Tensor, least: Tensor, most: Tensor, climbs: int) -> Tensor:
+    """The squared lengths (B, S) after ascent from z (B, S, n + m) within a box; steps that don't ascend are halved."""
+    way, size = _way(problem, z), torch.full_like(z[..., :1], 0.5)
+    for _ in range(climbs):
+        (slopes,) = gradients(lambda z: _way(problem, z), z)
+        slopes = slopes * (most - least)
+        tried = z + size * (most - least) * slopes / slopes.abs().amax(-1, keepdim=True).clamp(min=1e-300)
+        tried = torch.minimum(torch.maximum(tried, least), most)
+        longer = _way(problem, tried)
+        better = longer > way
+        z, way = torch.where(better.unsqueeze(-1), tried, z), torch.where(better, longer, way)
+        size = torch.where(better.unsqueeze(-1), size, 0.5 * size)
+    return way
 
 
 def _way(problem: Problem, z: Tensor) -> Tensor:

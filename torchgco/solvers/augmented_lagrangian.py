@@ -18,6 +18,7 @@ from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import is_preferred
 from torchgco.native.dispatch import engine_of, measured, open_loop, value
 from torchgco.native.engine import Engine
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.caught import StopWhenCaught
@@ -70,7 +71,7 @@ class AugmentedLagrangian(Solver):
     stalled_growth: Annotated[float, AtLeast(1)] | None = None
     max_outer_iterations: Count = 10
     patience: Count | None = None
-    violation_tolerance: Positive = 1e-3
+    violation_tolerance: Positive = ADMITTED
     slots: Count | None = None
     record: bool = False
 

@@ -46,7 +46,8 @@ from torchgco.solvers.ending import optimality
 
 OUTER = 12  # outer iterations of a plan at most
 LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violation_tolerance": 5e-3}
-BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
+ROUGH = 0.01  # m of distance that sensed maps and plans between their knots may err by
+BETTER = 2 * ROUGH  # m by which an unsafe plan has to keep more distance than the one that is kept
 AWAY = 1.0  # m/s^2 with which a vehicle gets out of a margin that it has entered
 NEARLY = 0.2  # at most, by which a plan exceeds what can be flown where the one that is kept isn't safe
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
@@ -200,7 +201,7 @@ class Exploration:
                     own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING, HOLD)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 late = self.dt * (np.arange(1, N + 1) - EARLY).clip(0)
-                near = max(gap - 0.01, CONTACT_FACTOR * scout.radius) + 0.5 * AWAY * late**2
+                near = max(gap - ROUGH, CONTACT_FACTOR * scout.radius) + 0.5 * AWAY * late**2
                 new = (
                     (planes, own),
                     (room, far),
@@ -226,7 +227,7 @@ class Exploration:
         former = former.clone()
         for b, scout in enumerate(self.scouts):
             least = CONTACT_FACTOR * scout.radius + SPARE
-            blocked = np.flatnonzero(scout.seen.gaps(former[b].numpy(), least + 0.01, self.kinds) < least)
+            blocked = np.flatnonzero(scout.seen.gaps(former[b].numpy(), least + ROUGH, self.kinds) < least)
             if len(blocked):
                 at = max(0, int(blocked[0]) - WAITS)
                 former[b, at:] = former[b, at].clone()
@@ -307,7 +308,7 @@ class Exploration:
         near = gaps[0] - least
         asked = np.zeros(len(gaps))
         if near < 0:
-            asked[: FINE * EARLY] = near - 0.02
+            asked[: FINE * EARLY] = near - BETTER
         return float((gaps - least - asked).min())
 
 
