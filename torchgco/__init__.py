@@ -27,6 +27,7 @@ from torchgco.base.errors import HorizonWarning as HorizonWarning
 from torchgco.base.errors import InputError as InputError
 from torchgco.base.errors import ScaleWarning as ScaleWarning
 from torchgco.base.errors import StartWarning as StartWarning
+from torchgco.base.errors import TraceWarning as TraceWarning
 from torchgco.base.status import Status as Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold as Hold
@@ -101,7 +102,7 @@ __all__ = [  # noqa: RUF022
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
     "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning", "ScaleWarning",
-    "StartWarning",
+    "StartWarning", "TraceWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

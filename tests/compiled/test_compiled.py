@@ -207,6 +207,8 @@ def test_a_deadline_ends_a_call() -> None:
     mpc(warm=False)
     jumped = mpc(x0=numbers["x0"] + 0.5, max_seconds=1e-6)
     assert Status.TIME_LIMIT in jumped.statuses and torch.isfinite(jumped.U).all()
+    late = jumped.iterations == 0  # not begun: there is no feedback, rather than that of the last call
+    assert bool(late.any()) and bool((jumped.K[late] == 0.0).all())
     assert mpc().statuses == [Status.CONVERGED] * 64
 
 
@@ -288,6 +290,7 @@ def test_one_thread_at_a_time_and_processes_compile_their_own() -> None:
         ({"speed": 1.0}, "numbers: expected one of x0, x_ref, u_ref, Q, R, Qf, lower, upper, centers, radii"),
         ({"upper": [np.inf, 1.0]}, None),
         ({"upper": [-9.0, 1.0]}, "constraints[0].upper: expected lower bounds of at most the upper ones"),
+        ({"lower": [4.0, -0.5], "upper": [3.9, 0.5]}, "constraints[0].lower: expected lower bounds of at most"),
         ({"radii": [-1.0, 1.0]}, "constraints[1].radii: expected lengths of at least 0, got -1.0"),
         ({"Q": [[-1.0, 1, 1, 1]]}, "cost.Q: expected weights of at least 0, got -1.0"),
         ({"x_ref": np.nan * path(0.0)}, "cost.x_ref: expected finite numbers, got NaN or infinity"),
@@ -306,6 +309,29 @@ def test_a_mistake_changes_nothing_and_gets_one_line(numbers: Numbers, message: 
         mpc(**({"x0": np.ones(4)} | numbers))
     assert str(error.value).startswith(message) and "\n" not in str(error.value)
     assert all(np.array_equal(mpc.numbers[name], value) for name, value in before.items() if name != "x0")
+
+
+def test_numbers_of_one_call_are_checked_together() -> None:
+    problem = driven(of_driven(2, 8))
+    weights = QuadraticCost([1.0] * 4, [0.1] * 2, [1.0] * 4, H=0.01 * np.ones((2, 4)))
+    mpc = torchgco.compile(Problem(CAR, weights, problem.constraints, problem.x0, N))
+    upper = mpc.numbers["upper"]
+    beyond = mpc(lower=upper + 1.0, upper=upper + 2.0, max_seconds=1.0)
+    assert beyond.U.shape == (2, N, 2), "lower bounds above the old upper ones"
+    with pytest.raises(InputError, match=r"cost.H: expected a weight .* that is positive semidefinite"):
+        mpc(Q=[1e-6 * np.eye(4)])
+
+
+@pytest.mark.parametrize("context", [torch.inference_mode, lambda: torch.device("meta")], ids=["inference", "device"])
+def test_modes_and_default_devices_of_the_caller_change_nothing(context: Callable[[], Any]) -> None:
+    numbers = of_driven(1, 8)
+    problem, expected = driven(numbers), torchgco.compile(driven(numbers))()
+    with context():
+        mpc = torchgco.compile(problem)
+        first = mpc()
+    assert torch.equal(first.X, expected.X) and mpc(x0=numbers["x0"]).statuses == [Status.CONVERGED]
+    with context():
+        assert mpc(x0=numbers["x0"]).statuses == [Status.CONVERGED] and mpc.stale() is None
 
 
 def test_numbers_are_listed_and_only_the_chosen_ones_change() -> None:

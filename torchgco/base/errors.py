@@ -60,5 +60,9 @@ class HorizonWarning(UserWarning):
     """A horizon is shorter than the way to the goal needs at the limits on speed."""
 
 
+class TraceWarning(UserWarning):
+    """A model's compiled code gives other states than the model itself."""
+
+
 class ContactWarning(UserWarning):
     """A trajectory whose status says feasible touches an obstacle between two knots."""

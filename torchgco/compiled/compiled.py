@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from torch import Tensor
 from torchgco.api import solve
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Positive, check_value
-from torchgco.base.shapes import check_untransformed
+from torchgco.base.shapes import check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_own_numbers
@@ -37,7 +38,15 @@ from torchgco.solvers.ending import constant_cost, least_cost
 from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
 
 SOLVERS = "gco", "interior_point"
+CPU = torch.device("cpu")
 CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEASIBLE, Status.TIME_LIMIT))
+
+
+@contextmanager
+def _plainly() -> Iterator[None]:
+    """Tensors that are kept lie on the CPU and can be written in place, whatever the caller's default and mode are."""
+    with torch.inference_mode(False), computing_on(CPU):
+        yield
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +130,8 @@ class Compiled:
         if problem.x0.device.type != "cpu":
             raise InputError("problem", "one on the CPU", str(problem.x0.device))
         self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
-        self._begin(with_own_numbers(problem))
+        with _plainly():
+            self._begin(with_own_numbers(problem))
 
     def _begin(self, problem: Problem) -> None:
         found = numbers_of(problem)
@@ -185,10 +195,12 @@ class Compiled:
             self.numbers.write({**(numbers or {}), **named})
             able = self._warm if warm else np.zeros_like(self._warm)
             self._warm = np.zeros_like(self._warm)  # an error or an interrupt leaves nothing to begin with
-            return self._solved(able, shift, began, until)
+            with _plainly():
+                return self._solved(able, shift, began, until)
         finally:
             self._lock.release()
 
+    @_plainly()
     def solution(self) -> Solution:
         """The last answer with multipliers, costs and statuses; costs of what C solved are by the numbers as they are.
 
@@ -211,6 +223,7 @@ class Compiled:
             self._found = self._packed_solution(self._warm)
         return self._found
 
+    @_plainly()
     def stale(self) -> str | None:
         """What the compiled code would compute otherwise if it were compiled now, in a line; None: nothing.
 
@@ -223,6 +236,7 @@ class Compiled:
             return None
         return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
 
+    @_plainly()
     def __getstate__(self) -> dict[str, Any]:
         """A process that loads it compiles again, and begins without an answer."""
         names = "solver", "interior", "receding", "changes"
@@ -231,7 +245,8 @@ class Compiled:
     def __setstate__(self, state: dict[str, Any]) -> None:
         problem = state.pop("problem")
         vars(self).update(state)
-        self._begin(with_own_numbers(problem))
+        with _plainly():
+            self._begin(with_own_numbers(problem))
 
     def _note(self, number: Number) -> None:
         if number.derived:

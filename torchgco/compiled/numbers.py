@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.base.values import Values
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -41,6 +42,8 @@ class Number:
         derived: whether kernels read what is computed from it, not the number itself.
         check: says what is wrong with new numbers, (expected, got), or None.
         after: is called when new numbers have been written.
+        joint: says what is wrong with new numbers, by full names, that are written together; raises or returns as
+            `check`.
     """
 
     name: str
@@ -49,6 +52,7 @@ class Number:
     derived: bool
     check: Callable[[Floats], tuple[str, Any] | None]
     after: Callable[[], object] | None = None
+    joint: Callable[[Mapping[str, Floats]], tuple[str, Any] | None] | None = None
     shape: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -122,6 +126,10 @@ class Numbers(Mapping[str, Floats]):
     def write(self, values: Mapping[str, Any]) -> None:
         """Write several; all are checked before the first is written."""
         new = [(number := self.find(name), number.checked(value)) for name, value in values.items()]
+        together = {number.name: np.broadcast_to(given, number.shape) for number, given in new}
+        for number, _ in new:
+            if number.joint is not None and (wrong := number.joint(together)) is not None:
+                raise InputError(number.name, *wrong)
         for number, given in new:
             number.write(given)
             self._changed(number)
@@ -214,13 +222,24 @@ def _of_cost(problem: Problem) -> list[Number]:
         tensor = getattr(cost, name)
         if tensor is not None:
             check = _finite if name not in WEIGHTS else _weights if cost.diagonal else _matrices
-            found.append(Number(f"cost.{name}", (_view(tensor),), "cost", False, check))
+            joint = _semidefinite(cost) if name in ("Q", "R", "H") and cost.H is not None else None
+            found.append(Number(f"cost.{name}", (_view(tensor),), "cost", False, check, joint=joint))
     return found
+
+
+def _semidefinite(cost: BoundQuadratic) -> Callable[[Mapping[str, Floats]], None]:
+    """A check of Q, R and H together: each alone may be fine, and the stage cost still fall without end."""
+
+    def check(new: Mapping[str, Floats]) -> None:
+        own = {name: new.get(f"cost.{name}", _view(getattr(cost, name))) for name in (*WEIGHTS, "H")}
+        check_semidefinite(**{name: torch.tensor(weights) for name, weights in own.items()})
+
+    return check
 
 
 def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Number]:
     def check(new: Floats, side: str) -> tuple[str, Any] | None:
-        other, sign = (part.upper, 1.0) if side == "lower" else (part.lower, -1.0)
+        sign = 1.0 if side == "lower" else -1.0
         bounded = np.zeros(part.lower.shape[-1], dtype=bool)
         bounded[part.below if side == "lower" else part.above] = True
         free = new[..., ~bounded]
@@ -230,12 +249,17 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
             return "infinity in components that were infinite when the problem was compiled; give them 1e9 then", (
                 float(free[np.isfinite(free)][0])
             )
-        if (sign * (new - other.numpy()) > 0).any():
-            return "lower bounds of at most the upper ones", new.tolist()
         return None
 
+    def joint(new: Mapping[str, Floats]) -> tuple[str, Any] | None:
+        lower, upper = (new.get(f"{name}.{side}", _view(getattr(part, side))) for side in ("lower", "upper"))
+        over = np.nonzero(lower > upper)
+        if not len(over[0]):
+            return None
+        return "lower bounds of at most the upper ones", f"{lower[over][0]:g} and {upper[over][0]:g}"
+
     return [
-        Number(f"{name}.{side}", (_view(getattr(part, side)),), i, True, lambda new, side=side: check(new, side))
+        Number(f"{name}.{side}", (_view(getattr(part, side)),), i, True, partial(check, side=side), joint=joint)
         for side in ("lower", "upper")
     ]
 

@@ -43,7 +43,7 @@ class QuadraticCost(Cost):
         Q, R = _weight(self.Q, "Q", n, B, N, dims.like), _weight(self.R, "R", m, B, N, dims.like)
         Qf = _weight(self.Qf, "Qf", n, B, None, dims.like)
         H = None if self.H is None else _cross(self.H, m, n, B, N, dims.like)
-        _check_semidefinite(Q, R, Qf, H)
+        check_semidefinite(Q, R, Qf, H)
         x_ref = _vector(self.x_ref, "x_ref", n, B, N + 1, dims.like)
         diagonal = H is None and all(_is_diagonal(W) for W in (Q, R, Qf))
         if diagonal:
@@ -221,7 +221,7 @@ def _is_diagonal(W: Tensor) -> bool:
     return bool((W - torch.diag_embed(W.diagonal(dim1=-2, dim2=-1)) == 0).all())
 
 
-def _check_semidefinite(Q: Tensor, R: Tensor, Qf: Tensor, H: Tensor | None) -> None:
+def check_semidefinite(Q: Tensor, R: Tensor, Qf: Tensor, H: Tensor | None) -> None:
     blocks = {"Q": Q, "R": R, "Qf": Qf}
     if H is not None:
         # Q and R alone may pass while the cross term makes the stage cost unbounded below.

@@ -53,7 +53,7 @@ class Kept:
         self.worst = like.new_zeros(B)
         # The same memory by NumPy, which takes a small share of PyTorch's time for a few numbers.
         self._moving = [part.numpy() for part in (self.X, self.U, *self.lam)]
-        at_rows = [torch.arange(N + 1)[part.knots].tolist() for part in problem.constraints]
+        at_rows = [torch.arange(N + 1, device=like.device)[part.knots].tolist() for part in problem.constraints]
         self._knots: list[Sequence[int]] = [range(N + 1), range(N), *at_rows]
         self._later = dict[int, list[np.ndarray]]()
         self._rolled = [part.numpy() for part in self.rolled]
@@ -77,6 +77,7 @@ class Kept:
         self._barrier[:] = mu
         self.statuses[:] = 0
         self._iterations[:] = 0
+        self._gains[rows] = 0.0  # of problems that a deadline leaves no time for
         for first, last in _spans(rows):
             run(self.library.tgco_interior, last - first, self.lanes, self.how, first)
             self.how.fill({"seconds": max(0.0, until - time.monotonic())})

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import TraceWarning
 from torchgco.base.status import STOPPED, Status, is_over
-from torchgco.base.tree import is_users, spread, take
+from torchgco.base.tree import is_users, put, spread, take
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.native.dispatch import engine_of, reproducible
@@ -59,13 +61,15 @@ class Session:
         everyone = torch.arange(problem.B, device=best.X.device)
         parts = [self._optimality(best, rows) for rows in everyone.split(slots or max(1, problem.B))]
         K, d, left = (torch.cat(column) for column in zip(*parts, strict=True))
-        found = self.trajectories(end, lambda rows: K[rows])
+        found, unlike = self._by_users_model(self.trajectories(end, lambda rows: K[rows]))
+        left = torch.where(unlike, left.clamp(min=1.0), left)
         if problem.free_start is not None:  # stationary for this start alone, unless the interior point chose it
             left = torch.where(problem.free_start.any(-1) & ~is_over(end.status), left.clamp(min=1.0), left)
         limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
         constrained = bool(problem.constraints) or problem.free_start is not None
-        finite = torch.isfinite(found.cost) & torch.isfinite(found.violation) & self._follows_dynamics(found)
+        finite = torch.isfinite(found.cost) & torch.isfinite(found.violation)
+        finite &= torch.isfinite(found.X).flatten(1).all(-1)
         ended = torch.where(finite | (ended == Status.INVALID_START), ended, int(Status.NON_FINITE))
         status = final_status(ended, left, found.violation, tolerance, constrained)
         user = self.given.problem
@@ -77,24 +81,29 @@ class Session:
             None if self.recorder is None else self.recorder.frame(*self.scales),
         )  # fmt: skip
 
-    def _follows_dynamics(self, found: Iterate) -> Tensor:
-        """Whether a user's model gives finite states along trajectories, (B,), which compiled code may do without it.
+    def _by_users_model(self, found: Iterate) -> tuple[Iterate, Tensor]:
+        """The trajectories with states of the user's own model, and where (B,) those of its compiled code are others.
 
-        Raises:
-            InputError: its states are others than those of the compiled code.
+        They may be: at a jump of the model, for which rounding decides; where the model gives NaN and compiled code
+        doesn't; and where what the model does depends on more than its arguments, which the TraceWarning says.
         """
-        model = self.given.problem.dynamics
-        finite = torch.isfinite(found.X).flatten(1).all(-1)
-        if engine_of(self.given.problem) is None or not is_users(model):
-            return finite
-        ahead, X = self.given.problem.along.step(found.X[:, :-1], found.U), found.X[:, 1:]
-        sound = torch.isfinite(ahead).flatten(1).all(-1)
-        gap = (ahead - X).abs() / (1.0 + X.abs().amax(dim=(1, 2), keepdim=True))
-        worst = float(torch.where((sound & finite).view(-1, 1, 1), gap, 0.0).max()) if gap.numel() > 0 else 0.0
-        if worst > UNLIKE:
-            expected = "the states that its compiled code gives: a function of its arguments alone"
-            raise InputError("dynamics.step", expected, f"states that differ by a share of {worst:.2g}")
-        return finite & sound
+        user = self.given.problem
+        unlike = torch.zeros_like(found.cost, dtype=torch.bool)
+        if engine_of(user) is None or not is_users(user.dynamics) or found.U.numel() == 0:
+            return found, unlike
+        X = found.X[:, 1:]
+        gap = (user.along.step(found.X[:, :-1], found.U) - X).abs() / (1.0 + X.abs().amax(dim=(1, 2), keepdim=True))
+        unlike = ~(gap.flatten(1).amax(-1) <= UNLIKE) & torch.isfinite(found.X).flatten(1).all(-1)
+        rows = unlike.nonzero().flatten()
+        if rows.numel() > 0:
+            part, U = user.take(rows), found.U[rows]
+            X = open_loop(part.dynamics, found.X[rows, 0], U)
+            if bool(torch.isfinite(X).all()):
+                told = "compiled code gives other states than the model, whose own are returned, for problems"
+                warnings.warn(f"{told} {rows.tolist()}", TraceWarning, stacklevel=2)
+            own = Iterate(X, U, take(found.multipliers, rows), part.cost.total(X, U), violation(part.constraints, X, U))
+            put(found, rows, own)
+        return found, unlike
 
     def trajectories(self, end: SolveEnd, gains: Callable[[Tensor], Tensor] | None = None) -> Iterate:
         """The best trajectories in the user's units, as PyTorch's rollouts give them; their own costs and violations.
