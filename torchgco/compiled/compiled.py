@@ -44,7 +44,10 @@ CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEA
 
 @contextmanager
 def _plainly() -> Iterator[None]:
-    """Tensors that are kept lie on the CPU and can be written in place, whatever the caller's default and mode are."""
+    """Tensors that are kept lie on the CPU and can be written in place, whatever the caller's default and mode are.
+
+    A warm call makes none, and does without: this takes as long as a part of the solve.
+    """
     with torch.inference_mode(False), computing_on(CPU):
         yield
 
@@ -195,8 +198,7 @@ class Compiled:
             self.numbers.write({**(numbers or {}), **named})
             able = self._warm if warm else np.zeros_like(self._warm)
             self._warm = np.zeros_like(self._warm)  # an error or an interrupt leaves nothing to begin with
-            with _plainly():
-                return self._solved(able, shift, began, until)
+            return self._solved(able, shift, began, until)
         finally:
             self._lock.release()
 
@@ -254,7 +256,7 @@ class Compiled:
 
     def _refresh(self) -> None:
         """Have C read what it doesn't share with the problem's tensors."""
-        kept, problem = self._kept, self._problem
+        kept = self._kept
         assert kept is not None
         for part in self._changed:
             if part == "dynamics":
@@ -264,7 +266,7 @@ class Compiled:
             elif isinstance(part, int):
                 kept.refresh_constraint(part)
         self._changed.clear()
-        kept.X[:, 0] = problem.x0
+        kept.start()
 
     def _now(self) -> Problem:
         """The problem with its numbers as they are, and nothing that was computed from others."""
@@ -289,20 +291,25 @@ class Compiled:
             left = math.inf if until == math.inf else max(0.0, until - time.perf_counter())
             kept.solve(able, self.interior.warm_barrier, seconds=left)
             status, worst = kept.statuses, kept.violations if kept.engine.measures else self._violation().numpy()
-            X, U = (part.numpy() for part in kept.rolled)
-            finite = np.isfinite(X).all(axis=(1, 2)) & np.isfinite(U).all(axis=(1, 2))
+            finite = kept.finite
             late = able & finite & (status == TIME_LIMIT)
             good = able & finite & (status == CONVERGED) & (worst <= self.interior.violation_tolerance)
         else:
             kept.iterations.zero_()
         self._found = None
         if not good.all():
-            self._found = self._packed_solution(good)
-            again = torch.from_numpy(~(good | late)).nonzero().flatten()
-            if again.numel() > 0:
-                self._again(self._found, again, until)
+            self._found = self._with_others(good, late, until)
         return self._answer(good, began)
 
+    @_plainly()
+    def _with_others(self, good: np.ndarray, late: np.ndarray, until: float) -> Solution:
+        """What C has found, and solves from the start of what is neither `good` nor `late`, (B,)."""
+        found, again = self._packed_solution(good), torch.from_numpy(~(good | late)).nonzero().flatten()
+        if again.numel() > 0:
+            self._again(found, again, until)
+        return found
+
+    @_plainly()
     def _by_solver_alone(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
         """Where nothing is packed for C."""
         self._found = self._by_solver(shift if able.all() else None, until)

@@ -126,9 +126,10 @@ class Numbers(Mapping[str, Floats]):
     def write(self, values: Mapping[str, Any]) -> None:
         """Write several; all are checked before the first is written."""
         new = [(number := self.find(name), number.checked(value)) for name, value in values.items()]
-        together = {number.name: np.broadcast_to(given, number.shape) for number, given in new}
-        for number, _ in new:
-            if number.joint is not None and (wrong := number.joint(together)) is not None:
+        joint = [(number, check) for number, _ in new if (check := number.joint) is not None]
+        together = {number.name: np.broadcast_to(given, number.shape) for number, given in new} if joint else {}
+        for number, check in joint:
+            if (wrong := check(together)) is not None:
                 raise InputError(number.name, *wrong)
         for number, given in new:
             number.write(given)

@@ -56,7 +56,8 @@ class Kept:
         at_rows = [torch.arange(N + 1, device=like.device)[part.knots].tolist() for part in problem.constraints]
         self._knots: list[Sequence[int]] = [range(N + 1), range(N), *at_rows]
         self._later = dict[int, list[np.ndarray]]()
-        self._rolled = [part.numpy() for part in self.rolled]
+        self._rolled, self._x0 = [part.numpy() for part in self.rolled], problem.x0.numpy()
+        self._flat = [part.reshape(B, -1) for part in self._rolled]
         self._gains = self.gains.numpy()
         self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
         self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
@@ -81,16 +82,27 @@ class Kept:
         for first, last in _spans(rows):
             run(self.library.tgco_interior, last - first, self.lanes, self.how, first)
             self.how.fill({"seconds": max(0.0, until - time.monotonic())})
-        np.nan_to_num(self._gains, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        if not math.isfinite(self._gains.sum()):
+            np.nan_to_num(self._gains, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         self._rolled[0][:], self._rolled[1][:] = self._moving[:2]
         run(library.tgco_closed_loop, B, LANES, self._follow)
         if self.engine.measures:
             run(library.tgco_violation, B, LANES, self._follow)
 
     @property
+    def finite(self) -> np.ndarray:
+        """Whether all states and controls of `rolled` are, (B,)."""
+        X, U = self._flat
+        return np.isfinite(X).all(axis=1) & np.isfinite(U).all(axis=1)
+
+    @property
     def feedback(self) -> Tensor:
         """Gains K (B, N, m, n)."""
         return self.gains[..., :-1]
+
+    def start(self) -> None:
+        """Let all trajectories begin at the problem's starts."""
+        self._moving[0][:, 0] = self._x0
 
     def shift(self, by: int) -> None:
         """Let all trajectories and multipliers begin `by` stages later, as `Solution.shifted` does."""
