@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import torchgco
 from tests.other_device import OTHER, SecondDevice
 from torchgco import (
     GCO,
@@ -98,6 +99,20 @@ def eager() -> Iterator[None]:
 def solved(problem: Problem, U0: Tensor, solver: Any = LOCAL) -> tuple[Solution, list[Tensor]]:
     found = solver.solve(problem, U0)
     return found, [found.X, found.U, found.K, found.d, found.cost, found.violation, found.status, found.iterations]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("kind", ["map", "states"])
+def test_what_solve_checks_before_and_after_stays_on_the_device(kind: str) -> None:
+    """Horizons, contact between knots, scales, explanations: the solver itself has tests of its own."""
+
+    def work(problem: Problem, U0: Tensor) -> list[Tensor]:
+        found = torchgco.solve(problem, U0, solver=LOCAL, verbose=False)
+        assert found.explain(1) and len(found.to_frame(problem)) == len(found.worst_rows(problem)) == 2
+        later = torchgco.solve(problem, warm=found.shifted(), solver="hold", verbose=False)
+        return [found.X, found.U, found.cost, found.violation, later.X]
+
+    on_both(work, kind)
 
 
 OTHERS = ("spheres", "boxes", "capsules", "oscillating", "function")
