@@ -25,6 +25,7 @@ from torchgco import (
     InteriorPoint,
     Problem,
     QuadraticCost,
+    RateBounds,
     Solution,
     StateBounds,
     Status,
@@ -203,9 +204,11 @@ class Rate(Constraint):
         return torch.cat((change, -change), dim=-1) - self.limit
 
 
-@pytest.mark.parametrize("solver", ["interior_point", "gco"])
-def test_rows_that_join_knots_are_refused_in_one_line(solver: str) -> None:
-    problem = cart(rows=[ControlBounds(-2.0, 2.0), Rate(0.1)])
+@pytest.mark.parametrize(
+    ("solver", "more"), [("interior_point", []), ("gco", []), ("interior_point", [RateBounds(-1.0, 1.0)])]
+)
+def test_rows_that_join_knots_are_refused_in_one_line(solver: str, more: list) -> None:
+    problem = cart(rows=[ControlBounds(-2.0, 2.0), Rate(0.1), *more])
     began = time.monotonic()
     with warnings.catch_warnings(), pytest.raises(InputError, match=r"rows of one knot .*RateBounds") as caught:
         warnings.simplefilter("ignore", EagerWarning)

@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown, theirs
 from torchgco.base.mixing import foreign, why
 from torchgco.base.options import check_options
 from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
-from torchgco.base.tree import PerElement
+from torchgco.base.tree import PerElement, is_users
 from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.costs.base import add_blocks
 
@@ -85,6 +85,30 @@ class Constraint(PerElement):
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """Whether the constraint admits a start at x0 (B, n), (B,) bool."""
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)
+
+
+@dataclass(frozen=True)
+class WrappedConstraint(Constraint):
+    """A constraint with kind and knots of another one, in a form of the problem with other rows."""
+
+    constraint: Constraint
+
+    sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
+    geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
+    knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
+    bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
+    calls_function = property(lambda self: is_users(self.constraint))
+
+    def grown(self, by: Tensor) -> Self:
+        return replace(self, constraint=self.constraint.grown(by))
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        return self.constraint.start_is_clear(x0)
+
+
+def innermost(constraint: Constraint) -> Constraint:
+    """The constraint within all that wraps it."""
+    return innermost(constraint.constraint) if isinstance(constraint, WrappedConstraint) else constraint
 
 
 def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> slice | Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.base.shapes import Dimensions, lead
-from torchgco.base.tree import PerElement
+from torchgco.base.tree import PerElement, is_users
 from torchgco.base.values import whole_numbers_become
 
 
@@ -77,6 +77,8 @@ class WrappedCost(Cost):
     """A cost with the goal and the controls at rest of another one."""
 
     cost: Cost
+
+    calls_function = property(lambda self: is_users(self.cost))
 
     def rest_controls(self, like: Tensor) -> Tensor:
         return self.cost.rest_controls(like)

@@ -13,7 +13,7 @@ from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Seconds, check_options
 from torchgco.base.shapes import Dimensions
-from torchgco.base.tree import PerElement
+from torchgco.base.tree import PerElement, is_users
 from torchgco.base.values import NONE, Knot, Values, asks_for_knot, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS
 
@@ -70,6 +70,19 @@ class Dynamics(PerElement):
         """Derivatives of `step` by `torch.func`: fx (..., n, n) and fu (..., n, m)."""
         fx, fu = jacobian(self.step, x, u)
         return fx, fu
+
+
+@dataclass(frozen=True)
+class WrappedDynamics(Dynamics):
+    """A model with sizes, time step and position of another one, in a form of the problem with other steps."""
+
+    model: Dynamics
+
+    n = property(lambda self: self.model.n)  # type: ignore[assignment]
+    m = property(lambda self: self.model.m)  # type: ignore[assignment]
+    dt = property(lambda self: self.model.dt)  # type: ignore[assignment]
+    position = property(lambda self: self.model.position)  # type: ignore[assignment]
+    calls_function = property(lambda self: is_users(self.model))
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class Kept:
     def finite(self) -> np.ndarray:
         """Whether all states and controls of `rolled` are, (B,)."""
         X, U = self._flat
-        return np.isfinite(X).all(axis=1) & np.isfinite(U).all(axis=1)
+        return np.asarray(np.isfinite(X).all(axis=1) & np.isfinite(U).all(axis=1))
 
     @property
     def feedback(self) -> Tensor:

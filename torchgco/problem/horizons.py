@@ -16,12 +16,11 @@ from torch import Tensor
 from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import lead
-from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.base import WrappedDynamics
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
@@ -88,20 +87,13 @@ def _between(held: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _Dynamics(Dynamics):
+class _Dynamics(WrappedDynamics):
     """A model whose states are held after each problem's last stage."""
 
-    model: Dynamics
     running: Tensor  # (B, N): 1 in the stages of a problem, 0 after them
     k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at`
 
     batched: ClassVar[tuple[str, ...]] = ("model", "running")
-
-    n = property(lambda self: self.model.n)  # type: ignore[assignment]
-    m = property(lambda self: self.model.m)  # type: ignore[assignment]
-    dt = property(lambda self: self.model.dt)  # type: ignore[assignment]
-    position = property(lambda self: self.model.position)  # type: ignore[assignment]
-    calls_function = property(lambda self: is_users(self.model))
 
     def at(self, k: int | Tensor) -> Self:
         return replace(self, model=self.model.at(k), k=k)
@@ -242,19 +234,12 @@ def _obstacles(obstacles: Obstacles, problem: Problem, i: int) -> Obstacles:
 
 
 @dataclass(frozen=True)
-class _Rows(Constraint):
+class _Rows(WrappedConstraint):
     """A constraint whose rows count at some of its knots."""
 
-    constraint: Constraint
     counts: Tensor  # (B, K): 1 where they count, else 0
 
     batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
-
-    sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
-    geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
-    knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
-    bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
-    calls_function = property(lambda self: is_users(self.constraint))
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else OUT_OF_THE_WAY)
@@ -269,12 +254,6 @@ class _Rows(Constraint):
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)
-
-    def grown(self, by: Tensor) -> Self:
-        return replace(self, constraint=self.constraint.grown(by))
-
-    def start_is_clear(self, x0: Tensor) -> Tensor:
-        return self.constraint.start_is_clear(x0)
 
     def _where(self, rows: Tensor, other: float) -> Tensor:
         return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)

@@ -12,13 +12,12 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.constraints.separation import Separation
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.base import WrappedDynamics
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 
@@ -48,19 +47,14 @@ def with_controls_before(problem: Problem) -> Problem:
 
 
 @dataclass(frozen=True)
-class _Dynamics(Dynamics):
+class _Dynamics(WrappedDynamics):
     """A model whose states are followed by some of the controls of the stage before."""
 
-    model: Dynamics
     controls: Tensor  # (r,) int64: which controls
 
     batched: ClassVar[tuple[str, ...]] = ("model",)
 
     n = property(lambda self: self.model.n + len(self.controls))  # type: ignore[assignment]
-    m = property(lambda self: self.model.m)  # type: ignore[assignment]
-    dt = property(lambda self: self.model.dt)  # type: ignore[assignment]
-    position = property(lambda self: self.model.position)  # type: ignore[assignment]
-    calls_function = property(lambda self: is_users(self.model))
 
     def at(self, k: int | Tensor) -> Self:
         model = self.model.at(k)
@@ -148,18 +142,12 @@ def _constraint(constraint: Constraint, n: int) -> Constraint:
 
 
 @dataclass(frozen=True)
-class _Rows(Constraint):
+class _Rows(WrappedConstraint):
     """A constraint on the first n states."""
 
-    constraint: Constraint
     n: int
 
     batched: ClassVar[tuple[str, ...]] = ("constraint",)
-
-    sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
-    geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
-    knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
-    bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self.constraint.value(X[..., : self.n], U)
@@ -174,9 +162,6 @@ class _Rows(Constraint):
         blocks = _blocks(H, self.n, U.shape[-1])
         self.constraint.accumulate(X[..., : self.n], U, g, h, blocks)
         _add(H, blocks, self.n)
-
-    def grown(self, by: Tensor) -> Self:
-        return replace(self, constraint=self.constraint.grown(by))
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         return self.constraint.start_is_clear(x0[:, : self.n])
