@@ -13,7 +13,7 @@ import pytest
 
 from torchgco.base import notices
 from torchgco.native import compiler
-from torchgco.native.compiler import find_compiler
+from torchgco.native.compiler import Unit, find_compiler
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPILE = "from torchgco.native.compiler import build; build('int tgco_one(void) { return 1; }')"
@@ -55,28 +55,36 @@ def test_something_brief_is_shown_to_those_who_watch(shown, capsys, monkeypatch)
     ("lines", "flags", "said"),
     [
         (100, (), None),
-        (1900, (), None),
-        (2600, (), "about 2 s"),
-        (2600, ("-O3", "-O1"), None),
-        (50_000, ("-O3",), "about 14 s"),
+        (8000, (), None),
+        (11_000, (), "about 3 s"),
+        (11_000, ("-O3", "-O1"), None),
+        (50_000, ("-O3",), "about 13 s"),
         (50_000, ("-O1", "-g"), "about 7 s"),
         (10**6, (), "about 23 minutes"),
     ],
 )
 def test_a_log_says_how_long_the_compiler_takes_where_that_is_long(lines, flags, said, capsys, monkeypatch) -> None:
     monkeypatch.setattr(compiler, "_begun", {})
-    compiler._announce("\n" * lines, flags)
+    compiler._announce([Unit("\n" * lines, own=True)], flags)
     text = capsys.readouterr().err
     assert (text == "") if said is None else f"compiling native kernels (once for this form of problem, {said})" in text
+
+
+def test_units_are_compiled_side_by_side(monkeypatch) -> None:
+    """As many as there are cores at a time, and the longest one as long as it takes."""
+    monkeypatch.setattr(compiler.os, "cpu_count", lambda: 2)
+    solver, model = Unit("\n" * 2000), Unit("\n" * 1000, own=True)
+    together = compiler._expected([solver, solver, solver, model], ())
+    assert 3.0 < together < 3.4 and compiler._expected([solver, model], ()) == compiler._expected([solver], ()) == 2.0
 
 
 def test_compilers_at_the_same_time_are_announced_once(capsys, monkeypatch) -> None:
     running = SimpleNamespace(owner=os.getpid(), process=SimpleNamespace(poll=lambda: None))
     monkeypatch.setattr(compiler, "_begun", {"key": running})
-    compiler._announce("\n" * 10_000, ())
+    compiler._announce([Unit("\n" * 11_000)], ())
     assert capsys.readouterr().err == ""
     running.process.poll = lambda: 0
-    compiler._announce("\n" * 10_000, ())
+    compiler._announce([Unit("\n" * 11_000)], ())
     assert "compiling" in capsys.readouterr().err
 
 

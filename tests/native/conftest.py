@@ -11,4 +11,5 @@ from torchgco.native import compiler
 def cache(tmp_path: Path, monkeypatch) -> Path:
     monkeypatch.setenv("TORCHGCO_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(compiler, "_loaded", {})
+    monkeypatch.setattr(compiler, "_objects", {})
     return tmp_path / "cache"

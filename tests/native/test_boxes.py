@@ -68,14 +68,6 @@ def test_slopes_on_the_axis_of_a_post_are_pytorchs(d: int) -> None:
     torch.testing.assert_close(slopes[:, :-1, :n], want[:, :-1, :n, n], rtol=1e-10, atol=1e-9)
 
 
-def test_problems_without_boxes_have_no_code_for_them() -> None:
-    plain, boxed = planar_batch(B=1, N=3)[0], boxed_batch(2, B=1, N=3)[0]
-    sources = [engine.form.source() for problem in (plain, boxed) if (engine := engine_of(problem)) is not None]
-    assert len(sources) == 2
-    assert "WITH_BOXES 1" not in sources[0] and "static inline V solid(" not in sources[0]
-    assert "WITH_BOXES 1" in sources[1] and sources[1].count("static inline V solid(") == 1
-
-
 WALLS = {
     "box": Boxes([[0.1, 0.0]], [[0.1, 0.3]], 0.06, [0.2]),
     "capsule": Capsules([[0.1, -0.3]], [[0.05, 0.3]], [0.1], 0.06),

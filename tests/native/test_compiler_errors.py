@@ -8,7 +8,7 @@ import pytest
 
 from tests.native.test_compiler import needs_compiler, next_process, source
 from torchgco.native import compiler, store
-from torchgco.native.compiler import NativeError, build, find_compiler
+from torchgco.native.compiler import NativeError, Unit, build, find_compiler
 from torchgco.native.declarations import Structure, fields, head, load
 
 pytestmark = pytest.mark.usefixtures("cache")
@@ -69,7 +69,7 @@ def test_a_library_without_our_names_is_an_error_of_its_own(cache: Path) -> None
         _fields_ = fields(declared)
 
     text = head([Half], [], {})
-    key = compiler._key(find_compiler(), text, (*find_compiler().flags, *find_compiler().further))
+    key = compiler._key(find_compiler(), [Unit(text, own=True)], (*find_compiler().flags, *find_compiler().further))
     build(source(2))
     (other,) = cache.iterdir()
     store.save(key, ".so", other.read_bytes())

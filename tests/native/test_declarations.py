@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import astuple, replace
 from enum import IntEnum
 
 import pytest
@@ -109,13 +109,17 @@ def test_an_end_is_no_status() -> None:
 def test_a_constant_changes_what_is_compiled(name: str, monkeypatch) -> None:
     engine = engine_of(boxed_batch(2, B=1, N=3)[0])
     assert engine is not None
-    for parts in (SOLVER, SAMPLER, INTERIOR):
-        usual = engine.form._written(parts, "double", LANES, "")
+    vectors = {"REAL": "double", "LANES": LANES}
+    for library in (SOLVER, SAMPLER, INTERIOR):
+        usual = engine.form._written(library, vectors)
         with monkeypatch.context() as patch:
             patch.setitem(CONSTANTS, name, 7)
-            changed = engine.form._written(parts, "double", LANES, "")
-        assert changed == usual.replace(f"#define {name} {written(name)}\n", f"#define {name} 7\n") != usual
-    assert any(name in (C / file).read_text() for file in (*SOLVER, *SAMPLER, *INTERIOR)), "no line of C uses it"
+            changed = engine.form._written(library, vectors)
+        for now, before in zip(changed, usual, strict=True):
+            own = f"#define {name} {written(name)}\n"
+            assert now.source == before.source.replace(own, f"#define {name} 7\n") != before.source
+    files = {file for library in (SOLVER, SAMPLER, INTERIOR) for part in astuple(library) for file in part}
+    assert any(name in (C / file).read_text() for file in files), "no line of C uses it"
 
 
 def written(name: str) -> str:

@@ -234,7 +234,7 @@ class Compiled:
         if self._kept is None:
             return None  # PyTorch's kernels call the functions themselves
         then, now = self._kept.engine, Engine(self._now().renewed(), compiles=False)
-        if then.form.source() == now.form.source():
+        if then.form.units() == now.form.units():
             return None
         return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
 

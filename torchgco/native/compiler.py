@@ -25,11 +25,12 @@ from types import FrameType
 from torchgco.base.notices import notice
 from torchgco.native import store
 
-# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Below -O2 gcc clears the
+# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Products and sums are fused
+# where the code says so (lanes.h) and nowhere else: bits depend on no optimisation and on no division into units. Below -O2 gcc clears the
 # upper halves of vector registers before calls of the C library only with -fexpensive-optimizations: otherwise such a
 # call, a tanh for instance, takes many times as long on some processors.
 FLAGS = (
-    "-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
+    "-O3", "-std=c11", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off",
     "-fexpensive-optimizations",
 )  # fmt: skip
 # No warning where a vector type is wider than the registers: within one library that does no harm.
@@ -38,11 +39,12 @@ _ERROR_LINES = 5
 _ERROR = re.compile(r"error|fail|cannot|can't|No space", re.IGNORECASE)
 # What drivers add when the reason has been said, and lines of the source that are shown beside it.
 _SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? generated|^\d*\s*\|", re.IGNORECASE)
-# What gcc 12 takes: s a line of the solvers' own text, loops over vectors, and of the straight code of a model, beyond
-# _SOLVER lines, twice as long where there are _LONG of these; and the share of it at other levels than -O3.
-_LOOPS, _GENERATED, _SOLVER, _LONG = 1.0e-3, 0.2e-3, 2000, 170_000
+# What gcc 12 takes: s a line of the solvers' own text, loops over vectors; of the straight code of a model, twice as long
+# where there are _LONG lines, and to begin with; and the share of it at other levels than -O3.
+_LOOPS, _STRAIGHT, _BEGIN, _LONG = 1.0e-3, 0.2e-3, 0.2, 170_000
 _SHARES = {"-O0": 0.2, "-Og": 0.3, "-O1": 0.5, "-O2": 0.7, "-O3": 1.0}
 _BRIEF = 2.0  # s: compilations that are shorter are announced only to those who watch
+_KEPT = 32  # objects in memory
 _AMD_HALVES = 25  # family of AMD processors, at most, that compute vectors of 512 bits in two steps
 
 
@@ -73,11 +75,23 @@ def find_compiler() -> Compiler | None:
     return _find_compiler(*map(os.environ.get, ("TORCHGCO_CC", "CC", "PATH", "TORCHGCO_CFLAGS")))
 
 
-def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
+@dataclass(frozen=True)
+class Unit:
+    """A file of C that a library is linked from.
+
+    Attributes:
+        own: straight code of one model. The objects of all others are kept in the cache, for libraries to come.
+    """
+
+    source: str
+    own: bool = False
+
+
+def build(source: str | Sequence[Unit], flags: Sequence[str] = ()) -> ctypes.CDLL:
     """The library that `source` is compiled to; names it exports begin with tgco_.
 
     Args:
-        source: one file of C11.
+        source: one file of C11, or the units that are compiled, beside each other, and linked.
         flags: further flags, after those of `FLAGS`, so that -O2 here replaces its -O3.
 
     Raises:
@@ -85,29 +99,29 @@ def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
             written or loaded.
     """
     compiler = find_compiler()
-    known = (source, tuple(flags), compiler)
+    units = (Unit(source, own=True),) if isinstance(source, str) else tuple(source)
+    known = (units, tuple(flags), compiler)
     # No lock: two threads that compile the same source do no harm, and a lock held across a fork would.
     if known not in _loaded:
         if compiler is None:
             raise NativeError(
                 "no C compiler found: install gcc or clang, or `pip install ziglang`, or name one in TORCHGCO_CC"
             )
-        _loaded[known] = _load(compiler, source, (*compiler.flags, *flags, *compiler.further))
+        _loaded[known] = _load(compiler, units, (*compiler.flags, *flags, *compiler.further))
     return _loaded[known]
 
 
-def begin(source: str) -> None:
-    """Start to compile a source that `build` will ask for, while others are compiled; an error is left to `build`."""
+def begin(*libraries: tuple[Unit, ...]) -> None:
+    """Start to compile what `build` will ask for, of several libraries at once; an error is left to `build`."""
     compiler = find_compiler()
-    if compiler is None or (source, (), compiler) in _loaded:
+    if compiler is None:
         return
     flags = (*compiler.flags, *compiler.further)
-    key = _key(compiler, source, flags)
-    if key not in _begun and store.find(key, ".so") is None:
-        _announce(source, flags)
-        with suppress(OSError), _held():
-            room = TemporaryDirectory(prefix="torchgco-")
-            _begun[key] = _Begun(os.getpid(), room, _start(compiler, source, flags, Path(room.name)))
+    missing = [
+        units for units in libraries
+        if (units, (), compiler) not in _loaded and store.find(_key(compiler, units, flags), ".so") is None
+    ]  # fmt: skip
+    _begin(compiler, [unit for units in missing for unit in units], flags)
 
 
 @dataclass(frozen=True)
@@ -119,30 +133,38 @@ class _Begun:
     process: subprocess.Popen[str]
 
 
-_loaded: dict[tuple[str, tuple[str, ...], Compiler | None], ctypes.CDLL] = {}
-_begun: dict[str, _Begun] = {}
+_loaded: dict[tuple[tuple[Unit, ...], tuple[str, ...], Compiler | None], ctypes.CDLL] = {}
+_begun: dict[str, _Begun] = {}  # by the key of the object
+_objects: dict[str, bytes] = {}  # the most recent ones: both libraries of a form have its model's
 
 
-def _key(compiler: Compiler, source: str, flags: tuple[str, ...]) -> str:
+def _key(compiler: Compiler, units: Sequence[Unit], flags: tuple[str, ...]) -> str:
     # Libraries are of a kin whose sources differ in numbers alone, decimal or hexadecimal, be it in names.
-    kin = source.encode(errors="surrogateescape").translate(None, b"0123456789abcdefxp.+-").decode(errors="replace")
-    return store.key_of(("library 1", source, *flags, compiler.identity, _processor()), kin)
+    sources = [unit.source for unit in units]
+    every = "".join(sources).encode(errors="surrogateescape")
+    kin = every.translate(None, b"0123456789abcdefxp.+-").decode(errors="replace")
+    return store.key_of(("library 2", *sources, *_circumstances(compiler, flags)), kin)
 
 
-def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
-    key = _key(compiler, source, flags)
+def _object_key(compiler: Compiler, unit: Unit, flags: tuple[str, ...]) -> str:
+    return store.key_of(("object 1", unit.source, *_circumstances(compiler, flags)))
+
+
+def _circumstances(compiler: Compiler, flags: tuple[str, ...]) -> tuple[str, ...]:
+    return (*flags, *compiler.command[1:], compiler.identity, _processor())
+
+
+def _load(compiler: Compiler, units: tuple[Unit, ...], flags: tuple[str, ...]) -> ctypes.CDLL:
+    key = _key(compiler, units, flags)
     held = store.read(key, ".so")
     if held is not None:
         with suppress(OSError):  # a full disk, or one mounted without execution rights
             return _own(held)
         with suppress(OSError):
             return ctypes.CDLL(str(store.find(key, ".so")))
-    begun = _begun.pop(key, None)
-    if begun is not None and begun.owner != os.getpid():
-        begun = None
     try:
-        with TemporaryDirectory(prefix="torchgco-") if begun is None else begun.room as room:
-            made = _compile(compiler, source, flags, Path(room), None if begun is None else begun.process)
+        with TemporaryDirectory(prefix="torchgco-") as room:
+            made = _linked(compiler, units, flags, Path(room))
             kept = store.save(key, ".so", made.read_bytes())
             try:
                 return ctypes.CDLL(str(made))  # stays loaded when its file is deleted
@@ -163,47 +185,114 @@ def _own(library: bytes) -> ctypes.CDLL:
         return ctypes.CDLL(str(path))
 
 
-def _compile(
-    compiler: Compiler, source: str, flags: tuple[str, ...], room: Path, begun: subprocess.Popen[str] | None = None
-) -> Path:
-    if begun is None:
-        _announce(source, flags)
-    returncode, errors = _finished(lambda: begun or _start(compiler, source, flags, room))
-    if returncode:
-        said = [line.strip() for line in errors.splitlines() if line.strip()] or [_ended(returncode)]
-        telling = [line for line in said if _ERROR.search(line) and not _SUMMARY.search(line)] or said
-        # The first line stands alone in warnings: it has the error that ended the compiler, the last one.
-        lines = [f"{shlex.join(compiler.command)} failed: {telling[-1]}", *telling[:-1][:_ERROR_LINES]]
-        raise NativeError("\n".join(lines))
+def _linked(compiler: Compiler, units: tuple[Unit, ...], flags: tuple[str, ...], room: Path) -> Path:
+    """The library of these units, made in a room of its own."""
+    _begin(compiler, units, flags)
+    objects = [_object(compiler, unit, flags) for unit in units]
+    for i, content in enumerate(objects):
+        (room / f"{i}.o").write_bytes(content)
+    words = ["-shared", "-o", "kernels.so", *(f"{i}.o" for i in range(len(units))), "-lm"]
+    _check(compiler, *_finished(lambda: _start(compiler, (*flags, *words), room)))
     return room / "kernels.so"
 
 
-def _announce(source: str, flags: Sequence[str]) -> None:
-    """A line on a compiler that is to be started; none where another one runs, which has been announced."""
+def _begin(compiler: Compiler, units: Sequence[Unit], flags: tuple[str, ...]) -> None:
+    """Start a compiler for each of these units that has no object yet, all at the same time."""
+    keys = {_object_key(compiler, unit, flags): unit for unit in units}
+    missing = {key: unit for key, unit in keys.items() if _known(key, unit) is None and not _runs(key)}
+    if missing:
+        _announce(list(missing.values()), flags)
+    for key, unit in missing.items():
+        with suppress(OSError), _ending([]), _held():
+            room = TemporaryDirectory(prefix="torchgco-")
+            _begun[key] = _Begun(os.getpid(), room, _compiling(compiler, unit, flags, Path(room.name)))
+
+
+def _compiling(compiler: Compiler, unit: Unit, flags: tuple[str, ...], room: Path) -> subprocess.Popen[str]:
+    """A compiler that makes kernels.o of a unit in its room."""
+    (room / "kernels.c").write_text(unit.source)
+    return _start(compiler, (*flags, "-c", "-o", "kernels.o", "kernels.c"), room)
+
+
+def _runs(key: str) -> bool:
+    return key in _begun and _begun[key].owner == os.getpid()
+
+
+def _known(key: str, unit: Unit) -> bytes | None:
+    """The object under a key, of this process or from the cache."""
+    found = _objects.get(key)
+    if found is None and not unit.own:
+        found = store.read(key, store.OBJECT)
+        if found is not None:
+            _remember(key, found)
+    return found
+
+
+def _remember(key: str, content: bytes) -> None:
+    _objects[key] = content
+    if len(_objects) > _KEPT:
+        del _objects[next(iter(_objects))]
+
+
+def _object(compiler: Compiler, unit: Unit, flags: tuple[str, ...]) -> bytes:
+    """The object of a unit; its compiler has begun unless another thread waits for that one."""
+    key = _object_key(compiler, unit, flags)
+    begun = _begun.pop(key, None) if _runs(key) else None
+    if begun is None:
+        content = _known(key, unit)
+        if content is not None:
+            return content
+    with TemporaryDirectory(prefix="torchgco-") if begun is None else begun.room as name:
+        room = Path(name)
+        _check(compiler, *_finished(lambda: _compiling(compiler, unit, flags, room) if begun is None else begun.process))
+        content = (room / "kernels.o").read_bytes()
+    _remember(key, content)
+    if not unit.own:
+        store.save(key, store.OBJECT, content)
+    return content
+
+
+def _check(compiler: Compiler, returncode: int, errors: str) -> None:
+    """Raise what a compiler says that has failed."""
+    if returncode == 0:
+        return
+    said = [line.strip() for line in errors.splitlines() if line.strip()] or [_ended(returncode)]
+    telling = [line for line in said if _ERROR.search(line) and not _SUMMARY.search(line)] or said
+    # The first line stands alone in warnings: it has the error that ended the compiler, the last one.
+    lines = [f"{shlex.join(compiler.command)} failed: {telling[-1]}", *telling[:-1][:_ERROR_LINES]]
+    raise NativeError("\n".join(lines))
+
+
+def _announce(units: Sequence[Unit], flags: Sequence[str]) -> None:
+    """A line on compilers that are to be started; none where others run, which have been announced."""
     if any(begun.owner == os.getpid() and begun.process.poll() is None for begun in _begun.values()):
         return
-    seconds = _expected(source, flags)
+    seconds = _expected(units, flags)
     about = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} minutes"
     known = f"about {about}" if seconds >= 1.0 else "a moment"
     notice(f"compiling native kernels (once for this form of problem, {known}) ...", brief=seconds <= _BRIEF)
 
 
-def _expected(source: str, flags: Sequence[str]) -> float:
-    """Seconds that gcc takes for a source, within a factor of two on an AMD EPYC that has nothing else to do."""
-    lines = source.count("\n")
-    own, straight = min(lines, _SOLVER), max(0, lines - _SOLVER)
+def _expected(units: Sequence[Unit], flags: Sequence[str]) -> float:
+    """Seconds that gcc takes for units, within a factor of two on an AMD EPYC that has nothing else to do."""
     level = next((flag for flag in reversed(flags) if flag in _SHARES), "-O3")
-    return _SHARES[level] * (_LOOPS * own + _GENERATED * straight * (1.0 + straight / _LONG))
+    each = [_SHARES[level] * _took(unit) for unit in units]
+    return max(*each, sum(each) / (os.cpu_count() or 1)) if len(each) > 1 else each[0]
 
 
-def _start(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> subprocess.Popen[str]:
-    """A compiler that makes kernels.so in its room. It has a process group of its own, as it starts other processes."""
-    (room / "kernels.c").write_text(source)
+def _took(unit: Unit) -> float:
+    lines = unit.source.count("\n")
+    if not unit.own:
+        return _LOOPS * lines
+    return _BEGIN + _STRAIGHT * lines * (1.0 + lines / _LONG)
+
+
+def _start(compiler: Compiler, words: Sequence[str], room: Path) -> subprocess.Popen[str]:
+    """A compiler that works in its room. It has a process group of its own, as it starts other processes."""
     # Run in its folder: no path gets into the library, which then has the same bytes wherever it is made.
     return subprocess.Popen(
-        [*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"], cwd=room,
-        env={**os.environ, "LC_ALL": "C"}, process_group=0, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE, text=True, errors="replace",
+        [*compiler.command, *words], cwd=room, env={**os.environ, "LC_ALL": "C"}, process_group=0,
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace",
     )  # fmt: skip
 
 
@@ -213,15 +302,22 @@ def _finished(start: Callable[[], subprocess.Popen[str]]) -> tuple[int, str]:
     Ctrl-C and SIGTERM end it here, with its group and the compilers that have begun: they would go on.
     """
     started: list[subprocess.Popen[str]] = []
+    with _ending(started):
+        with _held():  # a signal before the compiler is known would leave it running
+            started.append(start())
+        _, said = started[0].communicate()
+    return started[0].returncode, said
+
+
+@contextmanager
+def _ending(started: Sequence[subprocess.Popen[str]]) -> Iterator[None]:
+    """An exception or SIGTERM in this block ends what is started by then, and the compilers that have begun."""
     try:
         with _ending_by_sigterm(started):
-            with _held():  # a signal before the compiler is known would leave it running
-                started.append(start())
-            _, said = started[0].communicate()
+            yield
     except BaseException:
         _end_all(started)
         raise
-    return started[0].returncode, said
 
 
 @contextmanager

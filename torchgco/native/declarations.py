@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchgco.native.codegen.emit import literal
-from torchgco.native.compiler import NativeError, build
+from torchgco.native.compiler import NativeError, Unit, build
 
 NUMBERS = {"int32_t": ctypes.c_int32, "int64_t": ctypes.c_int64, "double": ctypes.c_double}
 TENSORS = {
@@ -96,8 +96,8 @@ def fields(declared: tuple[tuple[Any, str], ...]) -> list[tuple[str, Any]]:
     return [(name, _ctype(kind)) for kind, names in declared for name in names.split()]
 
 
-def load(source: str, structures: Iterable[type[Structure]], flags: Sequence[str] = ()) -> ctypes.CDLL:
-    """The library that a source with the `head` of these structures is compiled to.
+def load(source: str | Sequence[Unit], structures: Iterable[type[Structure]], flags: Sequence[str] = ()) -> ctypes.CDLL:
+    """The library that a source, or units, with the `head` of these structures are compiled to.
 
     Raises:
         NativeError: see `build`; or a structure of another size in C, or of none.
@@ -123,7 +123,9 @@ def head(
     for structure in structures:
         rows = "".join(f"    {_in_c(name, kind)};\n" for name, kind in structure.kinds.items())
         name = structure.__name__
-        lines += [f"typedef struct {{\n{rows}}} {name};", f"int tgco_size_of_{name}(void) {{ return sizeof({name}); }}"]
+        lines += [f"typedef struct {{\n{rows}}} {name};"]
+        # Weak: each unit of a library has it.
+        lines += [f"__attribute__((weak)) int tgco_size_of_{name}(void) {{ return sizeof({name}); }}"]
     return "\n".join(lines) + "\n"
 
 

@@ -18,7 +18,6 @@ from torchgco.base.status import Status
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.maps.field import BoundField
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
@@ -27,7 +26,6 @@ from torchgco.native.codegen.stages import trace_model
 from torchgco.native.declarations import load
 from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, numbers_of, quadratic_arrays
 from torchgco.native.structures import STRUCTURES, array
-from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
 
 PACKED = "packed"  # marks the constraints that were packed last, among what a form keeps
@@ -60,14 +58,13 @@ class Engine:
         sources = ((i, trace_rows(problem, i)) for i in traced)
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
-        kinds = {type(constraint) for constraint in problem.constraints}
         self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
-        self.form = Form(self.model, at, self.cost, dense, functions, BoundBoxes in kinds, BoundField in kinds)
+        self.form = Form(self.model, at, self.cost, dense, functions)
         if ahead is not None:
             ahead(self)
         if compiles:
-            self.library = load(self.form.source(), STRUCTURES)
+            self.library = load(self.form.units(), STRUCTURES)
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X (B, N+1, n) from U (B, N, m)."""

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.source import INTERIOR, LANES
 from torchgco.native.compiler import begin
 from torchgco.native.declarations import load
@@ -31,12 +30,12 @@ class InteriorEngine:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self.library = load(_source(engine), STRUCTURES)
+        self.library = load(engine.form.units(INTERIOR), STRUCTURES)
 
     def for_few(self, B: int) -> tuple[ctypes.CDLL, int]:
         """A library for B problems, and how many it solves side by side: lanes without a problem take time, too."""
         lanes = next((lanes for lanes in FEW if B <= lanes < LANES), LANES)
-        return (self.library if lanes == LANES else load(_source(self.engine, lanes), STRUCTURES)), lanes
+        return (self.library if lanes == LANES else load(self.engine.form.units(INTERIOR, lanes=lanes), STRUCTURES)), lanes
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
@@ -73,10 +72,7 @@ class InteriorEngine:
 
 
 def begin_interior(engine: Engine) -> None:
-    """Start to compile the interior point's library, for a form whose first library is about to be compiled."""
+    """Start to compile both libraries of a form of which the first one is about to be loaded."""
     with suppress(InputError):
-        begin(_source(engine))
+        begin(engine.form.units(), engine.form.units(INTERIOR))
 
-
-def _source(engine: Engine, lanes: int = LANES) -> str:
-    return engine.form.source(INTERIOR, lanes=lanes, more=curvature_code(engine.model, engine.functions.items()))

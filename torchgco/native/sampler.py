@@ -23,7 +23,7 @@ class Sampler:
 
     def __init__(self, engine: Engine, dtype: torch.dtype) -> None:
         self.engine = engine
-        self.library = load(engine.form.source(SAMPLER, *REALS[dtype]), STRUCTURES)
+        self.library = load(engine.form.units(SAMPLER, *REALS[dtype]), STRUCTURES)
 
     def improve(self, problem: Problem, U: Tensor, sampling: Sampling) -> Tensor:
         """Controls (B, N, m): the weighted mean of the last round's samples, the first drawn around U.

@@ -3,7 +3,8 @@
 A file is called KEY-CHECKSUM and a suffix, with the checksum of its content. It is written under another name and
 renamed, so processes that write the same file at once do no harm; a damaged, truncated or swapped file is deleted.
 The first digits of a key are those of its kin: code that differs in numbers alone, as in a loop that trains a model. Of
-such a kin only so many files are kept, so a loop displaces its own oldest files and not those of other problems.
+such a kin only so many files are kept, so a loop displaces its own oldest files and not those of other problems. The
+objects of solvers, which libraries to come are linked from, are counted apart.
 A folder that is missing or can't be written costs time, never correctness: nothing here raises OSError.
 
 Libraries are code, and the checksum is no signature: anybody can compute it. So a folder or file that others own or may
@@ -27,6 +28,7 @@ from typing import Any, NamedTuple
 from torchgco.base.files import PART, write_whole
 
 FILES = 1000  # at most, some 150 MB; the least recently used are removed
+OBJECT, OBJECTS = ".o", 200  # objects of the solvers, further 20 MB: no loop over models removes any
 KIN = 100  # at most of one kin: a tenth of all, as a solve makes four or so
 _PREFIX = 8  # digits of a key that name its kin
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
@@ -164,8 +166,10 @@ def _tidy(place: Path, kin: str) -> None:
                 elif entry.name.startswith(PART[0]) and entry.name.endswith(PART[1]) and age > _ABANDONED:
                     os.unlink(entry.path)
     ages.sort()
-    over = [one for one in ages if os.path.basename(one[1]).startswith(kin)][KIN:]
-    over += [one for one in ages if one not in over][FILES:]
+    objects = [one for one in ages if one[1].endswith(OBJECT)]
+    others = [one for one in ages if not one[1].endswith(OBJECT)]
+    over = [one for one in others if os.path.basename(one[1]).startswith(kin)][KIN:]
+    over += [one for one in others if one not in over][FILES:] + objects[OBJECTS:]
     for _, path in over:
         with suppress(OSError):
             os.unlink(path)

@@ -36,8 +36,6 @@ typedef __typeof__((V){0} == (V){0}) I;
 #define SET(c) ((double)(c) - (V){0})
 static inline V tgco_choose(I where, V a, V b) { return (V)((where & (I)a) | (~where & (I)b)); }
 """
-# Fused products and sums would be rounded once where PyTorch rounds twice.
-FLAGS = ("-ffp-contract=off",)
 
 
 class Arguments(Structure):
@@ -168,7 +166,7 @@ def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.C
     constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL, "BLOCK": BLOCK, "SIDE": SIDE}
     own = [VECTORS, BOX.read_text(), BOXES.read_text()] if boxes else []
     try:
-        return load("\n".join((head([Arguments], [], constants), *own, SEARCH.read_text())), [Arguments], FLAGS)
+        return load("\n".join((head([Arguments], [], constants), *own, SEARCH.read_text())), [Arguments])
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

@@ -22,7 +22,7 @@ static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_
     for (int i = 0; i < DIM; i++) {
         V depth = tgco_fabs(local[i]) - half[i];
         away[i] = beyond(local[i], half[i]);
-        square += away[i] * away[i];
+        ADD(square, away[i], away[i]);
         nearest[i] = i == 0 ? zero == zero : depth > deepest; /* the first of equals */
         deepest = tgco_choose(nearest[i], depth, deepest);
         for (int a = 0; a < i; a++) nearest[a] &= ~nearest[i];
@@ -35,7 +35,7 @@ static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_
         for (int i = 0; i < DIM; i++) {
             V inside = tgco_choose(local[i] < zero, -tgco_truth(nearest[i]), tgco_truth(nearest[i]));
             V side = -factor * tgco_choose(outside, away[i] / distance, inside);
-            for (int a = 0; a < DIM; a++) slopes[a] += axes[i * DIM + a] * side;
+            for (int a = 0; a < DIM; a++) ADD(slopes[a], axes[i * DIM + a], side);
         }
         for (int a = 0; a < DIM; a++) slopes[a] = tgco_if(here, slopes[a]);
     }
@@ -98,8 +98,8 @@ static inline void boxes_expand(
             if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
             V slope = pull(s, 0, c, lam[j], &rho);
             for (int a = 0; a < DIM; a++) {
-                g[POSITION + a] += slope * slopes[a];
-                for (int b = a; b < DIM; b++) H[(POSITION + a) * S + POSITION + b] += rho * slopes[a] * slopes[b];
+                ADD(g[POSITION + a], slope, slopes[a]);
+                for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], rho * slopes[a], slopes[b]);
             }
         }
     }

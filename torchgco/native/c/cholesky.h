@@ -4,13 +4,13 @@
 static inline void factor_controls(const V *H, V *L, V *pivots) {
     for (int j = 0; j < NU; j++) {
         V pivot = H[(NX + j) * S + NX + j];
-        for (int i = 0; i < j; i++) pivot -= L[j * NU + i] * L[j * NU + i];
+        for (int i = 0; i < j; i++) SUBTRACT(pivot, L[j * NU + i], L[j * NU + i]);
         pivots[j] = pivot;
         V inverse = SET(1.0) / tgco_sqrt(pivot);
         L[j * NU + j] = inverse;
         for (int i = j + 1; i < NU; i++) {
             V entry = H[(NX + j) * S + NX + i];
-            for (int a = 0; a < j; a++) entry -= L[i * NU + a] * L[j * NU + a];
+            for (int a = 0; a < j; a++) SUBTRACT(entry, L[i * NU + a], L[j * NU + a]);
             L[i * NU + j] = entry * inverse;
         }
     }
@@ -20,7 +20,7 @@ static inline void factor_controls(const V *H, V *L, V *pivots) {
 static inline void solve_lower(const V *L, V *Y, int width, int count) {
     for (int j = 0; j < NU; j++) {
         V *row = Y + j * width;
-        for (int a = 0; a < j; a++) for (int i = 0; i < count; i++) row[i] -= L[j * NU + a] * Y[a * width + i];
+        for (int a = 0; a < j; a++) for (int i = 0; i < count; i++) SUBTRACT(row[i], L[j * NU + a], Y[a * width + i]);
         for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];
     }
 }
@@ -30,7 +30,7 @@ static inline void solve_upper(const V *L, V *Y, int width, int count) {
     for (int j = NU - 1; j >= 0; j--) {
         V *row = Y + j * width;
         for (int a = j + 1; a < NU; a++)
-            for (int i = 0; i < count; i++) row[i] -= L[a * NU + j] * Y[a * width + i];
+            for (int i = 0; i < count; i++) SUBTRACT(row[i], L[a * NU + j], Y[a * width + i]);
         for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];
     }
 }

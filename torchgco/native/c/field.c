@@ -47,9 +47,9 @@ static inline Axis axis_at(const Constraint *con, const Rows *rows, const V *x, 
     for (int i = 0; i < t.count; i++) {
         V place = base + SET((double)(con->smooth ? i - 1 : i)), held = within_lattice(place, lattice_size(con, axis));
         V beyond = (place - held) * (place - held);
-        t.more += t.weight[i] * beyond;
-        t.more_slope += t.slope[i] * beyond;
-        t.more_bend += t.bend[i] * beyond;
+        ADD(t.more, t.weight[i], beyond);
+        ADD(t.more_slope, t.slope[i], beyond);
+        ADD(t.more_bend, t.bend[i], beyond);
         t.place[i] = held;
     }
     return t;
@@ -88,15 +88,15 @@ static inline Sums sum_of_node(const Constraint *con, const Rows *rows, const Ax
         for (int i = 0; i < t->count; i++) { \
             at[AXIS] = t->place + i; \
             Sums inner = INNER(con, rows, axes, at, order); \
-            sums.value += t->weight[i] * inner.value; \
+            ADD(sums.value, t->weight[i], inner.value); \
             if (order < 1) continue; \
-            sums.slope[AXIS] += t->slope[i] * inner.value; \
-            for (int a = (AXIS) + 1; a < DIM; a++) sums.slope[a] += t->weight[i] * inner.slope[a]; \
+            ADD(sums.slope[AXIS], t->slope[i], inner.value); \
+            for (int a = (AXIS) + 1; a < DIM; a++) ADD(sums.slope[a], t->weight[i], inner.slope[a]); \
             if (order < 2) continue; \
-            sums.bend[(AXIS) * DIM + (AXIS)] += t->bend[i] * inner.value; \
+            ADD(sums.bend[(AXIS) * DIM + (AXIS)], t->bend[i], inner.value); \
             for (int a = (AXIS) + 1; a < DIM; a++) { \
-                sums.bend[(AXIS) * DIM + a] += t->slope[i] * inner.slope[a]; \
-                for (int b = a; b < DIM; b++) sums.bend[a * DIM + b] += t->weight[i] * inner.bend[a * DIM + b]; \
+                ADD(sums.bend[(AXIS) * DIM + a], t->slope[i], inner.slope[a]); \
+                for (int b = a; b < DIM; b++) ADD(sums.bend[a * DIM + b], t->weight[i], inner.bend[a * DIM + b]); \
             } \
         } \
         return sums; \
@@ -126,7 +126,7 @@ __attribute__((noinline)) static V field_row(
     V factor = number[FACTOR], inverse = number[INVERSE], square = number[STEP_SQUARE];
     I here = map_counts(con, rows, k);
     for (int a = 0; a < DIM; a++) {
-        sums.value += square * axes[a].more;
+        ADD(sums.value, square, axes[a].more);
         if (!slopes) continue;
         slopes[a] = tgco_if(here, -factor * (inverse * sums.slope[a] + square * inverse * axes[a].more_slope));
         for (int b = a; curvature && b < DIM; b++) {
@@ -175,7 +175,7 @@ static inline void field_expand(
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return;
     V c = field_row(con, rows, k, x, slopes, 0), slope = pull(s, 0, c, lam, &rho);
     for (int a = 0; a < DIM; a++) {
-        g[POSITION + a] += slope * slopes[a];
-        for (int b = a; b < DIM; b++) H[(POSITION + a) * S + POSITION + b] += rho * slopes[a] * slopes[b];
+        ADD(g[POSITION + a], slope, slopes[a]);
+        for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], rho * slopes[a], slopes[b]);
     }
 }

@@ -32,7 +32,7 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
             alpha[l] = o->ladder[last ? o->rungs - 1 : rung];
             enough[l] = !open[l] ? -__builtin_inf() : last || !s->of->bounded ? __builtin_inf() : most[l];
         }
-        roll(s, alpha, enough, &cost, &merit);
+        roll(s, knot_value, alpha, enough, &cost, &merit);
         V ratio = (merit - s->merit) / (alpha * linear + SET(0.5) * alpha * alpha * quadratic);
         I good = (ratio >= SET(o->ratio_min)) & (ratio <= SET(o->ratio_max));
         if (o->accept_last) good |= alpha < SET(o->smallest);
@@ -70,7 +70,7 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     V linear, squares, lowest, zero = SET(0.0), old = s->merit, shortest;
     s->alpha = zero;
     s->used = s->mu_r;
-    backward(s, NULL, &linear, &squares, &lowest);
+    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
     V quadratic = -linear - s->mu_r * squares, before = s->mu_r;
     I failed = ~(lowest > zero) & running;
     V expected = tgco_fabs(linear + SET(0.5) * quadratic);
@@ -81,7 +81,7 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
         V higher = s->mu_r * SET(o->regularisation_growth);
         higher = tgco_choose(higher < SET(o->regularisation_first), SET(o->regularisation_first), higher);
         s->mu_r = tgco_choose(failed, higher, s->mu_r);
-        I sound = is_finite(s);
+        I sound = is_finite(s, knot_expand);
         for (int l = 0; l < LANES; l++) if (failed[l]) {
             if (s->mu_r[l] > o->regularisation_max) status[l] = NOT_POSITIVE_DEFINITE;
             if (!sound[l]) status[l] = NON_FINITE;

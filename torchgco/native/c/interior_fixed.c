@@ -49,8 +49,8 @@ static void vary_controls(const Barrier *t, int64_t k, V *du) {
     }
 }
 
-/* States and controls of a knot, and how a change of all free variables changes them. */
-typedef struct { V x[S], z[S]; } Response;
+/* States and controls of a knot (S), and how a change of all free variables changes them (S). */
+typedef struct { V *x, *z; } Response;
 
 /* The rows of constraint i at knot k that a change moves in one of two trajectories close together, into `moves`: a row
    may be flat in one point alone. A change that is within rounding of its terms is none. */
@@ -98,14 +98,14 @@ typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const Response *at);
 static void respond(Barrier *t, int64_t k, Response *at) {
     V f[NJ + 1], next[NX], moved[NX];
     const V *parameters = model_at(&t->lanes, k);
-    tgco_jacobian(at[1].x, at[1].x + NX, parameters, f);
-    tgco_push(f, at[1].z, next);
+    model_jacobian(at[1].x, at[1].x + NX, parameters, f);
+    model_push(f, at[1].z, next);
     model_step(at[1].x, at[1].x + NX, parameters, moved);
     for (int i = 0; i < NX; i++) at[1].z[i] = next[i];
     model_step(at->x, at->x + NX, parameters, next);
     for (int i = 0; i < NX; i++) at[1].x[i] = t->lanes.X[(k + 1) * NX + i] + (moved[i] - next[i]);
-    tgco_jacobian(at->x, at->x + NX, parameters, f);
-    tgco_push(f, at->z, next);
+    model_jacobian(at->x, at->x + NX, parameters, f);
+    model_push(f, at->z, next);
     for (int i = 0; i < NX; i++) at->z[i] = next[i];
 }
 
@@ -113,7 +113,8 @@ static void respond(Barrier *t, int64_t k, Response *at) {
 static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
     const Lanes *s = &t->lanes;
     const Problem *p = s->of;
-    Response at[2];
+    V memory[4 * S];
+    Response at[2] = {{memory, memory + S}, {memory + 2 * S, memory + 3 * S}};
     for (int i = 0; i < NX; i++) {
         at->z[i] = at[1].z[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]), SET(uneven(~i))) : SET(0.0);
         at[1].x[i] = s->X[i] + SET(NUDGE) * at->z[i];

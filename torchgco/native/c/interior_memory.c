@@ -100,7 +100,7 @@ static void adjoin(Barrier *t, I of) {
     for (int64_t k = p->N; k > 0; k--) {
         V *y = t->yn + k * NX;
         for (int i = 0; i < S; i++) q[i] = SET(0.0);
-        if (k < p->N) tgco_pull_back(y + NX, t->f + k * NJ, q);
+        if (k < p->N) model_pull_back(y + NX, t->f + k * NJ, q);
         for (int i = 0; i < NX; i++) {
             y[i] = q[i] + t->g[0][k * S + i];
             largest = most(tgco_fabs(y[i]), largest);
@@ -127,7 +127,7 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
     V slope = SET(0.0), gap = SET(0.0), sum_y = SET(0.0), sum_z = SET(0.0), q[S];
     for (int64_t k = 0; k <= p->N; k++) {
         for (int i = 0; i < S; i++) q[i] = SET(0.0);
-        if (k < p->N) tgco_pull_back(t->y + (k + 1) * NX, t->f + k * NJ, q);
+        if (k < p->N) model_pull_back(t->y + (k + 1) * NX, t->f + k * NJ, q);
         for (int i = k || t->is_free ? 0 : NX; i < (k < p->N ? S : NX); i++) {
             V entry = q[i] + t->g[0][k * S + i];
             if (!k && i < NX) entry = tgco_if(tgco_is(t->is_free[i]), entry); /* the start has no costate */

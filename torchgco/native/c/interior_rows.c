@@ -1,35 +1,4 @@
-/* The interior point's data, and the rows of constraints in it: c(x, u) + s = 0 with slacks s > 0, or c(x, u) = 0.
-
-   The generated part also defines
-
-       tgco_curve(x, u, parameters, y, H)               H += second derivatives of y' step, upper triangle
-       tgco_push(f, z, out)                             out = F z
-       tgco_model_rows(i, x, u, p, by, cc, lam, g, H)   traced rows: g[a] += c_z' by[a], H += c_z' cc c_z + lam' c_zz
-       tgco_along_rows(i, x, u, p, z, out)              out = c_z z */
-
-typedef struct {
-    Lanes lanes;
-    const Interior *how;
-    V *y, *yn;                   /* (N+1, NX): costates of the states, and those of a full step */
-    V *gap, *gapn, *aim;         /* (N, NX): step(x, u) - x', of iterate and trial, and what a step is to close */
-    V *H, *f;                    /* (N+1, S, S) upper triangles, (N, NJ) */
-    V *cost_slope, *g[PARTS];    /* (N+1, S): cost; with J' of multipliers, of the condensed residuals, of 1 / s */
-    V *P, *p, *L;                /* (N+1, NX, NX), (N+1, NX), (N, NU, NU): the Riccati recursion */
-    V *is_free, *L_start;        /* (NX): 1 where the start is free; (NX, NX): its factor. None where none is free */
-    V *dx, *du;                  /* (N+1, NX), (N, NU) */
-    V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
-    V *room, *relaxed; /* (rows): half the range between two bounds, 1 at most; by how much a row is relaxed */
-    int some_relaxed;  /* whether any is, in a lane */
-    I *out, *fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
-    int some_out;   /* whether there are any in a lane; see interior_fixed.c */
-    double admitted; /* violation of rows outside, up to which they stay there */
-    int64_t *first, rows;        /* the first row of each constraint, and how many there are */
-    V mu, shift, scale;
-    V objective; /* 0 where feasibility alone is sought */
-    V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */
-    V *kept; /* the iterate before the steps on trial */
-    V *memory;
-} Barrier;
+/* The rows of constraints in the interior point. */
 
 /* Rows of constraint i at knot k begin here. */
 static inline int64_t row_of(const Barrier *t, int64_t i, int64_t k) {
@@ -47,16 +16,12 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     } else if (con->kind == SPHERES) {
         V away[DIM];
         for (int j = 0; j < con->rows; j++) c[j] = sphere(con, rows, j, k, x, away);
-#endif
-#if WITH_BOXES
     } else if (con->kind == BOXES) {
         for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
-#endif
-#if WITH_FIELDS
     } else if (con->kind == FIELD) {
         c[0] = field_row(con, rows, k, x, 0, 0);
 #endif
-    } else tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
+    } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
 }
 
 /* `inside` of rows in the barrier, `fixed` of bounds that coincide, and nothing of rows that no variable moves. */
@@ -83,7 +48,7 @@ static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
 static inline void add_row(Barrier *t, int64_t k, int64_t q, const V *slopes, const V *curvature) {
     V by[PARTS], cc = weigh(t, 0, q, by), *H = t->H + k * S * S;
     for (int a = 0; a < DIM; a++) {
-        for (int part = 0; part < PARTS; part++) t->g[part][k * S + POSITION + a] += by[part] * slopes[a];
+        for (int part = 0; part < PARTS; part++) ADD(t->g[part][k * S + POSITION + a], by[part], slopes[a]);
         for (int b = a; b < DIM; b++)
             H[(POSITION + a) * S + POSITION + b] += cc * slopes[a] * slopes[b] + curvature[a * DIM + b];
     }
@@ -106,14 +71,14 @@ static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
 }
 #endif
 
-#if WITH_BOXES
+#if DIM > 0
 /* lam times the second derivatives of row j (DIM, DIM): distances bend around edges and corners, not along faces. */
 static inline void bend_box(
     const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V lam, V *curvature) {
     const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
     V zero = SET(0.0), local[DIM], away[DIM], square = zero;
     seen_from(box, x + POSITION, local);
-    for (int i = 0; i < DIM; i++) { away[i] = beyond(local[i], BOX_HALF(box)[i]); square += away[i] * away[i]; }
+    for (int i = 0; i < DIM; i++) { away[i] = beyond(local[i], BOX_HALF(box)[i]); ADD(square, away[i], away[i]); }
     I bends = (square > zero) & is_here(con, rows, BOX_RADIUS(box), k);
     V inverse = tgco_if(bends, SET(1.0) / tgco_choose(bends, square, SET(1.0)));
     V weight = -lam * factors[j] * tgco_sqrt(inverse);
@@ -122,7 +87,7 @@ static inline void bend_box(
         for (int i = 0; i < DIM; i++) for (int l = 0; l < DIM; l++) {
             V entry = -away[i] * away[l] * inverse;
             if (i == l) entry += tgco_truth(away[i] != zero);
-            sum += box[DIM + i * DIM + a] * entry * box[DIM + l * DIM + b];
+            ADD(sum, box[DIM + i * DIM + a] * entry, box[DIM + l * DIM + b]);
         }
         curvature[a * DIM + b] = weight * sum;
     }
@@ -141,7 +106,7 @@ static inline void add_boxes(Barrier *t, int64_t i, int64_t k, const V *x) {
 }
 #endif
 
-#if WITH_FIELDS
+#if DIM > 0
 static inline void add_field(Barrier *t, int64_t i, int64_t k, const V *x) {
     int64_t q = row_of(t, i, k);
     V slopes[DIM], curvature[DIM * DIM], lam = t->objective * t->z[q];
@@ -157,7 +122,7 @@ static inline void add_bounds(Barrier *t, int64_t i, int64_t k) {
     for (int j = 0; j < con->rows; j++, q++) {
         V by[PARTS], cc = weigh(t, 0, q, by), sign = SET(con->sign[j]);
         int v = con->variable[j];
-        for (int part = 0; part < PARTS; part++) t->g[part][k * S + v] += sign * by[part];
+        for (int part = 0; part < PARTS; part++) ADD(t->g[part][k * S + v], sign, by[part]);
         t->H[k * S * S + v * S + v] += cc;
     }
 }
@@ -169,11 +134,7 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
     if (con->kind == BOUNDS) { add_bounds(t, i, k); return; }
 #if DIM > 0
     if (con->kind == SPHERES) { add_spheres(t, i, k, x); return; }
-#endif
-#if WITH_BOXES
     if (con->kind == BOXES) { add_boxes(t, i, k, x); return; }
-#endif
-#if WITH_FIELDS
     if (con->kind == FIELD) { add_field(t, i, k, x); return; }
 #endif
     V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], own[PARTS];
@@ -185,7 +146,7 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
     }
     V *g[PARTS];
     for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
-    tgco_model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), by, cc, lam, g, t->H + k * S * S);
+    model_bend_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), by, cc, lam, g, t->H + k * S * S);
 }
 
 /* The change of the rows of constraint i at knot k along z = [dx, du], into out. */
@@ -200,24 +161,20 @@ static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, con
             V away[DIM];
             sphere(con, rows, j, k, x, away);
             out[j] = SET(0.0);
-            for (int a = 0; a < DIM; a++) out[j] -= SET(2.0) * away[a] * z[POSITION + a];
+            for (int a = 0; a < DIM; a++) SUBTRACT(out[j], SET(2.0) * away[a], z[POSITION + a]);
         }
-#endif
-#if WITH_BOXES
     } else if (con->kind == BOXES) {
         for (int j = 0; j < con->rows; j++) {
             V slopes[DIM];
             solid(con, rows, j, k, x, slopes);
             out[j] = SET(0.0);
-            for (int a = 0; a < DIM; a++) out[j] += slopes[a] * z[POSITION + a];
+            for (int a = 0; a < DIM; a++) ADD(out[j], slopes[a], z[POSITION + a]);
         }
-#endif
-#if WITH_FIELDS
     } else if (con->kind == FIELD) {
         V slopes[DIM];
         field_row(con, rows, k, x, slopes, 0);
         out[0] = SET(0.0);
-        for (int a = 0; a < DIM; a++) out[0] += slopes[a] * z[POSITION + a];
+        for (int a = 0; a < DIM; a++) ADD(out[0], slopes[a], z[POSITION + a]);
 #endif
-    } else tgco_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), z, out);
+    } else model_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), z, out);
 }

@@ -84,8 +84,8 @@ static V descent(const Barrier *t) {
     V sum = SET(0.0);
     for (int64_t k = 0; k <= p->N; k++) {
         const V *slope = t->cost_slope + k * S;
-        for (int i = 0; i < NX; i++) sum += slope[i] * t->dx[k * NX + i];
-        if (k < p->N) for (int j = 0; j < NU; j++) sum += slope[NX + j] * t->du[k * NU + j];
+        for (int i = 0; i < NX; i++) ADD(sum, slope[i], t->dx[k * NX + i]);
+        if (k < p->N) for (int j = 0; j < NU; j++) ADD(sum, slope[NX + j], t->du[k * NU + j]);
     }
     ROWS(t, 0, sum -= t->mu * t->ds[q] / t->s[q])
     return sum;

@@ -1,4 +1,5 @@
-/* A Newton step of the interior point: the model of all knots, a Riccati recursion, and the step of slacks and duals. */
+/* A Newton step of the interior point around its Riccati recursion: the model of all knots, and the step of slacks and
+   multipliers. */
 
 /* Values along X, U into c and gap; returns the cost. */
 static V values(const Barrier *t, const V *X, const V *U, V *c, V *gap) {
@@ -52,128 +53,8 @@ static void expand(Barrier *t) {
         if (!u) break;
         V y[NX];
         for (int i = 0; i < NX; i++) y[i] = t->objective * t->y[(k + 1) * NX + i];
-        tgco_jacobian(x, u, model_at(s, k), t->f + k * NJ);
-        tgco_curve(x, u, model_at(s, k), y, H);
-    }
-}
-
-/* The factor of the cost-to-go's curvature in the free components of the start, and the unit matrix in the others. */
-static I factor_start(Barrier *t) {
-    V *L = t->L_start, one = SET(1.0);
-    I good = one == one;
-    for (int j = 0; j < NX; j++) {
-        I own = tgco_is(t->is_free[j]);
-        V whole = tgco_choose(own, t->P[j * NX + j], one), pivot = whole;
-        for (int a = 0; a < j; a++) pivot -= L[j * NX + a] * L[j * NX + a];
-        good &= (pivot > SET(1e-14) * tgco_fabs(whole)) & finite(pivot);
-        V inverse = one / tgco_sqrt(pivot);
-        L[j * NX + j] = inverse;
-        for (int i = j + 1; i < NX; i++) {
-            V entry = tgco_if(own & tgco_is(t->is_free[i]), t->P[i * NX + j]);
-            for (int a = 0; a < j; a++) entry -= L[i * NX + a] * L[j * NX + a];
-            L[i * NX + j] = entry * inverse;
-        }
-    }
-    return good;
-}
-
-/* Factors L and gains K of the recursion with `shift` on the diagonal; where it isn't positive definite, the answer is
-   false. It stops as soon as it is false for all lanes of `open`, unless there are none: what it says of others then
-   is void. */
-static I factor(Barrier *t, I open) {
-    Lanes *s = &t->lanes;
-    int64_t N = s->of->N;
-    V T[S * NX], Q[S * S], Y[NU * NX], pivots[NU];
-    I good = SET(0.0) == SET(0.0);
-    int stops = any(open);
-    const V *last = t->H + N * S * S;
-    for (int i = 0; i < NX; i++) for (int j = i; j < NX; j++)
-        t->P[(N * NX + i) * NX + j] = t->P[(N * NX + j) * NX + i] = last[i * S + j] + (i == j ? t->shift : SET(0.0));
-    for (int64_t k = N - 1; k >= 0; k--) {
-        const V *H = t->H + k * S * S, *f = t->f + k * NJ;
-        V *L = t->L + k * NU * NU, *K = s->G + k * NU * NZ, *P = t->P + k * NX * NX;
-        tgco_gather(P + NX * NX, f, T);
-        tgco_product(f, T, Q);
-        for (int i = 0; i < S; i++) for (int j = i; j < S; j++) Q[i * S + j] += H[i * S + j];
-        for (int i = 0; i < S; i++) Q[i * S + i] += t->shift;
-        factor_controls(Q, L, pivots);
-        for (int j = 0; j < NU; j++) {
-            V whole = Q[(NX + j) * S + NX + j];
-            good &= (pivots[j] > SET(t->how->pivot) * tgco_fabs(whole)) & finite(pivots[j]);
-            for (int i = 0; i < NX; i++) Y[j * NX + i] = Q[i * S + NX + j];
-        }
-        solve_lower(L, Y, NX, NX);
-        if (stops && !any(open & good)) return good;
-        for (int j = 0; j < NU; j++) for (int i = 0; i < NX; i++) K[j * NZ + i] = -Y[j * NX + i];
-        solve_upper(L, K, NZ, NX);
-        for (int i = 0; i < NX; i++) for (int l = i; l < NX; l++) {
-            V entry = Q[i * S + l];
-            for (int j = 0; j < NU; j++) entry -= Y[j * NX + i] * Y[j * NX + l];
-            P[i * NX + l] = P[l * NX + i] = entry;
-        }
-    }
-    return t->is_free ? good & factor_start(t) : good;
-}
-
-/* The step of the start that is the least of the quadratic cost-to-go. */
-static void solve_start(Barrier *t) {
-    const V *L = t->L_start;
-    V *d = t->dx;
-    for (int i = 0; i < NX; i++) {
-        d[i] = tgco_if(tgco_is(t->is_free[i]), -t->p[i]);
-        for (int a = 0; a < i; a++) d[i] -= L[i * NX + a] * d[a];
-        d[i] *= L[i * NX + i];
-    }
-    for (int i = NX - 1; i >= 0; i--) {
-        for (int a = i + 1; a < NX; a++) d[i] -= L[a * NX + i] * d[a];
-        d[i] = tgco_if(tgco_is(t->is_free[i]), d[i] * L[i * NX + i]);
-    }
-}
-
-/* The step in states, controls and costates that the factors give. */
-static void solve(Barrier *t) {
-    Lanes *s = &t->lanes;
-    int64_t N = s->of->N;
-    V q[S], z[S], along_f[NX];
-    for (int i = 0; i < NX; i++) t->p[N * NX + i] = t->g[1][N * S + i] + t->mu * t->g[2][N * S + i];
-    for (int64_t k = N - 1; k >= 0; k--) {
-        const V *P = t->P + (k + 1) * NX * NX, *next = t->p + (k + 1) * NX, *L = t->L + k * NU * NU;
-        V *K = s->G + k * NU * NZ, v[NX];
-        for (int i = 0; i < NX; i++) {
-            v[i] = next[i];
-            for (int j = 0; j < NX; j++) v[i] += P[i * NX + j] * t->aim[k * NX + j];
-        }
-        tgco_pull_back(v, t->f + k * NJ, q);
-        for (int i = 0; i < S; i++) q[i] += t->g[1][k * S + i] + t->mu * t->g[2][k * S + i];
-        for (int i = 0; i < NX; i++) {
-            V entry = q[i];
-            for (int j = 0; j < NU; j++) entry += K[j * NZ + i] * q[NX + j];
-            t->p[k * NX + i] = entry;
-        }
-        V d[NU];
-        for (int j = 0; j < NU; j++) d[j] = -q[NX + j];
-        solve_lower(L, d, 1, 1);
-        solve_upper(L, d, 1, 1);
-        for (int j = 0; j < NU; j++) K[j * NZ + NX] = d[j];
-    }
-    for (int i = 0; i < NX; i++) t->dx[i] = SET(0.0);
-    if (t->is_free) solve_start(t);
-    for (int64_t k = 0; k < N; k++) {
-        const V *K = s->G + k * NU * NZ, *P = t->P + (k + 1) * NX * NX;
-        V *dx = t->dx + k * NX, *du = t->du + k * NU;
-        for (int i = 0; i < NX; i++) z[i] = dx[i];
-        for (int j = 0; j < NU; j++) {
-            du[j] = K[j * NZ + NX];
-            for (int i = 0; i < NX; i++) du[j] += K[j * NZ + i] * dx[i];
-            z[NX + j] = du[j];
-        }
-        tgco_push(t->f + k * NJ, z, along_f);
-        for (int i = 0; i < NX; i++) dx[NX + i] = along_f[i] + t->aim[k * NX + i];
-        for (int i = 0; i < NX; i++) {
-            V y = t->p[(k + 1) * NX + i];
-            for (int j = 0; j < NX; j++) y += P[i * NX + j] * dx[NX + j];
-            t->yn[(k + 1) * NX + i] = y;
-        }
+        model_jacobian(x, u, model_at(s, k), t->f + k * NJ);
+        model_curve(x, u, model_at(s, k), y, H);
     }
 }
 

@@ -1,46 +1,6 @@
-/* The terms of one knot of the iterate: cost, constraints, guide and the model's step. */
-
-#define BLOCK 32 /* spheres evaluated together: most blocks are far away and add nothing */
-
-/* Row j of bounds at knot k. */
-static inline V bound(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, const V *u) {
-    int v = con->variable[j];
-    return SET(con->sign[j]) * ((v < NX ? x[v] : u[v - NX]) - at(rows->bound, &con->bound, con->place[k])[j]);
-}
+/* The terms of one knot of the iterate: cost, constraints and guide. */
 
 #if DIM > 0
-/* The squared radius of sphere j at knot k; ABSENT without one, or where time has stopped. */
-static inline V square_at(const Constraint *con, const Rows *rows, int64_t j, int64_t k) {
-    if (!con->stops.data) return rows->squares[j];
-    return tgco_choose(SET(k) > rows->stops[0], SET(ABSENT), rows->squares[j]);
-}
-
-/* Row j of spheres at knot k, and the vector from the centre to the position (DIM); an absent sphere is c = -1. */
-static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
-    const V *o = rows->bound + j * DIM;
-    V square = SET(0.0), limit = square_at(con, rows, j, k);
-    I here = limit >= SET(0.0);
-    for (int a = 0; a < DIM; a++) {
-        away[a] = x[POSITION + a] - o[a];
-        if (con->velocities.data) away[a] -= SET(k * con->dt) * rows->velocities[j * DIM + a];
-        away[a] = tgco_if(here, away[a]);
-        square += away[a] * away[a];
-    }
-    return limit - square;
-}
-
-/* Rows c of the spheres first, ..., last - 1 at knot k, and whether they add anything in any lane. */
-static inline int spheres(
-    const Constraint *con, const Rows *rows, int64_t first, int64_t last, int64_t k, const V *x, V *c) {
-    I matters = rows->pushed[con->place[k]];
-    for (int64_t j = first; j < last; j++) {
-        V away[DIM];
-        c[j - first] = sphere(con, rows, j, k, x, away);
-        matters |= ~(c[j - first] <= SET(0.0)); /* NaN matters */
-    }
-    return any(matters);
-}
-
 static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     V c[BLOCK];
@@ -63,14 +23,34 @@ static inline void spheres_expand(
             if (!any(~(c[j - first] <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
             V slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam[j], &rho);
             for (int a = 0; a < DIM; a++) {
-                g[POSITION + a] -= SET(2.0) * slope * away[a];
+                SUBTRACT(g[POSITION + a], SET(2.0) * slope, away[a]);
                 for (int b = a; b < DIM; b++)
-                    H[(POSITION + a) * S + POSITION + b] += SET(4.0) * rho * away[a] * away[b];
+                    ADD(H[(POSITION + a) * S + POSITION + b], SET(4.0) * rho * away[a], away[b]);
             }
         }
     }
 }
 #endif
+
+/* Rows that are traced, in functions of their own: room for any number of them would cost the others time. */
+__attribute__((noinline)) static V traced_value(
+    const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V total) {
+    const Constraint *con = s->of->constraint + i;
+    V c[MAX_ROWS];
+    model_rows((int)i, x, u, at(s->rows[i].bound, &con->bound, con->place[k]), c);
+    for (int j = 0; j < con->rows; j++) total += worth(s, con->equality, c[j], lam[j]);
+    return total;
+}
+
+__attribute__((noinline)) static void traced_expand(
+    const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V *g, V *H) {
+    const Constraint *con = s->of->constraint + i;
+    const V *numbers = at(s->rows[i].bound, &con->bound, con->place[k]);
+    V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
+    model_rows((int)i, x, u, numbers, c);
+    for (int j = 0; j < con->rows; j++) slope[j] = pull(s, con->equality, c[j], lam[j], rho + j);
+    model_add_rows((int)i, x, u, numbers, slope, rho, g, H);
+}
 
 static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {
     const Constraint *con = s->of->constraint + i;
@@ -81,20 +61,12 @@ static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, con
 #if DIM > 0
     } else if (con->kind == SPHERES) {
         total = spheres_value(s, con, rows, k, x, total);
-#endif
-#if WITH_BOXES
     } else if (con->kind == BOXES) {
         total = boxes_value(s, con, rows, k, x, total);
-#endif
-#if WITH_FIELDS
     } else if (con->kind == FIELD) {
         total = field_value(s, con, rows, k, x, total);
 #endif
-    } else {
-        V c[MAX_ROWS];
-        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
-        for (int j = 0; j < con->rows; j++) total += worth(s, con->equality, c[j], lam[j]);
-    }
+    } else total = traced_value(s, i, k, x, u, lam, total);
     return total;
 }
 
@@ -106,28 +78,18 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
         for (int j = 0; j < con->rows; j++) {
             int v = con->variable[j];
             V rho, slope = pull(s, 0, bound(con, rows, j, k, x, u), lam[j], &rho);
-            g[v] += SET(con->sign[j]) * slope;
+            ADD(g[v], SET(con->sign[j]), slope);
             H[v * S + v] += rho;
         }
 #if DIM > 0
     } else if (con->kind == SPHERES) {
         spheres_expand(s, con, rows, k, x, g, H);
-#endif
-#if WITH_BOXES
     } else if (con->kind == BOXES) {
         boxes_expand(s, con, rows, k, x, g, H);
-#endif
-#if WITH_FIELDS
     } else if (con->kind == FIELD) {
         field_expand(s, con, rows, k, x, g, H);
 #endif
-    } else {
-        V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
-        const V *numbers = at(rows->bound, &con->bound, con->place[k]);
-        tgco_rows((int)i, x, u, numbers, c);
-        for (int j = 0; j < con->rows; j++) slope[j] = pull(s, con->equality, c[j], lam[j], rho + j);
-        tgco_add_rows((int)i, x, u, numbers, slope, rho, g, H);
-    }
+    } else traced_expand(s, i, k, x, u, lam, g, H);
 }
 
 #if DIM > 0
@@ -136,7 +98,7 @@ static inline V from_guide(const Lanes *s, int64_t k, const V *x, V *away) {
     V square = SET(0.0);
     for (int a = 0; a < DIM; a++) {
         away[a] = x[POSITION + a] - s->center[k * DIM + a];
-        square += away[a] * away[a];
+        ADD(square, away[a], away[a]);
     }
     return square;
 }
@@ -152,7 +114,7 @@ static inline void guide_expand(const Lanes *s, int64_t k, const V *x, V *g, V *
     V away[DIM], square = from_guide(s, k, x, away);
     if (s->of->guide == PATH) {
         for (int a = 0; a < DIM; a++) {
-            g[POSITION + a] += s->weight * away[a];
+            ADD(g[POSITION + a], s->weight, away[a]);
             H[(POSITION + a) * S + POSITION + a] += s->weight;
         }
         return;
@@ -160,14 +122,14 @@ static inline void guide_expand(const Lanes *s, int64_t k, const V *x, V *g, V *
     V f = square - s->radius[k] * s->radius[k];
     V rho = tgco_if(f > SET(0.0), s->weight), slope = tgco_if(f > SET(0.0), s->weight * f * SET(2.0));
     for (int a = 0; a < DIM; a++) {
-        g[POSITION + a] += slope * away[a];
-        for (int b = a; b < DIM; b++) H[(POSITION + a) * S + POSITION + b] += SET(4.0) * rho * away[a] * away[b];
+        ADD(g[POSITION + a], slope, away[a]);
+        for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], SET(4.0) * rho * away[a], away[b]);
     }
 }
 #endif
 
 /* Cost of knot k; guides and constraints go into `added`. u is NULL at the last knot. */
-static inline V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V *added) {
+static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V *added) {
     const Problem *p = s->of;
     V more = SET(0.0);
     for (int64_t i = 0; i < p->constraints; i++)
@@ -180,7 +142,7 @@ static inline V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V 
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of all terms of knot k. */
-__attribute__((noinline)) static void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+static void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     const Problem *p = s->of;
     cost_expand(s, k, x, u, g, H);
     for (int64_t i = 0; i < p->constraints; i++)
@@ -188,8 +150,4 @@ __attribute__((noinline)) static void knot_expand(const Lanes *s, int64_t k, con
 #if DIM > 0
     if (p->guide != NO_GUIDE) guide_expand(s, k, x, g, H);
 #endif
-}
-
-__attribute__((noinline)) static void model_step(const V *x, const V *u, const V *parameters, V *next) {
-    tgco_step(x, u, parameters, next);
 }

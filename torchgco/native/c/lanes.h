@@ -18,6 +18,44 @@ typedef __typeof__((V){0} == (V){0}) I; /* all bits of a lane set where true */
 static inline V tgco_set(double c) { return (REAL)c - (V){0}; } /* minus, so that -0.0 keeps its sign */
 #define SET(c) tgco_set(c)
 
+/* a b + c of all lanes, rounded once where the processor can. Products and sums are fused here alone, and compiled with
+   -ffp-contract=off: so no bit depends on what is inlined, on the level of optimisation or on the compiler. */
+#define TGCO_BYTES (LANES * (TGCO_IS_DOUBLE ? 8 : 4))
+#if defined(__FMA__) && !defined(__clang__)
+#if TGCO_BYTES >= 64 && defined(__AVX512F__)
+#define TGCO_PART 64
+#define TGCO_FMA_double(a, b, c) __builtin_ia32_vfmaddpd512_mask(a, b, c, -1, 4)
+#define TGCO_FMA_float(a, b, c) __builtin_ia32_vfmaddps512_mask(a, b, c, -1, 4)
+#elif TGCO_BYTES >= 32
+#define TGCO_PART 32
+#define TGCO_FMA_double(a, b, c) __builtin_ia32_vfmaddpd256(a, b, c)
+#define TGCO_FMA_float(a, b, c) __builtin_ia32_vfmaddps256(a, b, c)
+#elif TGCO_BYTES == 16
+#define TGCO_PART 16
+#define TGCO_FMA_double(a, b, c) __builtin_ia32_vfmaddpd(a, b, c)
+#define TGCO_FMA_float(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
+#endif
+#endif
+static inline __attribute__((always_inline)) V tgco_fused(V a, V b, V c) {
+#if defined(TGCO_PART) && TGCO_PART == TGCO_BYTES
+    return TGCO_JOIN(TGCO_FMA_, REAL)(a, b, c);
+#elif defined(TGCO_PART)
+    typedef REAL Part __attribute__((vector_size(TGCO_PART)));
+    typedef union { V whole; Part part[TGCO_BYTES / TGCO_PART]; } Parts;
+    Parts x = {a}, y = {b}, z = {c};
+    for (int i = 0; i < TGCO_BYTES / TGCO_PART; i++)
+        z.part[i] = TGCO_JOIN(TGCO_FMA_, REAL)(x.part[i], y.part[i], z.part[i]);
+    return z.whole;
+#elif defined(__FMA__) || defined(__ARM_FEATURE_FMA) || defined(__FP_FAST_FMA)
+    for (int i = 0; i < LANES; i++) c[i] = TGCO_MATH(fma)(a[i], b[i], c[i]);
+    return c;
+#else
+    return a * b + c;
+#endif
+}
+#define ADD(sum, a, b) ((sum) = tgco_fused((a), (b), (sum))) /* sum += a b */
+#define SUBTRACT(sum, a, b) ((sum) = tgco_fused(-(a), (b), (sum))) /* sum -= a b */
+
 static inline V tgco_choose(I where, V a, V b) { return (V)((where & (I)a) | (~where & (I)b)); }
 static inline V tgco_if(I where, V a) { return (V)(where & (I)a); }
 static inline V tgco_truth(I where) { return tgco_if(where, SET(1.0)); }
@@ -96,15 +134,15 @@ TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hy
 
 /* Term i of both series, written out: in a loop that isn't unrolled its factors are quotients computed at run time. */
 #define TGCO_TERM(i) \
-    sine = SET(1.0) - s * SET(1.0 / (2 * (i) * (2 * (i) + 1))) * sine; \
-    cosine = SET(1.0) - s * SET(1.0 / ((2 * (i)-1) * (2 * (i)))) * cosine;
+    sine = tgco_fused(s * SET(-1.0 / (2 * (i) * (2 * (i) + 1))), sine, SET(1.0)); \
+    cosine = tgco_fused(s * SET(-1.0 / ((2 * (i)-1) * (2 * (i)))), cosine, SET(1.0));
 
 static inline V tgco_wave(V x, int shift) {
-    V t = x * SET(0x1.45f306dc9c883p-1) + SET(TGCO_WHOLE), k = t - SET(TGCO_WHOLE);
+    V t = tgco_fused(x, SET(0x1.45f306dc9c883p-1), SET(TGCO_WHOLE)), k = t - SET(TGCO_WHOLE), r = x;
     I quarter = (I)t + shift;
-    V r = x - k * SET(TGCO_QUARTER_1);
-    r = r - k * SET(TGCO_QUARTER_2);
-    r = r - k * SET(TGCO_QUARTER_3);
+    SUBTRACT(r, k, SET(TGCO_QUARTER_1));
+    SUBTRACT(r, k, SET(TGCO_QUARTER_2));
+    SUBTRACT(r, k, SET(TGCO_QUARTER_3));
     /* sin r = r (1 - s/(2 3) (1 - s/(4 5) (...))), cos r = 1 - s/(1 2) (1 - s/(3 4) (...)), s = r^2 */
     V s = r * r, sine = SET(1.0), cosine = SET(1.0);
 #if TGCO_IS_DOUBLE

@@ -6,7 +6,7 @@
 typedef struct {
     const Sampling *of;
     Lanes s;
-    V *mean, *z, *sum, *lower, *upper, deviation[NU];
+    V *mean, *z, *sum, *lower, *upper, *deviation;
     double *score;
     V *memory;
 } Samples;
@@ -39,16 +39,12 @@ static V hits(const Samples *q, int64_t k, const V *x) {
             }
             continue;
         }
-#endif
-#if WITH_BOXES
         if (con->kind == BOXES) {
             const Rows *rows = q->s.rows + i;
             for (int j = 0; j < con->rows; j++)
                 if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
             continue;
         }
-#endif
-#if WITH_FIELDS
         if (con->kind == FIELD) {
             const Rows *rows = q->s.rows + i;
             if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, 0, 0) >= SET(0.0));
@@ -57,7 +53,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
 #endif
         V c[MAX_ROWS], u[NU];
         memset(u, 0, sizeof u); /* a geometric constraint reads x alone */
-        tgco_rows((int)i, x, u, at(q->s.rows[i].bound, &con->bound, con->place[k]), c);
+        model_rows((int)i, x, u, at(q->s.rows[i].bound, &con->bound, con->place[k]), c);
         for (int j = 0; j < con->rows; j++) count += tgco_truth(c[j] >= SET(0.0));
     }
     return count;
@@ -122,7 +118,7 @@ static void average(Samples *q, uint64_t key, int64_t rows) {
         normal(key, first, rows, q->z);
         for (int64_t k = 0; k < N; k++) {
             draw(q, k, eps, u);
-            for (int j = 0; j < NU; j++) q->sum[k * NU + j] += weight * u[j];
+            for (int j = 0; j < NU; j++) ADD(q->sum[k * NU + j], weight, u[j]);
         }
     }
     for (int64_t i = 0; i < N * NU; i++) {
@@ -138,11 +134,12 @@ static int begin(Samples *q, const Sampling *o) {
     int64_t N = o->of->N, rows = (o->knots ? o->knots : N) * NU;
     int64_t bounds = length(&o->lower, N) + length(&o->upper, N);
     if (!start(&q->s, o->of)) return 0;
-    q->memory = aligned_alloc(sizeof(V), (2 * N * NU + rows + bounds + 1) * sizeof(V));
+    q->memory = aligned_alloc(sizeof(V), (2 * N * NU + rows + bounds + NU) * sizeof(V));
     q->score = malloc((o->samples + o->elite) * sizeof(double));
     if (!q->memory || !q->score) { finish(&q->s); free(q->memory); free(q->score); return 0; }
     q->mean = q->memory; q->sum = q->mean + N * NU; q->z = q->sum + N * NU;
     q->lower = q->z + rows; q->upper = q->lower + length(&o->lower, N);
+    q->deviation = q->upper + length(&o->upper, N);
     return 1;
 }
 

@@ -42,8 +42,6 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
                 note(s, con, value, tgco_choose(value <= zero, zero, depth), lam + j, &pushed, sweep);
             }
         }
-#endif
-#if WITH_BOXES
     } else if (con->kind == BOXES) {
         const V *factors = rows->bound + con->rows * 2 * DIM;
         int known = any(rows->pushed[place]);
@@ -56,8 +54,6 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
                 note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, &pushed, sweep);
             }
         }
-#endif
-#if WITH_FIELDS
     } else if (con->kind == FIELD) {
         if (any(rows->pushed[place]) || !is_far_from_map(con, rows, x)) {
             V c = field_row(con, rows, k, x, 0, 0);
@@ -66,7 +62,7 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
 #endif
     } else {
         V c[MAX_ROWS];
-        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, place), c);
+        model_rows((int)i, x, u, at(rows->bound, &con->bound, place), c);
         for (int j = 0; j < con->rows; j++) {
             V violated = con->equality ? tgco_fabs(c[j]) : tgco_choose(c[j] < zero, zero, c[j]);
             note(s, con, c[j], violated, lam + j, &pushed, sweep);
@@ -272,10 +268,10 @@ int tgco_penetration(const Problem *p, int64_t first, int64_t last) { return vio
 /* Squared distance of the origin from the segment that begins at a and goes along. */
 static inline V from_segment(const V *a, const V *along) {
     V length = SET(0.0), toward = SET(0.0), square = SET(0.0);
-    for (int i = 0; i < DIM; i++) { length += along[i] * along[i]; toward -= a[i] * along[i]; }
+    for (int i = 0; i < DIM; i++) { ADD(length, along[i], along[i]); SUBTRACT(toward, a[i], along[i]); }
     V share = tgco_choose(length > SET(0.0), toward / length, SET(0.0));
     share = tgco_choose(share < SET(0.0), SET(0.0), tgco_choose(share > SET(1.0), SET(1.0), share));
-    for (int i = 0; i < DIM; i++) { V gap = a[i] + share * along[i]; square += gap * gap; }
+    for (int i = 0; i < DIM; i++) { V gap = a[i] + share * along[i]; ADD(square, gap, gap); }
     return square;
 }
 

@@ -2,7 +2,7 @@
 
 /* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. It ends
    early, with what has added up so far, where that is over `enough` in all lanes, or isn't a number. */
-static void roll(Lanes *s, V alpha, V enough, V *cost, V *merit) {
+void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
     const Problem *p = s->of;
     V total = SET(0.0), more = SET(0.0), part;
     memcpy(s->Xn, s->X, NX * sizeof(V));
@@ -12,28 +12,28 @@ static void roll(Lanes *s, V alpha, V enough, V *cost, V *merit) {
         for (int i = 0; i < NX; i++) dx[i] = x[i] - X[i];
         for (int j = 0; j < NU; j++) {
             V step = alpha * G[j * NZ + NX];
-            for (int i = 0; i < NX; i++) step += G[j * NZ + i] * dx[i];
+            for (int i = 0; i < NX; i++) ADD(step, G[j * NZ + i], dx[i]);
             u[j] = s->U[k * NU + j] + step;
         }
-        total += knot_value(s, k, x, u, &part);
+        total += value(s, k, x, u, &part);
         more += part;
         if (!any(total + more <= enough)) { *cost = total; *merit = total + more; return; }
         model_step(x, u, model_at(s, k), x + NX);
     }
-    total += knot_value(s, p->N, s->Xn + p->N * NX, 0, &part);
+    total += value(s, p->N, s->Xn + p->N * NX, 0, &part);
     *cost = total;
     *merit = total + (more + part);
 }
 
 /* The backward pass (lines 4-13): gains into G, the two sums of the expected change, and the smallest pivot. `gap`
    (N, NX) is how far each step ends from the knot after it, NULL along a rollout. */
-static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
+void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
     V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ], pivots[NU];
     V sum = SET(0.0), square = SET(0.0), least = SET(__builtin_inf());
     int regular = any(s->mu_r > SET(0.0));
     memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-    knot_expand(s, p->N, s->X + p->N * NX, 0, g, H);
+    expand(s, p->N, s->X + p->N * NX, 0, g, H);
     for (int i = 0; i < NX; i++) {
         vector[i] = g[i];
         for (int j = 0; j < NX; j++) P[i * NX + j] = i <= j ? H[i * S + j] : H[j * S + i];
@@ -44,9 +44,9 @@ static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
         tgco_jacobian(x, u, model_at(s, k), f);
         tgco_gather(P, f, T);
         tgco_product(f, T, H);
-        if (gap) for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) vector[i] += P[i * NX + j] * gap[k * NX + j];
+        if (gap) for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) ADD(vector[i], P[i * NX + j], gap[k * NX + j]);
         tgco_pull_back(vector, f, g);
-        knot_expand(s, k, x, u, g, H);
+        expand(s, k, x, u, g, H);
         /* L of Quu + mu_r I, Y = L^-1 [Qux Qu], [K d] = -L'^-1 Y. */
         for (int j = 0; j < NU; j++) H[(NX + j) * S + NX + j] += s->mu_r;
         factor_controls(H, L, pivots);
@@ -59,19 +59,19 @@ static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
         for (int i = 0; i < NU * NZ; i++) G[i] = -Y[i];
         solve_upper(L, G, NZ, NZ);
         for (int j = 0; j < NU; j++) {
-            sum += g[NX + j] * G[j * NZ + NX];
-            square += G[j * NZ + NX] * G[j * NZ + NX];
+            ADD(sum, g[NX + j], G[j * NZ + NX]);
+            ADD(square, G[j * NZ + NX], G[j * NZ + NX]);
         }
         /* V = Qzz - Y'Y - mu_r G'G */
         for (int i = 0; i < NX; i++) {
-            V value = g[i];
-            for (int j = 0; j < NU; j++) value -= Y[j * NZ + i] * Y[j * NZ + NX];
-            if (regular) for (int j = 0; j < NU; j++) value -= s->mu_r * G[j * NZ + i] * G[j * NZ + NX];
-            vector[i] = value;
+            V slope = g[i];
+            for (int j = 0; j < NU; j++) SUBTRACT(slope, Y[j * NZ + i], Y[j * NZ + NX]);
+            if (regular) for (int j = 0; j < NU; j++) SUBTRACT(slope, s->mu_r * G[j * NZ + i], G[j * NZ + NX]);
+            vector[i] = slope;
             for (int l = i; l < NX; l++) {
                 V entry = H[i * S + l];
-                for (int j = 0; j < NU; j++) entry -= Y[j * NZ + i] * Y[j * NZ + l];
-                if (regular) for (int j = 0; j < NU; j++) entry -= s->mu_r * G[j * NZ + i] * G[j * NZ + l];
+                for (int j = 0; j < NU; j++) SUBTRACT(entry, Y[j * NZ + i], Y[j * NZ + l]);
+                if (regular) for (int j = 0; j < NU; j++) SUBTRACT(entry, s->mu_r * G[j * NZ + i], G[j * NZ + l]);
                 P[i * NX + l] = P[l * NX + i] = entry;
             }
         }
@@ -80,13 +80,13 @@ static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
 }
 
 /* Whether everything that the backward pass reads is finite. */
-static I is_finite(const Lanes *s) {
+I is_finite(const Lanes *s, Expand *expand) {
     const Problem *p = s->of;
     V g[S], H[S * S], f[NJ ? NJ : 1], sum = SET(0.0);
     for (int64_t k = 0; k <= p->N; k++) {
         const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-        knot_expand(s, k, x, u, g, H);
+        expand(s, k, x, u, g, H);
         for (int i = 0; i < S; i++) sum += SET(0.0) * g[i];
         for (int i = 0; i < S * S; i++) sum += SET(0.0) * H[i];
         if (k == p->N) break;
@@ -97,7 +97,7 @@ static I is_finite(const Lanes *s) {
 }
 
 /* How far each step ends from the knot after it. */
-static void gaps(const Lanes *s, V *gap) {
+void gaps(const Lanes *s, V *gap) {
     for (int64_t k = 0; k < s->of->N; k++) {
         V next[NX];
         model_step(s->X + k * NX, s->U + k * NU, model_at(s, k), next);
@@ -106,7 +106,7 @@ static void gaps(const Lanes *s, V *gap) {
 }
 
 /* A full step of the linearised dynamics under the gains, which closes the gaps; added to X and U. */
-static void linear_step(Lanes *s, const V *gap) {
+void linear_step(Lanes *s, const V *gap) {
     V one[NX * NX], F[NX * S], f[NJ ? NJ : 1], z[S], dx[NX];
     for (int i = 0; i < NX * NX; i++) one[i] = SET(i % (NX + 1) == 0);
     for (int i = 0; i < NX; i++) dx[i] = SET(0.0);
@@ -118,12 +118,12 @@ static void linear_step(Lanes *s, const V *gap) {
         memcpy(z, dx, sizeof dx);
         for (int j = 0; j < NU; j++) {
             z[NX + j] = G[j * NZ + NX];
-            for (int i = 0; i < NX; i++) z[NX + j] += G[j * NZ + i] * dx[i];
+            for (int i = 0; i < NX; i++) ADD(z[NX + j], G[j * NZ + i], dx[i]);
         }
         for (int i = 0; i < NX; i++) {
             x[i] += dx[i];
             dx[i] = gap[k * NX + i];
-            for (int c = 0; c < S; c++) dx[i] += F[c * NX + i] * z[c];
+            for (int c = 0; c < S; c++) ADD(dx[i], F[c * NX + i], z[c]);
         }
         for (int j = 0; j < NU; j++) u[j] += z[NX + j];
     }

@@ -3,13 +3,13 @@
 /* The term that a row adds to L_M. */
 static inline V worth(const Lanes *s, int equality, V c, V lam) {
     V half = SET(0.5), mu = s->mu;
-    if (equality) return (lam + half * mu * c) * c;
+    if (equality) return tgco_fused(half * mu, c, lam) * c;
     if (s->of->phr) {
-        I idle = lam + mu * c < SET(0.0);
-        return tgco_choose(idle, -half * lam * lam * s->inverse_mu, (lam + half * mu * c) * c);
+        I idle = tgco_fused(mu, c, lam) < SET(0.0);
+        return tgco_choose(idle, -half * lam * lam * s->inverse_mu, tgco_fused(half * mu, c, lam) * c);
     }
     I idle = (c < SET(0.0)) & (lam == SET(0.0));
-    return (lam + half * tgco_if(~idle, mu) * c) * c;
+    return tgco_fused(half * tgco_if(~idle, mu), c, lam) * c;
 }
 
 /* First and second derivative of `worth` by c; where `optimality` is set, of lam c with the penalty's curvature. */
@@ -22,9 +22,9 @@ static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
         *rho = tgco_if(binds, mu);
         return lam;
     }
-    if (equality) { *rho = mu; return lam + mu * c; }
-    I idle = p->phr ? lam + mu * c < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
+    if (equality) { *rho = mu; return tgco_fused(mu, c, lam); }
+    I idle = p->phr ? tgco_fused(mu, c, lam) < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
     *rho = tgco_if(~idle, mu);
-    V g = lam + *rho * c;
+    V g = tgco_fused(*rho, c, lam);
     return p->phr ? tgco_if(~idle, g) : g;
 }

@@ -1,42 +1,4 @@
-/* Problems side by side, one per lane of the vectors V; no operation mixes lanes.
-
-   The generated part before this file declares the structures and enumerations of native/structures.py. It defines NX,
-   NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, WITH_BOXES, WITH_FIELDS, COST_ARRAYS, MAX_ROWS, and
-
-       tgco_step, tgco_jacobian                         the model
-       tgco_gather(P, f, T), tgco_product(f, T, Q)      T = P F and Q = F' T (upper triangle) for its sparse F = [fx fu]
-       tgco_pull_back(p, f, g)                          g = F' p
-       tgco_rows(i, x, u, p, c), tgco_add_rows(i, ...)  traced constraints, with a knot's own numbers p */
-
-#include <stdlib.h>
-#include <string.h>
-#include <time.h>
-
-#define S (NX + NU)
-#define NZ (NX + 1)
-
-/* A constraint's multipliers and numbers. */
-typedef struct {
-    V *lam, *bound, *squares, *velocities, *stops;
-    I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
-    const float *map[LANES]; /* of a FIELD: each lane's map */
-} Rows;
-
-/* The working data of a group of lanes. */
-typedef struct {
-    const Problem *of;
-    V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
-    Rows *rows;
-    V weight, mu, inverse_mu, mu_r, merit, cost, inner, made, alpha, used;
-    V floor; /* the constraints' terms add no less than minus this to L_M: lam^2 / (2 mu) for each row */
-    int64_t element[LANES], rung[LANES]; /* at which the next line search begins */
-    V *memory;
-} Lanes;
-
-static inline int any(I where) { return tgco_any(where); }
-static inline I finite(V a) { return (a - a) == SET(0.0); }
-
-/* Lanes ----------------------------------------------------------------------------------------------------------- */
+/* Lanes: their memory, and problems that enter and leave them. */
 
 static int64_t length(const Array *a, int64_t knots) { return a->data ? (a->knot ? knots : 1) * a->size : 0; }
 
@@ -52,18 +14,6 @@ static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t elem
 static void fill_stage(V *to, const Array *from, int64_t k, int lane, int64_t element) {
     for (int64_t i = 0; i < from->size; i++) to[i][lane] = from->data[element * from->element + k * from->knot + i];
 }
-
-static inline const V *at(const V *array, const Array *shape, int64_t k) {
-    return array + (shape->knot ? k * shape->size : 0);
-}
-
-/* Array i of the cost at knot k. */
-static inline const V *cost_at(const Lanes *s, int i, int64_t k) {
-    return at(s->cost_data[i], s->of->cost_data + i, k);
-}
-
-/* The model's own numbers at stage k. */
-static inline const V *model_at(const Lanes *s, int64_t k) { return at(s->parameters, &s->of->parameters, k); }
 
 static V *cut(V **memory, int64_t count) { V *part = *memory; *memory += count; return part; }
 

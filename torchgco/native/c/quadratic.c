@@ -24,13 +24,13 @@ static inline void quadratic_value(Quadratic of, int size, const V *z, V *e, V *
 #if QUADRATIC_FULL
     for (int i = 0; i < size; i++) {
         V row = SET(0.0);
-        for (int j = 0; j < size; j++) row += of.W[i * size + j] * e[j];
-        *total += half * e[i] * row;
+        for (int j = 0; j < size; j++) ADD(row, of.W[i * size + j], e[j]);
+        ADD(*total, half * e[i], row);
     }
 #else
-    for (int i = 0; i < size; i++) *total += half * of.W[i] * e[i] * e[i];
+    for (int i = 0; i < size; i++) ADD(*total, half * of.W[i] * e[i], e[i]);
 #endif
-    if (of.w) for (int i = 0; i < size; i++) *total += of.w[i] * e[i];
+    if (of.w) for (int i = 0; i < size; i++) ADD(*total, of.w[i], e[i]);
 }
 
 /* Writes e, and adds gradient and upper triangle for z, which is [x, u] from `first` on. */
@@ -38,30 +38,30 @@ static inline void quadratic_expand(Quadratic of, int size, int first, const V *
     for (int i = 0; i < size; i++) e[i] = z[i] - of.reference[i];
 #if QUADRATIC_FULL
     for (int i = 0; i < size; i++) for (int j = 0; j < size; j++) {
-        g[first + i] += of.W[i * size + j] * e[j];
+        ADD(g[first + i], of.W[i * size + j], e[j]);
         if (j >= i) H[(first + i) * S + first + j] += of.W[i * size + j];
     }
 #else
-    for (int i = 0; i < size; i++) { g[first + i] += of.W[i] * e[i]; H[(first + i) * S + first + i] += of.W[i]; }
+    for (int i = 0; i < size; i++) { ADD(g[first + i], of.W[i], e[i]); H[(first + i) * S + first + i] += of.W[i]; }
 #endif
     if (of.w) for (int i = 0; i < size; i++) g[first + i] += of.w[i];
 }
 
 /* The cost of stage k at x, u; of the last knot where u is NULL. */
-static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
+V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     V total = SET(0.0), ex[NX], eu[NU];
     quadratic_value(quadratic_of_x(s, k, !u), NX, x, ex, &total);
     if (!u) return total;
     quadratic_value(quadratic_of_u(s, k), NU, u, eu, &total);
     if (s->of->cost_data[CROSS].data) {
         const V *C = cost_at(s, CROSS, k);
-        for (int i = 0; i < NU; i++) for (int j = 0; j < NX; j++) total += eu[i] * C[i * NX + j] * ex[j];
+        for (int i = 0; i < NU; i++) for (int j = 0; j < NX; j++) ADD(total, eu[i] * C[i * NX + j], ex[j]);
     }
     return total;
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of `cost_value`. */
-static inline void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     V ex[NX], eu[NU];
     quadratic_expand(quadratic_of_x(s, k, !u), NX, 0, x, ex, g, H);
     if (!u) return;
@@ -69,8 +69,8 @@ static inline void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u
     if (s->of->cost_data[CROSS].data) {
         const V *C = cost_at(s, CROSS, k);
         for (int i = 0; i < NU; i++) for (int j = 0; j < NX; j++) {
-            g[NX + i] += C[i * NX + j] * ex[j];
-            g[j] += C[i * NX + j] * eu[i];
+            ADD(g[NX + i], C[i * NX + j], ex[j]);
+            ADD(g[j], C[i * NX + j], eu[i]);
             H[j * S + NX + i] += C[i * NX + j];
         }
     }

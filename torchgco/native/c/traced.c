@@ -7,7 +7,7 @@
        tgco_stage_places                where they belong in g and H */
 
 /* The cost of stage k at x, u; of the last knot where u is NULL. */
-static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
+V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     V value;
     const V *scale = cost_at(s, FACTOR, k);
     if (u) tgco_stage_value(x, u, cost_at(s, STAGE, k), &value);
@@ -16,12 +16,12 @@ static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
 }
 
 static inline void add_entries(V factor, int slopes, int count, const int *places, const V *e, V *g, V *H) {
-    for (int i = 0; i < slopes; i++) g[places[i]] += factor * e[i];
-    for (int i = slopes; i < count; i++) H[places[i]] += factor * e[i];
+    for (int i = 0; i < slopes; i++) ADD(g[places[i]], factor, e[i]);
+    for (int i = slopes; i < count; i++) ADD(H[places[i]], factor, e[i]);
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of `cost_value`. */
-static inline void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     if (u) {
         V e[STAGE_ENTRIES + 1];
         tgco_stage_entries(x, u, cost_at(s, STAGE, k), e);

@@ -27,7 +27,7 @@ int tgco_gains(const Problem *p, int64_t first, int64_t last) {
     for (int64_t e = first; e < last; e += LANES) {
         for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
         V linear, squares, lowest;
-        backward(s, NULL, &linear, &squares, &lowest);
+        backward(s, knot_expand, NULL, &linear, &squares, &lowest);
         V quadratic = -linear - s->mu_r * squares;
         for (int l = 0; l < LANES && e + l < last; l++) {
             p->cost[e + l] = linear[l];
@@ -116,9 +116,9 @@ static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, 
         for (int64_t round = 0; round < rounds && any(open); round++) {
             V linear, squares, lowest, cost, merit, sum = SET(0.0);
             gaps(s, gap);
-            backward(s, gap, &linear, &squares, &lowest);
+            backward(s, knot_expand, gap, &linear, &squares, &lowest);
             if (round > 0) { /* the first gains are those that failed */
-                roll(s, SET(1.0), SET(__builtin_inf()), &cost, &merit);
+                roll(s, knot_value, SET(1.0), SET(__builtin_inf()), &cost, &merit);
                 I low = open & finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
                 for (int l = 0; l < used; l++) if (low[l]) {
                     int64_t e = s->element[l];

@@ -73,8 +73,8 @@ def _code(knot: Knot, name: str) -> str:
     ]
     places = sorted(zip(rows, columns, range(len(rows)), strict=True))
     for row, column, i in places:
-        code.append(f"    g[{column}] += e[{i}] * by_c[{row}];")
+        code.append(f"    ADD(g[{column}], e[{i}], by_c[{row}]);")
         for other, later, j in places:
             if other == row and later >= column:
-                code.append(f"    H[{column} * (NX + NU) + {later}] += e[{i}] * by_cc[{row}] * e[{j}];")
+                code.append(f"    ADD(H[{column} * (NX + NU) + {later}], e[{i}] * by_cc[{row}], e[{j}]);")
     return "\n".join([*code, "}"])

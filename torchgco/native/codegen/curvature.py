@@ -20,7 +20,7 @@ SMOOTH = (
 
 
 def curvature_code(model: DynamicsSource, functions: Iterable[tuple[int, KnotSource]]) -> str:
-    """The functions that interior_rows.c describes, for a model and the traced constraints by their place."""
+    """The functions that curvature.c names, for a model and the traced constraints by their place."""
     rows = [(i, knot_source("curves", source.span, _rows_code, __file__)) for i, source in functions]
     code = dict.fromkeys(source.code for _, source in rows)
     return "\n".join([_model_code(model), _push(model), *code, _switches(rows)])
@@ -71,10 +71,10 @@ def _rows_code(knot: Knot, name: str) -> str:
         f"    tgco_{name}_slants(x, u, p, e);",
     ]
     for row, column, i in places:
-        lines.append(f"    for (int a = 0; a < PARTS; a++) g[a][{column}] += e[{i}] * by[a * MAX_ROWS + {row}];")
+        lines.append(f"    for (int a = 0; a < PARTS; a++) ADD(g[a][{column}], e[{i}], by[a * MAX_ROWS + {row}]);")
         for other, later, j in places:
             if other == row and later >= column:
-                lines.append(f"    H[{column} * (NX + NU) + {later}] += e[{i}] * cc[{row}] * e[{j}];")
+                lines.append(f"    ADD(H[{column} * (NX + NU) + {later}], e[{i}] * cc[{row}], e[{j}]);")
     lines += [
         f"    tgco_{name}_bend(x, u, p, lam, H);",
         "}",
@@ -82,7 +82,7 @@ def _rows_code(knot: Knot, name: str) -> str:
         f"    V e[{max(1, len(rows))}];",
         f"    tgco_{name}_slants(x, u, p, e);",
         f"    for (int j = 0; j < {knot.rows.numel()}; j++) out[j] = SET(0.0);",
-        *(f"    out[{row}] += e[{i}] * z[{column}];" for row, column, i in places),
+        *(f"    ADD(out[{row}], e[{i}], z[{column}]);" for row, column, i in places),
         "}",
     ]
     return "\n".join(lines)
@@ -169,8 +169,8 @@ def _push(model: DynamicsSource) -> str:
     lines = ["static inline void tgco_push(const V *restrict f, const V *restrict z, V *restrict out) {"]
     lines.append("    for (int i = 0; i < NX; i++) out[i] = SET(0.0);")
     for row, column, place, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
-        factor = f"f[{place}] * " if place >= 0 else "" if value == 1.0 else f"SET({emit.literal(value)}) * "
-        lines.append(f"    out[{row}] += {factor}z[{column}];")
+        factor = f"f[{place}]" if place >= 0 else f"SET({emit.literal(value)})"
+        lines.append(f"    ADD(out[{row}], {factor}, z[{column}]);")
     return "\n".join([*lines, "}"])
 
 

@@ -1,12 +1,14 @@
 """C over vectors whose lanes are problems, from the instructions of a CasADi function of scalar expressions.
 
 A file that holds such code defines REAL (double or float) and LANES (a power of two), then PRELUDE, then the functions.
-No operation mixes lanes: a problem's bits don't depend on the content of other lanes.
+No operation mixes lanes: a problem's bits don't depend on the content of other lanes. Products and sums are fused where
+the code says so alone (lanes.h), never by the compiler.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,29 +43,85 @@ def emit(name: str, function: ca.Function) -> str:
         raise ValueError(f"{name}: expected a CasADi function of scalar expressions, got {function.class_name()}")
     arguments = [f"const V *restrict in{i}" for i in range(function.n_in())]
     arguments += [f"V *restrict out{i}" for i in range(function.n_out())]
-    lines = [_statement(function, k) for k in range(function.n_instructions())]
-    work = ", ".join(f"w{i}" for i in range(function.sz_w()))
+    lines, size = _statements(function)
+    work = ", ".join(f"w{i}" for i in range(size))
     declared = [f"V {work};"] if work else []
     body = "\n".join(f"    {line}" for line in (*declared, *lines))
     return f"static inline void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"
 
 
-def _statement(function: ca.Function, k: int) -> str:
-    """One instruction; w are places of the work vector, each used for several values in turn."""
+def _statements(function: ca.Function) -> tuple[list[str], int]:
+    """A line for each instruction but for products that a sum takes, and how many variables w these lines have."""
+    operations, reads = _read(function)
+    sums = _sums(operations, reads)
+    taken = {product for product, *_ in sums.values()}
+    needs = [list(sums[k][2]) if k in sums else read for k, read in enumerate(reads)]
+    last = {read: k for k, read_by in enumerate(needs) if k not in taken for read in read_by}
+    lines, names, free, size = [], {}, [], 0
+    for k, read in enumerate(needs):
+        if k in taken:
+            continue
+        given = [names[one] for one in read]
+        free += [names.pop(one) for one in dict.fromkeys(read) if last[one] == k]
+        if operations[k] == _codes()["OUTPUT"]:
+            place, entry = function.instruction_output(k)
+            lines.append(f"out{place}[{entry}] = {given[0]};")
+            continue
+        value = sums[k][1].format(*given) if k in sums else _value(function, k, given)
+        if not free:
+            free.append(f"w{size}")
+            size += 1
+        names[k] = free.pop()
+        lines.append(f"{names[k]} = {value};")
+    return lines, size
+
+
+def _read(function: ca.Function) -> tuple[list[int], list[list[int]]]:
+    """The operations of all instructions, and the instructions that have made what each of them reads."""
+    at, operations, reads = _codes(), [], []
+    written: dict[int, int] = {}
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        given = operation in (at["INPUT"], at["CONST"])
+        operations.append(operation)
+        reads.append([] if given else [written[place] for place in function.instruction_input(k)])
+        if operation != at["OUTPUT"]:
+            written[function.instruction_output(k)[0]] = k
+    return operations, reads
+
+
+def _sums(operations: list[int], reads: list[list[int]]) -> dict[int, tuple[int, str, list[int]]]:
+    """Sums and differences that take a product nobody else reads, which is rounded once with them: the product's
+    instruction, and text and operands of both together.
+    """
+    at, uses = _codes(), Counter(one for read in reads for one in read)
+    found: dict[int, tuple[int, str, list[int]]] = {}
+    for k, operation in enumerate(operations):
+        if operation not in (at["ADD"], at["SUB"]):
+            continue
+        for own, other in ((1, 0), (0, 1)):
+            product, rest = reads[k][own], reads[k][other]
+            if operations[product] not in (at["MUL"], at["SQ"]) or uses[product] > 1:
+                continue
+            signs = ("", "") if operation == at["ADD"] else ("-", "") if own else ("", "-")
+            factors = (reads[product] * 2)[:2]
+            found[k] = product, f"tgco_fused({signs[0]}{{0}}, {{1}}, {signs[1]}{{2}})", [*factors, rest]
+            break
+    return found
+
+
+def _value(function: ca.Function, k: int, read: list[str]) -> str:
+    """What an instruction makes of the variables that it reads."""
     at, operation = _codes(), function.instruction_id(k)
-    read, written = function.instruction_input(k), function.instruction_output(k)
-    if operation == at["OUTPUT"]:
-        return f"out{written[0]}[{written[1]}] = w{read[0]};"
     if operation == at["INPUT"]:
-        value = f"in{read[0]}[{read[1]}]"
-    elif operation == at["CONST"]:
-        value = f"SET({literal(function.instruction_constant(k))})"
-    elif operation in _templates():
-        value = _templates()[operation].format(*(f"w{i}" for i in read))
-    else:
-        (meant,) = (word for word, code in at.items() if code == operation)
-        raise ValueError(f"{function.name()}: no counterpart in C for CasADi's operation {meant}")
-    return f"w{written[0]} = {value};"
+        place, entry = function.instruction_input(k)
+        return f"in{place}[{entry}]"
+    if operation == at["CONST"]:
+        return f"SET({literal(function.instruction_constant(k))})"
+    if operation in _templates():
+        return _templates()[operation].format(*read)
+    (meant,) = (word for word, code in at.items() if code == operation)
+    raise ValueError(f"{function.name()}: no counterpart in C for CasADi's operation {meant}")
 
 
 def literal(value: float) -> str:

@@ -1,23 +1,28 @@
-"""The C file of a form of problems: its model, products with the sparse Jacobian, its functions, and the solver."""
+"""The units of C that a library for a form of problems is linked from: the form's own, with its model, products with
+the sparse Jacobian and its functions, and those of the solver, which are compiled once for all forms.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 from torchgco.native.codegen.cost import CostSource
+from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource
 from torchgco.native.codegen.emit import PRELUDE, literal
 from torchgco.native.codegen.knot import KnotSource
-from torchgco.native.compiler import lanes
+from torchgco.native.compiler import Unit, lanes
 from torchgco.native.declarations import defines, head
 from torchgco.native.structures import CONSTANTS, COST_ARRAYS, ENUMERATIONS, STRUCTURES, Quadratic, TracedCost
 
 C = Path(__file__).parents[1] / "c"
 LANES = lanes()
-KEPT = 64  # texts, the most recent ones
+KEPT = 64  # libraries, the most recent ones
+HEADS = "problem.h", "model.h"
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
 LOOPS = """
 static inline V entry(int e, const V *f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
@@ -26,7 +31,7 @@ static void tgco_gather(const V *restrict P, const V *restrict f, V *restrict T)
     for (int e = 0; e < COUNT; e++) {
         V a = entry(e, f), *to = T + F_column[e] * NX;
         const V *from = P + F_row[e] * NX;
-        for (int r = 0; r < NX; r++) to[r] += a * from[r];
+        for (int r = 0; r < NX; r++) ADD(to[r], a, from[r]);
     }
 }
 static void tgco_product(const V *restrict f, const V *restrict T, V *restrict H) {
@@ -34,24 +39,43 @@ static void tgco_product(const V *restrict f, const V *restrict T, V *restrict H
     for (int e = 0; e < COUNT; e++) {
         int c = F_column[e];
         V a = entry(e, f);
-        for (int l = c; l < NX + NU; l++) H[c * (NX + NU) + l] += a * T[l * NX + F_row[e]];
+        for (int l = c; l < NX + NU; l++) ADD(H[c * (NX + NU) + l], a, T[l * NX + F_row[e]]);
     }
 }
 static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict g) {
     for (int i = 0; i < NX + NU; i++) g[i] = SET(0.0);
-    for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
+    for (int e = 0; e < COUNT; e++) ADD(g[F_column[e]], entry(e, f), p[F_row[e]]);
 }
 """
-COST = "quadratic.c"  # or traced.c
-BOXES, FIELDS = ("box.h", "boxes.c"), ("field.c",)  # left out where there are no boxes, or no maps
-TERMS = ("problem.c", COST, "penalty.c", *BOXES, *FIELDS, "knot.c")
-SOLVER = (*TERMS, "cholesky.h", "passes.c", "ilqr.c", "trajectories.c", "outer.c")
-SAMPLER = (*TERMS, "normal.c", "mppi.c")
+@dataclass(frozen=True)
+class Library:
+    """What a library is linked from beside a form's own code.
+
+    Attributes:
+        model: files that are compiled with the model. They take the numbers of states and controls as constants: their
+            loops are short, and take up to a quarter longer otherwise.
+        curvature: the same of the unit with second derivatives; none: there is no such unit.
+        shared: files that read these numbers from the model, so that one object serves all models.
+    """
+
+    model: tuple[str, ...]
+    curvature: tuple[str, ...]
+    shared: tuple[str, ...]
+
+
+BOXES = "box.h", "boxes.c", "field.c"  # left out of problems without a position
+ROWS = ("problem.c", "rows.c", "penalty.c", *BOXES)
 PHASES = "_rows", "_step", "_memory", "_fixed", "_search", ""
-INTERIOR = (*TERMS, "cholesky.h", *(f"interior{phase}.c" for phase in PHASES))
+PASSES = "model.c", "passes.h", "cholesky.h", "passes.c"
+RICCATI = "curvature.c", "interior.h", "cholesky.h", "riccati.c"
+SOLVER = Library(PASSES, (), (*ROWS, "passes.h", "knot.c", "ilqr.c", "trajectories.c", "outer.c"))
+SAMPLER = Library(("model.c",), (), (*ROWS, "normal.c", "mppi.c"))
+# The model's unit is that of SOLVER: it is compiled once for both.
+INTERIOR = Library(PASSES, RICCATI, (*ROWS, "interior.h", *(f"interior{phase}.c" for phase in PHASES)))
+SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
 
 
-_sources: dict[tuple[Any, ...], str] = {}  # reading and joining the files takes longer than a small solve
+_units: dict[tuple[Any, ...], tuple[Unit, ...]] = {}  # reading and joining files takes longer than a small solve
 
 
 @dataclass(frozen=True)
@@ -63,44 +87,54 @@ class Form:
     cost: CostSource | None  # None: quadratic
     dense: bool  # the quadratic cost's weights are matrices
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
-    boxes: bool = False  # whether there are boxes among the obstacles
-    fields: bool = False  # the same of maps
 
-    def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES, more: str = "") -> str:
-        """The C file of one of the solvers or the sampler, for numbers of type `real`; `more` is generated code."""
-        key = (*self._key, parts, real, lanes, more)
-        if key not in _sources:
-            _sources[key] = self._written(parts, real, lanes, more)
-            if len(_sources) > KEPT:
-                del _sources[next(iter(_sources))]
-        return _sources[key]
+    def units(self, library: Library = SOLVER, real: str = "double", lanes: int = LANES) -> tuple[Unit, ...]:
+        """The units of a library, for numbers of type `real`."""
+        key = (*self._key, library, real, lanes)
+        if key not in _units:
+            _units[key] = self._written(library, {"REAL": real, "LANES": lanes})
+            if len(_units) > KEPT:
+                del _units[next(iter(_units))]
+        return _units[key]
 
     @property
     def _key(self) -> tuple[Any, ...]:
         at = self.position
         cost = None if self.cost is None else (self.cost.stage.key, self.cost.last.key)
         functions = tuple((i, rows.key) for i, rows in self.functions)
-        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions, self.boxes, self.fields
+        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions
 
-    def _written(self, parts: tuple[str, ...], real: str, lanes: int, more: str) -> str:
+    def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
         model, at = self.dynamics, self.position
         sizes = {
-            "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
-            "DIM": 0 if at is None else at.stop - at.start, "POSITION": 0 if at is None else at.start,
-            "QUADRATIC_FULL": int(self.dense), "WITH_BOXES": int(self.boxes), "WITH_FIELDS": int(self.fields),
-            "COST_ARRAYS": COST_ARRAYS,
-            "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]),
+            "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
+            "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]), "QUADRATIC_FULL": int(self.dense),
         }  # fmt: skip
-        cost = Quadratic if self.cost is None else TracedCost
-        shared = head(STRUCTURES, (*ENUMERATIONS, cost), CONSTANTS)
-        generated = [model.code, _products(model), "" if self.cost is None else self.cost.code]
-        generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
-        generated += [more] if more else []
-        # Without boxes or maps their code is left out, so that it can't change how the rest is compiled.
-        absent = (*(() if self.boxes else BOXES), *(() if self.fields else FIELDS))
-        names = [name for name in parts if name not in absent]
-        names = ["traced.c" if name == COST and self.cost is not None else name for name in names]
-        return "\n".join((defines(sizes), shared, PRELUDE, *generated, *((C / name).read_text() for name in names)))
+        space = {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
+        read = {name: f"tgco_{name.lower()}" for name in SIZES} | space
+        cost = "quadratic.c" if self.cost is None else "traced.c"
+        units = [Unit(self._text(vectors | sizes, self._model_code(), cost, *library.model), own=True)]
+        if library.curvature:
+            generated = [curvature_code(model, self.functions), _products(model)]
+            units.append(Unit(self._text(vectors | sizes, generated, *library.curvature), own=True))
+        shared = [name for name in library.shared if at is not None or name not in BOXES]
+        return (*units, Unit(self._text(vectors | read, [], *shared)))
+
+    def _text(self, sizes: dict[str, Any], generated: list[str], *files: str) -> str:
+        """The C file of a unit."""
+        costs = () if "quadratic.c" not in files and "traced.c" not in files else (self._cost,)
+        shared = head(STRUCTURES, (*ENUMERATIONS, *costs), CONSTANTS)
+        texts = [(C / name).read_text() for name in (*HEADS, *files)]
+        begin, end = texts[: len(HEADS)], texts[len(HEADS) :]
+        return "\n".join((defines({**sizes, "COST_ARRAYS": COST_ARRAYS}), shared, PRELUDE, *begin, *generated, *end))
+
+    @property
+    def _cost(self) -> type[IntEnum]:
+        return Quadratic if self.cost is None else TracedCost
+
+    def _model_code(self) -> list[str]:
+        generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
+        return [*generated, *dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
 
 
 def _products(model: DynamicsSource) -> str:
@@ -119,11 +153,18 @@ def _looped(model: DynamicsSource) -> str:
 def _written_out(model: DynamicsSource) -> str:
     by_column: list[list[tuple[int, str]]] = [[] for _ in range(model.n + model.m)]
     for row, column, place, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
-        factor = f"f[{place}] * " if place >= 0 else "" if value == 1.0 else f"SET({literal(value)}) * "
+        factor = f"f[{place}]" if place >= 0 else "" if value == 1.0 else f"SET({literal(value)})"
         by_column[column].append((row, factor))
 
     def total(entries: list[tuple[int, str]], source: str) -> str:
-        return " + ".join(factor + source.format(row) for row, factor in entries) or "SET(0.0)"
+        text = ""
+        for row, factor in entries:
+            each = source.format(row)
+            if text:
+                text = f"tgco_fused({factor}, {each}, {text})" if factor else f"{text} + {each}"
+            else:
+                text = f"{factor} * {each}" if factor else each
+        return text or "SET(0.0)"
 
     columns = range(len(by_column))
     gather = [f"        T[{c} * NX + r] = {total(by_column[c], 'p[{} * NX]')};" for c in columns]

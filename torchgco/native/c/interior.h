@@ -1,0 +1,31 @@
+/* The interior point's data: constraints are c(x, u) + s = 0 with slacks s > 0, or c(x, u) = 0. */
+
+typedef struct {
+    Lanes lanes;
+    const Interior *how;
+    V *y, *yn;                   /* (N+1, NX): costates of the states, and those of a full step */
+    V *gap, *gapn, *aim;         /* (N, NX): step(x, u) - x', of iterate and trial, and what a step is to close */
+    V *H, *f;                    /* (N+1, S, S) upper triangles, (N, NJ) */
+    V *cost_slope, *g[PARTS];    /* (N+1, S): cost; with J' of multipliers, of the condensed residuals, of 1 / s */
+    V *P, *p, *L;                /* (N+1, NX, NX), (N+1, NX), (N, NU, NU): the Riccati recursion */
+    V *is_free, *L_start;        /* (NX): 1 where the start is free; (NX, NX): its factor. None where none is free */
+    V *dx, *du;                  /* (N+1, NX), (N, NU) */
+    V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
+    V *room, *relaxed; /* (rows): half the range between two bounds, 1 at most; by how much a row is relaxed */
+    int some_relaxed;  /* whether any is, in a lane */
+    I *out, *fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
+    int some_out;   /* whether there are any in a lane; see interior_fixed.c */
+    double admitted; /* violation of rows outside, up to which they stay there */
+    int64_t *first, rows;        /* the first row of each constraint, and how many there are */
+    V mu, shift, scale;
+    V objective; /* 0 where feasibility alone is sought */
+    V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */
+    V *kept; /* the iterate before the steps on trial */
+    V *memory;
+} Barrier;
+
+/* In riccati.c. */
+#pragma GCC visibility push(hidden)
+I factor(Barrier *t, I open);
+void solve(Barrier *t);
+#pragma GCC visibility pop

@@ -1,0 +1,18 @@
+/* The unit of a model: the generated functions before this file, under the names that the solvers call.
+
+   They are tgco_step, tgco_jacobian (the model), tgco_gather, tgco_product, tgco_pull_back (its sparse Jacobian), tgco_rows
+   and tgco_add_rows (traced constraints). */
+
+const int tgco_nx = NX, tgco_nu = NU, tgco_np = NP, tgco_nj = NJ, tgco_max_rows = MAX_ROWS;
+
+void model_step(const V *x, const V *u, const V *parameters, V *next) { tgco_step(x, u, parameters, next); }
+
+void model_jacobian(const V *x, const V *u, const V *parameters, V *f) { tgco_jacobian(x, u, parameters, f); }
+
+void model_pull_back(const V *p, const V *f, V *g) { tgco_pull_back(p, f, g); }
+
+void model_rows(int i, const V *x, const V *u, const V *p, V *c) { tgco_rows(i, x, u, p, c); }
+
+void model_add_rows(int i, const V *x, const V *u, const V *p, const V *by_c, const V *by_cc, V *g, V *H) {
+    tgco_add_rows(i, x, u, p, by_c, by_cc, g, H);
+}

@@ -1,0 +1,12 @@
+/* Passes along a trajectory (passes.c), which are compiled with the model. They are told the functions of the terms of a
+   knot (knot.c): the interior point's library has the model's unit, too, but no such functions. */
+
+typedef V Value(const Lanes *s, int64_t k, const V *x, const V *u, V *added);
+typedef void Expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H);
+#pragma GCC visibility push(hidden)
+void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit);
+void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *lowest);
+I is_finite(const Lanes *s, Expand *expand);
+void gaps(const Lanes *s, V *gap);
+void linear_step(Lanes *s, const V *gap);
+#pragma GCC visibility pop

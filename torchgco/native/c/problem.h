@@ -1,0 +1,46 @@
+/* Problems side by side, one per lane of the vectors V; no operation mixes lanes.
+
+   The library of a form of problems is linked from units. Its own one, the model (model.c), knows all sizes; those that
+   take them as constants (passes.c, riccati.c) are compiled for each NX and NU; all others read them from the model, and
+   differ in DIM, REAL and LANES alone. Python's part before this file declares the structures and enumerations of
+   native/structures.py. */
+
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#define S (NX + NU)
+#define NZ (NX + 1)
+
+/* A constraint's multipliers and numbers. */
+typedef struct {
+    V *lam, *bound, *squares, *velocities, *stops;
+    I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
+    const float *map[LANES]; /* of a FIELD: each lane's map */
+} Rows;
+
+/* The working data of a group of lanes. */
+typedef struct {
+    const Problem *of;
+    V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
+    Rows *rows;
+    V weight, mu, inverse_mu, mu_r, merit, cost, inner, made, alpha, used;
+    V floor; /* the constraints' terms add no less than minus this to L_M: lam^2 / (2 mu) for each row */
+    int64_t element[LANES], rung[LANES]; /* at which the next line search begins */
+    V *memory;
+} Lanes;
+
+static inline int any(I where) { return tgco_any(where); }
+static inline I finite(V a) { return (a - a) == SET(0.0); }
+
+static inline const V *at(const V *array, const Array *shape, int64_t k) {
+    return array + (shape->knot ? k * shape->size : 0);
+}
+
+/* Array i of the cost at knot k. */
+static inline const V *cost_at(const Lanes *s, int i, int64_t k) {
+    return at(s->cost_data[i], s->of->cost_data + i, k);
+}
+
+/* The model's own numbers at stage k. */
+static inline const V *model_at(const Lanes *s, int64_t k) { return at(s->parameters, &s->of->parameters, k); }
