@@ -17,7 +17,7 @@ from torchgco.native.compiler import find_compiler
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
 # Most tests spend more time in the compiler than in what it has made: with -Og it takes a third of the time, and solves
-# up to twice as long. See `as_shipped`.
+# up to twice as long, with the same bits (tests/native/test_units.py).
 os.environ.setdefault("TORCHGCO_CFLAGS", "-Og")
 torch.set_num_threads(1)
 # In the background of a shell Ctrl-C is ignored, also by all processes that tests start and interrupt.
@@ -39,12 +39,6 @@ def _parse_once() -> None:
 
 
 _parse_once()
-
-
-@pytest.fixture
-def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Native kernels compiled as for users, for tests of bits and of agreement between kernels."""
-    monkeypatch.delenv("TORCHGCO_CFLAGS", raising=False)
 
 
 @pytest.fixture(params=["native", "eager"])

@@ -38,8 +38,6 @@ from torchgco.solvers.ilqr import advance
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import PassEnd, State
 
-pytestmark = pytest.mark.usefixtures("as_shipped")
-
 DAMPED = ILQR()
 BRIEF = replace(DAMPED, line_search=LineSearch(back=2))
 PRINTED = ILQR(as_printed=True, tolerance=0.1, max_iterations=15)

@@ -33,7 +33,7 @@ from torchgco.solvers.interior import FILTER
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"),
-    pytest.mark.usefixtures("as_shipped", "native"),
+    pytest.mark.usefixtures("native"),
 ]
 
 B, D = 9, torch.float64  # one problem more than lanes

@@ -22,8 +22,6 @@ from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.state import SolveEnd
 
-pytestmark = pytest.mark.usefixtures("as_shipped")
-
 STANDARD = AugmentedLagrangian(ILQR(max_iterations=12), initial_penalty=0.3, max_outer_iterations=8)
 SOLVERS = {
     "standard": STANDARD,

@@ -20,10 +20,7 @@ from torchgco.guidance import mppi
 from torchgco.native import dispatch, kernels
 from torchgco.native.compiler import find_compiler
 
-pytestmark = [
-    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
-    pytest.mark.usefixtures("as_shipped"),
-]
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 
 @pytest.fixture(autouse=True)

@@ -24,8 +24,6 @@ from torchgco.missions.constraints import FirstStepRates
 from torchgco.search import Follow, Refine
 from torchgco.solution import Solution
 
-pytestmark = pytest.mark.usefixtures("as_shipped")
-
 SAMPLER = MPPI(samples=20)
 SOLVERS = {
     "gco": AugmentedLagrangian(

@@ -25,10 +25,10 @@ from types import FrameType
 from torchgco.base.notices import notice
 from torchgco.native import store
 
-# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Products and sums are fused
-# where the code says so (lanes.h) and nowhere else: bits depend on no optimisation and on no division into units. Below -O2 gcc clears the
-# upper halves of vector registers before calls of the C library only with -fexpensive-optimizations: otherwise such a
-# call, a tanh for instance, takes many times as long on some processors.
+# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Products and sums are
+# fused where the code says so (lanes.h) and nowhere else: bits depend on no optimisation and on no division into units.
+# Below -O2 gcc clears the upper halves of vector registers before calls of the C library only with
+# -fexpensive-optimizations: otherwise such a call, a tanh for instance, takes many times as long on some processors.
 FLAGS = (
     "-O3", "-std=c11", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off",
     "-fexpensive-optimizations",
@@ -39,8 +39,8 @@ _ERROR_LINES = 5
 _ERROR = re.compile(r"error|fail|cannot|can't|No space", re.IGNORECASE)
 # What drivers add when the reason has been said, and lines of the source that are shown beside it.
 _SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? generated|^\d*\s*\|", re.IGNORECASE)
-# What gcc 12 takes: s a line of the solvers' own text, loops over vectors; of the straight code of a model, twice as long
-# where there are _LONG lines, and to begin with; and the share of it at other levels than -O3.
+# What gcc 12 takes: s a line of the solvers' own text, loops over vectors; a line of the straight code of a model,
+# twice as long where there are _LONG of these, and to begin with; and the share of it at other levels than -O3.
 _LOOPS, _STRAIGHT, _BEGIN, _LONG = 1.0e-3, 0.2e-3, 0.2, 170_000
 _SHARES = {"-O0": 0.2, "-Og": 0.3, "-O1": 0.5, "-O2": 0.7, "-O3": 1.0}
 _BRIEF = 2.0  # s: compilations that are shorter are announced only to those who watch
@@ -244,7 +244,7 @@ def _object(compiler: Compiler, unit: Unit, flags: tuple[str, ...]) -> bytes:
             return content
     with TemporaryDirectory(prefix="torchgco-") if begun is None else begun.room as name:
         room = Path(name)
-        _check(compiler, *_finished(lambda: _compiling(compiler, unit, flags, room) if begun is None else begun.process))
+        _check(compiler, *_finished(lambda: begun.process if begun else _compiling(compiler, unit, flags, room)))
         content = (room / "kernels.o").read_bytes()
     _remember(key, content)
     if not unit.own:

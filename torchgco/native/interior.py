@@ -35,7 +35,9 @@ class InteriorEngine:
     def for_few(self, B: int) -> tuple[ctypes.CDLL, int]:
         """A library for B problems, and how many it solves side by side: lanes without a problem take time, too."""
         lanes = next((lanes for lanes in FEW if B <= lanes < LANES), LANES)
-        return (self.library if lanes == LANES else load(self.engine.form.units(INTERIOR, lanes=lanes), STRUCTURES)), lanes
+        if lanes == LANES:
+            return self.library, lanes
+        return load(self.engine.form.units(INTERIOR, lanes=lanes), STRUCTURES), lanes
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
@@ -75,4 +77,3 @@ def begin_interior(engine: Engine) -> None:
     """Start to compile both libraries of a form of which the first one is about to be loaded."""
     with suppress(InputError):
         begin(engine.form.units(), engine.form.units(INTERIOR))
-

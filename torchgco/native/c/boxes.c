@@ -69,7 +69,8 @@ static inline int may_matter(const Constraint *con, const Rows *rows, const V *l
     return some_matter(con, rows, lam, pushed, j, j + 1, x);
 }
 
-static inline V boxes_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
+__attribute__((noinline)) static V boxes_value(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
     for (int64_t first = 0, last; first < con->rows; first = last) {
@@ -84,7 +85,7 @@ static inline V boxes_value(const Lanes *s, const Constraint *con, const Rows *r
     return total;
 }
 
-static inline void boxes_expand(
+__attribute__((noinline)) static void boxes_expand(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);

@@ -163,13 +163,14 @@ static inline V depth_of(const Rows *rows, V c) {
     return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[FACTOR], number[CORE]);
 }
 
-static inline V field_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
+__attribute__((noinline)) static V field_value(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     V lam = rows->lam[con->place[k]];
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return total;
     return total + worth(s, 0, field_row(con, rows, k, x, 0, 0), lam);
 }
 
-static inline void field_expand(
+__attribute__((noinline)) static void field_expand(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
     V lam = rows->lam[con->place[k]], slopes[DIM], rho;
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return;

@@ -1,4 +1,4 @@
-/* The terms of one knot of the iterate: cost, constraints and guide. */
+/* The terms of one knot of the iterate beside its cost: constraints and guide. */
 
 #if DIM > 0
 static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
@@ -128,8 +128,8 @@ static inline void guide_expand(const Lanes *s, int64_t k, const V *x, V *g, V *
 }
 #endif
 
-/* Cost of knot k; guides and constraints go into `added`. u is NULL at the last knot. */
-static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V *added) {
+/* What constraints and guide add at knot k. u is NULL at the last knot. */
+static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     const Problem *p = s->of;
     V more = SET(0.0);
     for (int64_t i = 0; i < p->constraints; i++)
@@ -137,14 +137,12 @@ static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V *added)
 #if DIM > 0
     if (p->guide != NO_GUIDE) more += guide_value(s, k, x);
 #endif
-    *added = more;
-    return cost_value(s, k, x, u);
+    return more;
 }
 
-/* Adds gradient g (S) and upper triangle H (S, S) of all terms of knot k. */
+/* Adds gradient g (S) and upper triangle H (S, S) of these terms. */
 static void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     const Problem *p = s->of;
-    cost_expand(s, k, x, u, g, H);
     for (int64_t i = 0; i < p->constraints; i++)
         if (p->constraint[i].place[k] != NOWHERE) rows_expand(s, i, k, x, u, g, H);
 #if DIM > 0

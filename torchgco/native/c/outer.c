@@ -146,7 +146,7 @@ static int64_t tested(const Outer *o, int64_t e, double violation, int caught) {
    A problem that has failed only gets its violation. */
 static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int count, int failed) {
     const Problem *p = s->of;
-    V least, total = SET(0.0), more = SET(0.0), part;
+    V least, total = SET(0.0), more = SET(0.0);
     I caught;
     for (int l = 0; l < LANES; l++) {
         int64_t e = number[l < count ? l : 0];
@@ -182,8 +182,9 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
     }
     if (!going) return;
     for (int64_t k = 0; k <= p->N; k++) {
-        total += knot_value(s, k, s->X + k * NX, k < p->N ? s->U + k * NU : 0, &part);
-        more += part;
+        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        total += cost_value(s, k, x, u);
+        more += knot_value(s, k, x, u);
     }
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];

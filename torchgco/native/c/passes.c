@@ -4,7 +4,7 @@
    early, with what has added up so far, where that is over `enough` in all lanes, or isn't a number. */
 void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
     const Problem *p = s->of;
-    V total = SET(0.0), more = SET(0.0), part;
+    V total = SET(0.0), more = SET(0.0);
     memcpy(s->Xn, s->X, NX * sizeof(V));
     for (int64_t k = 0; k < p->N; k++) {
         const V *X = s->X + k * NX, *G = s->G + k * NU * NZ;
@@ -15,14 +15,15 @@ void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
             for (int i = 0; i < NX; i++) ADD(step, G[j * NZ + i], dx[i]);
             u[j] = s->U[k * NU + j] + step;
         }
-        total += value(s, k, x, u, &part);
-        more += part;
+        total += cost_value(s, k, x, u);
+        more += value(s, k, x, u);
         if (!any(total + more <= enough)) { *cost = total; *merit = total + more; return; }
         model_step(x, u, model_at(s, k), x + NX);
     }
-    total += value(s, p->N, s->Xn + p->N * NX, 0, &part);
+    total += cost_value(s, p->N, s->Xn + p->N * NX, 0);
+    more += value(s, p->N, s->Xn + p->N * NX, 0);
     *cost = total;
-    *merit = total + (more + part);
+    *merit = total + more;
 }
 
 /* The backward pass (lines 4-13): gains into G, the two sums of the expected change, and the smallest pivot. `gap`
@@ -33,6 +34,7 @@ void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *
     V sum = SET(0.0), square = SET(0.0), least = SET(__builtin_inf());
     int regular = any(s->mu_r > SET(0.0));
     memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+    cost_expand(s, p->N, s->X + p->N * NX, 0, g, H);
     expand(s, p->N, s->X + p->N * NX, 0, g, H);
     for (int i = 0; i < NX; i++) {
         vector[i] = g[i];
@@ -46,6 +48,7 @@ void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *
         tgco_product(f, T, H);
         if (gap) for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) ADD(vector[i], P[i * NX + j], gap[k * NX + j]);
         tgco_pull_back(vector, f, g);
+        cost_expand(s, k, x, u, g, H);
         expand(s, k, x, u, g, H);
         /* L of Quu + mu_r I, Y = L^-1 [Qux Qu], [K d] = -L'^-1 Y. */
         for (int j = 0; j < NU; j++) H[(NX + j) * S + NX + j] += s->mu_r;
@@ -86,6 +89,7 @@ I is_finite(const Lanes *s, Expand *expand) {
     for (int64_t k = 0; k <= p->N; k++) {
         const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+        cost_expand(s, k, x, u, g, H);
         expand(s, k, x, u, g, H);
         for (int i = 0; i < S; i++) sum += SET(0.0) * g[i];
         for (int i = 0; i < S * S; i++) sum += SET(0.0) * H[i];

@@ -1,7 +1,7 @@
-/* Passes along a trajectory (passes.c), which are compiled with the model. They are told the functions of the terms of a
-   knot (knot.c): the interior point's library has the model's unit, too, but no such functions. */
+/* Passes along a trajectory (passes.c), which are compiled with the model. They are told the functions of what constraints and
+   guide add to the cost of a knot (knot.c): the interior point's library has the model's unit, but no such functions. */
 
-typedef V Value(const Lanes *s, int64_t k, const V *x, const V *u, V *added);
+typedef V Value(const Lanes *s, int64_t k, const V *x, const V *u);
 typedef void Expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H);
 #pragma GCC visibility push(hidden)
 void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit);

@@ -6,10 +6,11 @@ int tgco_value(const Problem *p, int64_t first, int64_t last) {
     if (!start(s, p)) return 0;
     for (int64_t e = first; e < last; e += LANES) {
         for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        V total = SET(0.0), more = SET(0.0), part;
+        V total = SET(0.0), more = SET(0.0);
         for (int64_t k = 0; k <= p->N; k++) {
-            total += knot_value(s, k, s->X + k * NX, k < p->N ? s->U + k * NU : 0, &part);
-            more += part;
+            const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+            total += cost_value(s, k, x, u);
+            more += knot_value(s, k, x, u);
         }
         for (int l = 0; l < LANES && e + l < last; l++) {
             p->cost[e + l] = total[l];
@@ -89,7 +90,9 @@ int tgco_expand(const Problem *p, int64_t first, int64_t last) {
         for (int64_t k = 0; k <= p->N; k++) {
             V g[S], H[S * S];
             memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-            knot_expand(s, k, s->X + k * NX, k < p->N ? s->U + k * NU : 0, g, H);
+            const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+            cost_expand(s, k, x, u, g, H);
+            knot_expand(s, k, x, u, g, H);
             for (int l = 0; l < LANES && e + l < last; l++) {
                 int64_t at = (e + l) * (p->N + 1) + k;
                 for (int i = 0; i < S; i++) p->slopes[at * S + i] = g[i][l];

@@ -47,6 +47,8 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) ADD(g[F_column[e]], entry(e, f), p[F_row[e]]);
 }
 """
+
+
 @dataclass(frozen=True)
 class Library:
     """What a library is linked from beside a form's own code.
