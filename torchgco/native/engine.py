@@ -25,7 +25,16 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.declarations import load
-from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, numbers_of, quadratic_arrays
+from torchgco.native.packing import (
+    KINDS,
+    constraint_of,
+    guide_of,
+    is_bounded,
+    numbers_of,
+    quadratic_arrays,
+    shared_fields,
+)
+from torchgco.native.shared import Shared, read
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
@@ -63,11 +72,22 @@ class Engine:
         kinds = {type(constraint) for constraint in problem.constraints}
         self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
+        self.shared = self._first_shared()
         self.form = Form(self.model, at, self.cost, dense, functions, BoundBoxes in kinds, BoundField in kinds)
         if ahead is not None:
             ahead(self)
         if compiles:
             self.library = load(self.form.source(), STRUCTURES)
+
+    def read(self) -> Shared | None:
+        """The numbers that all problems share, as they are now; None where a function is to be traced again."""
+        return read(self.model, self.cost, self.functions)
+
+    def _first_shared(self) -> Shared:
+        found = self.read()
+        if found is None:  # changed since the functions were traced, by another thread
+            raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
+        return found
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X (B, N+1, n) from U (B, N, m)."""
@@ -216,10 +236,12 @@ class Engine:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
         rows = self._constraints(problem)
-        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
+        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows, **shared_fields(self.shared))
         if self.model.count > 0:
-            packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
-        packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
+            numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
+            packed.parameters = array(numbers, knots=True)
+        cost, shared = self.cost, self.shared.cost
+        packed.cost_data = quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, shared)
         packed.bounded = int(self.cost is None and is_bounded(problem.cost))
         return packed, rows
 
@@ -230,11 +252,17 @@ class Engine:
             return rows
         rows = []
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
-            source = self.functions.get(i)
-            numbers = None if source is None else rows_numbers(problem, i, source)
-            rows.append(constraint_of(constraint, shape, numbers_of(constraint, numbers, problem), problem))
+            rows.append(constraint_of(constraint, shape, self.row_numbers(problem, i), problem))
         problem.form[PACKED] = problem.constraints, rows
         return rows
+
+    def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
+        """The fields of a `Constraint` in C that hold the numbers of constraint i."""
+        source, constraint = self.functions.get(i), problem.constraints[i]
+        if source is None:
+            return numbers_of(constraint, None, problem)
+        shared = self.shared.rows[i]
+        return {**numbers_of(constraint, rows_numbers(problem, i, source, shared), problem), "shared": shared}
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:

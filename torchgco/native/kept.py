@@ -13,12 +13,11 @@ from torch import Tensor
 
 from torchgco.lagrangian.lagrangian import later
 from torchgco.native import structures as c
-from torchgco.native.codegen.constraint import rows_numbers
 from torchgco.native.codegen.cost import cost_arrays
 from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import run
 from torchgco.native.interior import InteriorEngine
-from torchgco.native.packing import constraint_of, numbers_of, quadratic_arrays
+from torchgco.native.packing import constraint_of, quadratic_arrays, shared_fields
 from torchgco.problem.problem import Problem
 
 
@@ -43,7 +42,7 @@ class Kept:
         self.barrier = like.new_zeros(B)
         self._numbers = [self._own_numbers(i) for i in range(len(problem.constraints))]
         rows = [self._row(i, numbers) for i, numbers in enumerate(self._numbers)]
-        self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows)
+        self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(self.engine.shared))
         self._model = self._model_array()
         self._cost = self._cost_arrays()
         self.packed.fill({"parameters": self._model, "cost_data": self._cost})
@@ -89,6 +88,11 @@ class Kept:
         if self.engine.measures:
             run(library.tgco_violation, B, LANES, self._follow)
 
+    def begin_with(self, other: Kept) -> None:
+        """Take over the iterates of another one of the same shapes."""
+        for own, its in zip(self._moving, other._moving, strict=True):
+            own[:] = its
+
     @property
     def finite(self) -> np.ndarray:
         """Whether all states and controls of `rolled` are, (B,)."""
@@ -111,6 +115,18 @@ class Kept:
         for part, at in zip(self._moving, self._later[by], strict=True):
             part[:] = part[:, at]
 
+    def refresh_shared(self) -> bool:
+        """Read the numbers that all problems share again; whether the library computes with them as they are now."""
+        engine = self.engine
+        new = engine.read()
+        if new is not None and engine.shared.take_over(new):
+            # Some of them may be a knot's own.
+            for i in engine.functions:
+                self.refresh_constraint(i)
+            self.refresh_cost()
+            self.refresh_model()
+        return new is not None
+
     def refresh_constraint(self, i: int) -> None:
         """Read the numbers of constraint i again, after its tensors have changed."""
         new = self._own_numbers(i)
@@ -132,17 +148,17 @@ class Kept:
         return row
 
     def _own_numbers(self, i: int) -> dict[str, Any]:
-        source = self.engine.functions.get(i)
-        numbers = None if source is None else rows_numbers(self.problem, i, source)
-        return numbers_of(self.problem.constraints[i], numbers, self.problem)
+        return self.engine.row_numbers(self.problem, i)
 
     def _cost_arrays(self) -> list[c.Array]:
-        cost = self.engine.cost
-        return quadratic_arrays(self.problem.cost) if cost is None else cost_arrays(self.problem, cost)
+        cost, problem = self.engine.cost, self.problem
+        return quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, self.engine.shared.cost)
 
     def _model_array(self) -> c.Array:
         model, problem = self.engine.model, self.problem
-        return c.Array() if model.count == 0 else c.array(model.numbers(problem.B, problem.dynamics), knots=True)
+        if model.count == 0:
+            return c.Array()
+        return c.array(model.numbers(problem.B, problem.dynamics, self.engine.shared.model), knots=True)
 
 
 def _spans(rows: np.ndarray) -> list[tuple[int, int]]:

@@ -2,10 +2,10 @@
 
    The generated part also defines
 
-       tgco_curve(x, u, parameters, y, H)               H += second derivatives of y' step, upper triangle
+       tgco_curve(x, u, parameters, w, y, H)            H += second derivatives of y' step, upper triangle
        tgco_push(f, z, out)                             out = F z
-       tgco_model_rows(i, x, u, p, by, cc, lam, g, H)   traced rows: g[a] += c_z' by[a], H += c_z' cc c_z + lam' c_zz
-       tgco_along_rows(i, x, u, p, z, out)              out = c_z z */
+       tgco_model_rows(i, x, u, p, w, by, cc, lam, g, H)  traced rows: g[a] += c_z' by[a], H += c_z' cc c_z + lam' c_zz
+       tgco_along_rows(i, x, u, p, w, z, out)           out = c_z z */
 
 typedef struct {
     Lanes lanes;
@@ -56,7 +56,7 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     } else if (con->kind == FIELD) {
         c[0] = field_row(con, rows, k, x, 0, 0);
 #endif
-    } else tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
+    } else tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
 }
 
 /* `inside` of rows in the barrier, `fixed` of bounds that coincide, and nothing of rows that no variable moves. */
@@ -185,7 +185,8 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
     }
     V *g[PARTS];
     for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
-    tgco_model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), by, cc, lam, g, t->H + k * S * S);
+    const V *numbers = at(rows->bound, &con->bound, con->place[k]);
+    tgco_model_rows((int)i, x, u, numbers, con->shared, by, cc, lam, g, t->H + k * S * S);
 }
 
 /* The change of the rows of constraint i at knot k along z = [dx, du], into out. */
@@ -219,5 +220,5 @@ static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, con
         out[0] = SET(0.0);
         for (int a = 0; a < DIM; a++) out[0] += slopes[a] * z[POSITION + a];
 #endif
-    } else tgco_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), z, out);
+    } else tgco_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, z, out);
 }

@@ -92,7 +92,7 @@ static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, con
 #endif
     } else {
         V c[MAX_ROWS];
-        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
+        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
         for (int j = 0; j < con->rows; j++) total += worth(s, con->equality, c[j], lam[j]);
     }
     return total;
@@ -124,9 +124,9 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
     } else {
         V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
         const V *numbers = at(rows->bound, &con->bound, con->place[k]);
-        tgco_rows((int)i, x, u, numbers, c);
+        tgco_rows((int)i, x, u, numbers, con->shared, c);
         for (int j = 0; j < con->rows; j++) slope[j] = pull(s, con->equality, c[j], lam[j], rho + j);
-        tgco_add_rows((int)i, x, u, numbers, slope, rho, g, H);
+        tgco_add_rows((int)i, x, u, numbers, con->shared, slope, rho, g, H);
     }
 }
 
@@ -190,6 +190,7 @@ __attribute__((noinline)) static void knot_expand(const Lanes *s, int64_t k, con
 #endif
 }
 
-__attribute__((noinline)) static void model_step(const V *x, const V *u, const V *parameters, V *next) {
-    tgco_step(x, u, parameters, next);
+__attribute__((noinline)) static void model_step(
+    const V *x, const V *u, const V *parameters, const double *w, V *next) {
+    tgco_step(x, u, parameters, w, next);
 }

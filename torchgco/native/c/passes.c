@@ -18,7 +18,7 @@ static void roll(Lanes *s, V alpha, V enough, V *cost, V *merit) {
         total += knot_value(s, k, x, u, &part);
         more += part;
         if (!any(total + more <= enough)) { *cost = total; *merit = total + more; return; }
-        model_step(x, u, model_at(s, k), x + NX);
+        model_step(x, u, model_at(s, k), s->of->shared, x + NX);
     }
     total += knot_value(s, p->N, s->Xn + p->N * NX, 0, &part);
     *cost = total;
@@ -41,7 +41,7 @@ static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
     for (int64_t k = p->N - 1; k >= 0; k--) {
         const V *x = s->X + k * NX, *u = s->U + k * NU;
         V *G = s->G + k * NU * NZ;
-        tgco_jacobian(x, u, model_at(s, k), f);
+        tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         tgco_gather(P, f, T);
         tgco_product(f, T, H);
         if (gap) for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) vector[i] += P[i * NX + j] * gap[k * NX + j];
@@ -90,7 +90,7 @@ static I is_finite(const Lanes *s) {
         for (int i = 0; i < S; i++) sum += SET(0.0) * g[i];
         for (int i = 0; i < S * S; i++) sum += SET(0.0) * H[i];
         if (k == p->N) break;
-        tgco_jacobian(x, u, model_at(s, k), f);
+        tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         for (int i = 0; i < NJ; i++) sum += SET(0.0) * f[i];
     }
     return sum == SET(0.0);
@@ -100,7 +100,7 @@ static I is_finite(const Lanes *s) {
 static void gaps(const Lanes *s, V *gap) {
     for (int64_t k = 0; k < s->of->N; k++) {
         V next[NX];
-        model_step(s->X + k * NX, s->U + k * NU, model_at(s, k), next);
+        model_step(s->X + k * NX, s->U + k * NU, model_at(s, k), s->of->shared, next);
         for (int i = 0; i < NX; i++) gap[k * NX + i] = next[i] - s->X[(k + 1) * NX + i];
     }
 }
@@ -113,7 +113,7 @@ static void linear_step(Lanes *s, const V *gap) {
     for (int64_t k = 0; k < s->of->N; k++) {
         V *x = s->X + k * NX, *u = s->U + k * NU;
         const V *G = s->G + k * NU * NZ;
-        tgco_jacobian(x, u, model_at(s, k), f);
+        tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         tgco_gather(one, f, F);
         memcpy(z, dx, sizeof dx);
         for (int j = 0; j < NU; j++) {

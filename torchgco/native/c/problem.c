@@ -6,7 +6,8 @@
        tgco_step, tgco_jacobian                         the model
        tgco_gather(P, f, T), tgco_product(f, T, Q)      T = P F and Q = F' T (upper triangle) for its sparse F = [fx fu]
        tgco_pull_back(p, f, g)                          g = F' p
-       tgco_rows(i, x, u, p, c), tgco_add_rows(i, ...)  traced constraints, with a knot's own numbers p */
+       tgco_rows(i, x, u, p, w, c), tgco_add_rows(i, ...)  traced constraints, with a knot's own numbers p, and w that
+                                                        all problems share */
 
 #include <stdlib.h>
 #include <string.h>

@@ -29,6 +29,10 @@ class CostSource:
     last: KnotSource
 
     @property
+    def parts(self) -> tuple[KnotSource, KnotSource]:
+        return self.stage, self.last
+
+    @property
     def code(self) -> str:
         return f"{self.stage.code}\n{self.last.code}"
 
@@ -65,12 +69,15 @@ def trace_cost(problem: Problem) -> CostSource:
     )
 
 
-def cost_arrays(problem: Problem, source: CostSource) -> list[Array]:
-    """The arrays of traced.c: factor and shift (B, 1, 2), and the numbers (B|1, K|1, count) of stages and last knot."""
+def cost_arrays(problem: Problem, source: CostSource, shared: tuple[Tensor, Tensor]) -> list[Array]:
+    """The arrays of traced.c: factor and shift (B, 1, 2), and the numbers (B|1, K|1, count) of stages and last knot.
+
+    `shared` are the numbers that all problems share, of stages and last knot.
+    """
     cost, factor, shift = unscaled(problem)
     own = own_tensors(cost)
-    stage = source.stage.numbers(problem.B, own, lambda: spans_of_cost(problem)[0])
-    last = source.last.numbers(problem.B, own, lambda: spans_of_cost(problem)[1])
+    stage = source.stage.numbers(problem.B, own, shared[0], lambda: spans_of_cost(problem)[0])
+    last = source.last.numbers(problem.B, own, shared[1], lambda: spans_of_cost(problem)[1])
     scale = torch.stack((factor, shift), dim=-1).unsqueeze(1)
     numbers = {TracedCost.FACTOR: scale, TracedCost.STAGE: stage, TracedCost.LAST: last}
     arrays = [array(numbers[which], knots=True) for which in TracedCost]
@@ -125,7 +132,7 @@ def _named(method: str, cost: Cost) -> str:
 def _code(name: str, own: int | None, knot: Knot, _: str) -> str:
     import casadi as ca
 
-    inputs, value = [knot.x, knot.u, knot.numbers], knot.rows[0]
+    inputs, value = knot.inputs, knot.rows[0]
     gradient, hessian = _derivatives(knot) if own is None else _blocks(knot, own)
     size = knot.x.numel() + knot.u.numel()
     slopes = [(i, gradient[i]) for i in range(size) if not gradient[i].is_zero()]
@@ -136,8 +143,8 @@ def _code(name: str, own: int | None, knot: Knot, _: str) -> str:
     column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *entries)))
     return "\n".join(
         [
-            emit.emit(f"tgco_{name}_value", ca.Function("value", inputs, [ca.densify(value)])),
-            emit.emit(f"tgco_{name}_entries", ca.Function("entries", inputs, [column])),
+            emit.emit(f"tgco_{name}_value", ca.Function("value", inputs, [ca.densify(value)]), emit.SHARED),
+            emit.emit(f"tgco_{name}_entries", ca.Function("entries", inputs, [column]), emit.SHARED),
             f"static const int tgco_{name}_places[] = {{{', '.join(map(str, places or [0]))}}};",
             f"#define {name.upper()}_SLOPES {len(slopes)}",
             f"#define {name.upper()}_ENTRIES {len(entries)}",

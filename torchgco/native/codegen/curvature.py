@@ -7,7 +7,7 @@ from typing import Any
 
 from torchgco.native import store
 from torchgco.native.codegen import emit
-from torchgco.native.codegen.dynamics import DynamicsSource, elements, makers
+from torchgco.native.codegen.dynamics import DynamicsSource, makers, stepped
 from torchgco.native.codegen.knot import Knot, KnotSource, knot_source
 from torchgco.native.codegen.stages import StagesSource
 
@@ -27,7 +27,7 @@ def curvature_code(model: DynamicsSource, functions: Iterable[tuple[int, KnotSou
 
 
 def _model_code(model: DynamicsSource) -> str:
-    """`tgco_curve(x, u, p, y, H)`: H += sum_i y_i times the second derivatives of state i, upper triangle."""
+    """`tgco_curve(x, u, p, w, y, H)`: H += sum_i y_i times the second derivatives of state i, upper triangle."""
 
     if isinstance(model, StagesSource):
         return knot_source("curvature", model.stage.span, _stage_code, __file__).code
@@ -35,11 +35,9 @@ def _model_code(model: DynamicsSource) -> str:
     def make(_: str) -> dict[str, Any]:
         import casadi as ca
 
-        x, u = ca.SX.sym("x", model.n), ca.SX.sym("u", model.m)
-        p, y = ca.SX.sym("p", model.traced.count), ca.SX.sym("y", model.n)
-        ahead = model.traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
-        total = ca.dot(y, ca.densify(ca.vertcat(*ahead)))
-        return {"code": _curves("tgco_curve", [x, u, p, y], total, ca.vertcat(x, u))}
+        inputs, ahead = stepped(model.traced, model.n, model.m)
+        y = ca.SX.sym("y", model.n)
+        return {"code": _curves("tgco_curve", [*inputs, y], ca.dot(y, ahead), ca.vertcat(*inputs[:2]))}
 
     key = "curvature", model.key, *makers(__file__)
     return store.made(key, make, f"curvature {model.traced.kin}").content["code"]
@@ -49,14 +47,14 @@ def _stage_code(knot: Knot, _: str) -> str:
     import casadi as ca
 
     y = ca.SX.sym("y", knot.rows.numel())
-    return _curves("tgco_curve", [knot.x, knot.u, knot.numbers, y], ca.dot(y, knot.rows), ca.vertcat(knot.x, knot.u))
+    return _curves("tgco_curve", [*knot.inputs, y], ca.dot(y, knot.rows), ca.vertcat(knot.x, knot.u))
 
 
 def _rows_code(knot: Knot, name: str) -> str:
     """`tgco_NAME_model` and `tgco_NAME_along` of a traced constraint, as interior_rows.c describes them."""
     import casadi as ca
 
-    z, inputs = ca.vertcat(knot.x, knot.u), [knot.x, knot.u, knot.numbers]
+    z, inputs = ca.vertcat(knot.x, knot.u), knot.inputs
     slopes = ca.sparsify(ca.jacobian(knot.rows, z, {"allow_reverse": False}))
     rows, columns = slopes.sparsity().get_triplet()
     nonzeros: list[Any] = slopes.nonzeros()
@@ -64,11 +62,13 @@ def _rows_code(knot: Knot, name: str) -> str:
     lam = ca.SX.sym("lam", knot.rows.numel())
     lines = [
         _curves(f"tgco_{name}_bend", [*inputs, lam], ca.dot(lam, knot.rows), z),
-        emit.emit(f"tgco_{name}_slants", ca.Function("slants", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)])),
-        f"static inline void tgco_{name}_model(const V *x, const V *u, const V *p, const V *by, const V *cc,",
-        "    const V *lam, V *const *g, V *H) {",
+        emit.emit(
+            f"tgco_{name}_slants", ca.Function("slants", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)]), emit.SHARED
+        ),
+        f"static inline void tgco_{name}_model(const V *x, const V *u, const V *p, const double *w, const V *by,",
+        "    const V *cc, const V *lam, V *const *g, V *H) {",
         f"    V e[{max(1, len(rows))}];",
-        f"    tgco_{name}_slants(x, u, p, e);",
+        f"    tgco_{name}_slants(x, u, p, w, e);",
     ]
     for row, column, i in places:
         lines.append(f"    for (int a = 0; a < PARTS; a++) g[a][{column}] += e[{i}] * by[a * MAX_ROWS + {row}];")
@@ -76,11 +76,12 @@ def _rows_code(knot: Knot, name: str) -> str:
             if other == row and later >= column:
                 lines.append(f"    H[{column} * (NX + NU) + {later}] += e[{i}] * cc[{row}] * e[{j}];")
     lines += [
-        f"    tgco_{name}_bend(x, u, p, lam, H);",
+        f"    tgco_{name}_bend(x, u, p, w, lam, H);",
         "}",
-        f"static inline void tgco_{name}_along(const V *x, const V *u, const V *p, const V *z, V *out) {{",
+        f"static inline void tgco_{name}_along(",
+        "    const V *x, const V *u, const V *p, const double *w, const V *z, V *out) {",
         f"    V e[{max(1, len(rows))}];",
-        f"    tgco_{name}_slants(x, u, p, e);",
+        f"    tgco_{name}_slants(x, u, p, w, e);",
         f"    for (int j = 0; j < {knot.rows.numel()}; j++) out[j] = SET(0.0);",
         *(f"    out[{row}] += e[{i}] * z[{column}];" for row, column, i in places),
         "}",
@@ -98,10 +99,10 @@ def _curves(name: str, inputs: list[Any], total: Any, z: Any) -> str:
     rows, columns = hessian.sparsity().get_triplet()
     upper = [(i, j, entry) for i, j, entry in zip(rows, columns, found, strict=True) if j >= i]
     column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *(entry for *_, entry in upper))))
-    arguments = ", ".join(f"const V *in{i}" for i in range(len(inputs)))
+    arguments = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
     passed = ", ".join(f"in{i}" for i in range(len(inputs)))
     lines = [
-        emit.emit(f"{name}_entries", ca.Function("entries", inputs, [column])),
+        emit.emit(f"{name}_entries", ca.Function("entries", inputs, [column]), emit.SHARED),
         f"__attribute__((noinline)) static void {name}({arguments}, V *H) {{",
         f"    V e[{max(1, len(upper))}];",
         f"    {name}_entries({passed}, e);",
@@ -178,14 +179,15 @@ def _switches(rows: Iterable[tuple[int, KnotSource]]) -> str:
     """`tgco_model_rows` and `tgco_along_rows`, which call the functions of a constraint by its place."""
     models, alongs = [], []
     for i, source in rows:
-        models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, by, cc, lam, g, H); break;")
-        alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, z, out); break;")
+        models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, w, by, cc, lam, g, H); break;")
+        alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, w, z, out); break;")
     return "\n".join(
         [
-            "static inline void tgco_model_rows(int i, const V *x, const V *u, const V *p, const V *by, const V *cc,",
-            "    const V *lam, V *const *g, V *H) {",
+            "static inline void tgco_model_rows(int i, const V *x, const V *u, const V *p, const double *w,",
+            "    const V *by, const V *cc, const V *lam, V *const *g, V *H) {",
             "    switch (i) {", *models, "    }", "}",
-            "static inline void tgco_along_rows(int i, const V *x, const V *u, const V *p, const V *z, V *out) {",
+            "static inline void tgco_along_rows(",
+            "    int i, const V *x, const V *u, const V *p, const double *w, const V *z, V *out) {",
             "    switch (i) {", *alongs, "    }", "}",
         ]
     )  # fmt: skip

@@ -24,11 +24,12 @@ STEP, JACOBIAN = "tgco_step", "tgco_jacobian"
 
 @dataclass(frozen=True)
 class DynamicsSource:
-    """A model in C, for the prelude of `emit`, with x (n), u (m), and a problem's own numbers p (count) in vectors V:
+    """A model in C, for the prelude of `emit`, with x (n), u (m), and a problem's own numbers p (count) in vectors V,
+    and the numbers w that all problems share:
 
         static inline void tgco_step(const V *restrict x, const V *restrict u, const V *restrict p,
-                                     V *restrict x_next)       n
-        static inline void tgco_jacobian(the same three, V *restrict entries)      computed
+                                     const double *restrict w, V *restrict x_next)       n
+        static inline void tgco_jacobian(the same four, V *restrict entries)      computed
 
     No output may overlap an input. [fx, fu] (n, n+m) is zero except at `rows`, `columns`, listed column by column.
     Nonzero i is `values[i]` where `places[i]` is -1, else `entries[places[i]]`.
@@ -51,8 +52,10 @@ class DynamicsSource:
         """Number of the Jacobian's entries that `tgco_jacobian` writes."""
         return sum(place >= 0 for place in self.places)
 
-    def numbers(self, B: int, of: Dynamics) -> Tensor:
-        """The own numbers (B|1, K|1, count) of B problems with the model `of`, with an axis of stages."""
+    def numbers(self, B: int, of: Dynamics, shared: Tensor) -> Tensor:
+        """The own numbers (B|1, K|1, count) of B problems with the model `of`, with an axis of stages; `shared` are
+        the numbers that all problems share, of which some may be a stage's own.
+        """
         return self.parameters(torch.arange(B), of).unsqueeze(1)
 
     def parameters(self, index: Tensor, of: Dynamics | None = None) -> Tensor:
@@ -75,8 +78,8 @@ def trace_dynamics(
 ) -> DynamicsSource:
     """The C of `dynamics.step`, taken from the cache folder if it was made before.
 
-    Tensors in `per_element` and `batched` are numbers of each problem; all others, including those that a function
-    closes over, become constants in the code.
+    Tensors in `per_element` and `batched` are numbers of each problem. All others, including those that a function
+    closes over, are numbers that all problems share, or constants in the code: see `Traced`.
 
     Args:
         dynamics: of the whole batch.
@@ -99,19 +102,27 @@ def trace_dynamics(
 
 def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
     """The parts of a DynamicsSource that take CasADi to make."""
+    inputs, ahead = stepped(traced, n, m)
+    return step_parts(inputs, ahead)
+
+
+def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any]:
+    """CasADi's columns x (n), u (m), p and w, and the step (n) that a trace makes of them."""
     import casadi as ca
 
-    x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", traced.count)
-    ahead = traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
-    return step_parts(x, u, p, ca.densify(ca.vertcat(*ahead)))
+    x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+    p, w = ca.SX.sym("p", traced.count), ca.SX.sym("w", len(traced.pattern))
+    shared = np.where(np.isnan(traced.pattern), elements(w), traced.pattern)
+    ahead = traced(elements(p), elements(x)[None], elements(u)[None], shared=shared).reshape(-1)
+    return [x, u, p, w], ca.densify(ca.vertcat(*ahead))
 
 
-def step_parts(x: Any, u: Any, p: Any, ahead: Any) -> dict[str, Any]:
-    """The code of a step `ahead` (n) of x, u and the numbers p, CasADi's columns, and the lists of a DynamicsSource."""
+def step_parts(inputs: Sequence[Any], ahead: Any) -> dict[str, Any]:
+    """The code of a step `ahead` (n) of inputs x, u, p, w, CasADi's columns, and the lists of a DynamicsSource."""
     import casadi as ca
 
     # Forward mode only, as `torch.func.jvp`: reverse mode would let a NaN of the branch not taken through as 0 * NaN.
-    jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(x, u), {"allow_reverse": False}))
+    jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(*inputs[:2]), {"allow_reverse": False}))
     step, jacobian = ca.cse([ahead, jacobian])
     rows, columns = jacobian.sparsity().get_triplet()
     entries: list[Any] = jacobian.nonzeros()
@@ -119,7 +130,7 @@ def step_parts(x: Any, u: Any, p: Any, ahead: Any) -> dict[str, Any]:
     places = np.where(fixed, -1, np.cumsum(np.logical_not(fixed)) - 1)
     changing = ca.vertcat(ca.SX(0, 1), *(entry for entry, is_fixed in zip(entries, fixed, strict=True) if not is_fixed))
     code = [
-        emit.emit(name, ca.Function(name, [x, u, p], [ca.densify(result)]))
+        emit.emit(name, ca.Function(name, inputs, [ca.densify(result)]), emit.SHARED)
         for name, result in ((STEP, step), (JACOBIAN, changing))
     ]
     return {

@@ -23,7 +23,10 @@ _OF_ONE = (
 _OF_TWO = ("pow", "fmod", "atan2", "hypot", "copysign")
 
 
-def emit(name: str, function: ca.Function) -> str:
+SHARED = 3  # of the functions of a model, a cost, a constraint: the input with the numbers that all problems share
+
+
+def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
     """`static inline void NAME(const V *restrict in0, ..., V *restrict out0, ...)`, as straight-line code.
 
     An input is an array of its entries, an output one of its nonzeros in the order of its sparsity; outputs overlap
@@ -33,22 +36,28 @@ def emit(name: str, function: ca.Function) -> str:
     Args:
         name: of the C function.
         function: of scalar expressions (SX).
+        shared: the place of an input that is the same in all lanes, `const double *restrict`; None: there is none.
 
     Raises:
         ValueError: `function` isn't an SX function, or holds an operation without a counterpart in C.
     """
     if not function.is_a("SXFunction"):
         raise ValueError(f"{name}: expected a CasADi function of scalar expressions, got {function.class_name()}")
-    arguments = [f"const V *restrict in{i}" for i in range(function.n_in())]
+    arguments = [f"{input_type(i, shared)} in{i}" for i in range(function.n_in())]
     arguments += [f"V *restrict out{i}" for i in range(function.n_out())]
-    lines = [_statement(function, k) for k in range(function.n_instructions())]
+    lines = [_statement(function, k, shared) for k in range(function.n_instructions())]
     work = ", ".join(f"w{i}" for i in range(function.sz_w()))
     declared = [f"V {work};"] if work else []
     body = "\n".join(f"    {line}" for line in (*declared, *lines))
     return f"static inline void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"
 
 
-def _statement(function: ca.Function, k: int) -> str:
+def input_type(i: int, shared: int | None = SHARED) -> str:
+    """The type of input i, a pointer's up to the name."""
+    return "const double *restrict" if i == shared else "const V *restrict"
+
+
+def _statement(function: ca.Function, k: int, shared: int | None) -> str:
     """One instruction; w are places of the work vector, each used for several values in turn."""
     at, operation = _codes(), function.instruction_id(k)
     read, written = function.instruction_input(k), function.instruction_output(k)
@@ -56,6 +65,7 @@ def _statement(function: ca.Function, k: int) -> str:
         return f"out{written[0]}[{written[1]}] = w{read[0]};"
     if operation == at["INPUT"]:
         value = f"in{read[0]}[{read[1]}]"
+        value = f"SET({value})" if read[0] == shared else value
     elif operation == at["CONST"]:
         value = f"SET({literal(function.instruction_constant(k))})"
     elif operation in _templates():

@@ -40,19 +40,26 @@ class Span:
 
 @dataclass(frozen=True)
 class Knot:
-    """CasADi expressions: rows (p) of x (n), u (m) and a knot's numbers (count)."""
+    """CasADi expressions: rows (p) of x (n), u (m), a knot's numbers (count), and the numbers that all share."""
 
     x: Any
     u: Any
     numbers: Any
+    shared: Any
     rows: Any
+
+    @property
+    def inputs(self) -> list[Any]:
+        """Of the functions that are made of it, in order."""
+        return [self.x, self.u, self.numbers, self.shared]
 
 
 @dataclass(frozen=True)
 class KnotSource:
     """C of one knot's rows (size), and where its numbers come from.
 
-    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span`.
+    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span` and
+    the numbers that all problems share.
     """
 
     code: str
@@ -62,29 +69,29 @@ class KnotSource:
     span: Span = field(repr=False, compare=False)
 
     @cached_property
-    def shared(self) -> Tensor | None:
-        """The numbers (1, K|1, count) where none differs from problem to problem."""
-        fixed = torch.from_numpy(self.span.traced.constants)
-        at = self.places - self.span.traced.count
-        return None if bool((at < 0).any()) else fixed[at].unsqueeze(0)
+    def _is_own(self) -> bool:
+        """Whether some of the numbers differ from problem to problem."""
+        return bool((self.places < self.span.traced.count).any())
 
-    def numbers(self, B: int, own: Sequence[Tensor], again: Callable[[], Span]) -> Tensor:
+    def numbers(self, B: int, own: Sequence[Tensor], shared: Tensor, again: Callable[[], Span]) -> Tensor:
         """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `own`.
 
         Args:
+            shared: `Traced.shared_numbers`.
             again: traces these problems, where a new trace is needed.
 
         Raises:
             InputError: the problems have another function.
         """
-        if self.shared is not None:
-            return self.shared
+        fixed = torch.cat((torch.from_numpy(self.span.traced.constants), shared))
+        if not self._is_own:
+            return fixed[self.places - self.span.traced.count].unsqueeze(0)
         traced = self.span.traced.rebound(self.span.own, own, B)
         if traced is None:
             traced = again().traced
             if traced.fingerprint() != self.span.traced.fingerprint():
                 raise InputError(traced.field, "the same operations for all subsets of a batch", "others")
-        count, fixed = traced.count, torch.from_numpy(traced.constants)
+        count, fixed = traced.count, torch.cat((torch.from_numpy(traced.constants), shared))
         each = traced.parameters_of(torch.arange(B))[:, self.places.clamp(max=count - 1)]
         return torch.where(self.places < count, each, torch.cat((fixed.new_zeros(count), fixed))[self.places])
 
@@ -112,7 +119,7 @@ def knot_parts(
         import casadi as ca
 
         knot, places = _one_knot(span)
-        function = ca.Function("knot", [knot.x, knot.u, knot.numbers], [knot.rows])
+        function = ca.Function("knot", knot.inputs, [knot.rows])
         name = store.key_of((kind, str((span.n, span.m, *_form(function))), *makers(__file__, *files)))[:16]
         return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "places": places}
 
@@ -127,16 +134,18 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
     import casadi as ca
 
     traced, count = span.traced, span.traced.count
-    constants = traced.constants
+    constants, pattern = traced.constants, traced.pattern
+    first_shared = count + len(constants)
     X, U = ca.SX.sym("X", span.states * span.n), ca.SX.sym("U", span.controls * span.m)
-    # Constants are symbols until it is known which ones differ: a 0 or 1 among them would change its knot's form.
-    numbers = ca.SX.sym("p", count + len(constants))
+    # All are symbols until it is known which ones differ: a 0 or 1 among them would change its knot's form.
+    numbers = ca.SX.sym("p", first_shared + len(pattern))
     each = elements(numbers)
     found = traced(
         each[:count],
         elements(X).reshape(1, span.states, span.n),
         elements(U).reshape(1, span.controls, span.m),
-        constants=each[count:],
+        constants=each[count:first_shared],
+        shared=each[first_shared:],
     ).reshape(len(span.knots), -1)
     x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
     functions, places, forms, first = [], [], {}, None
@@ -158,13 +167,14 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
             raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
     differ = [len(set(column)) > 1 for column in zip(*places, strict=True)]
     own = [i for i, place in enumerate(places[0]) if place < count or differ[i]]
-    p = ca.SX.sym("p", len(own))
+    p, w = ca.SX.sym("p", len(own)), ca.SX.sym("w", len(pattern))
     values: list[Any] = [0.0] * count + constants.tolist()
+    values += [w[i] if np.isnan(value) else value for i, value in enumerate(pattern.tolist())]
     for i, place in enumerate(own):
         values[places[0][place]] = p[i]
     rows = functions[0](x, u, ca.vertcat(ca.SX(0, 1), *values))
     chosen = [[used[i] for i in own] for used in (places if any(differ) else places[:1])]
-    return Knot(x, u, p, rows), chosen
+    return Knot(x, u, p, w, rows), chosen
 
 
 def _form(function: Any) -> tuple[list[tuple], list[int]]:
