@@ -5,8 +5,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from copy import copy
 from itertools import pairwise
 from typing import Any
 
@@ -38,6 +39,7 @@ from torchgco.native.shared import Shared, read
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
+from torchgco.tracing import Traced
 
 PACKED = "packed"  # marks the constraints that were packed last, among what a form keeps
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
@@ -76,8 +78,27 @@ class Engine:
         self.form = Form(self.model, at, self.cost, dense, functions, BoundBoxes in kinds, BoundField in kinds)
         if ahead is not None:
             ahead(self)
+        self._libraries: dict[Hashable, ctypes.CDLL] = {}
         if compiles:
             self.library = load(self.form.source(), STRUCTURES)
+
+    @property
+    def traces(self) -> list[Traced]:
+        """The functions that the library computes."""
+        cost = () if self.cost is None else (part.span.traced for part in self.cost.parts)
+        return [self.model.traced, *cost, *(rows.span.traced for rows in self.functions.values())]
+
+    def further(self, name: Hashable, source: Callable[[], str]) -> ctypes.CDLL:
+        """A further library of this form, which this engine and those with other shared numbers keep."""
+        if name not in self._libraries:
+            self._libraries[name] = load(source(), STRUCTURES)
+        return self._libraries[name]
+
+    def with_shared(self, shared: Shared) -> Engine:
+        """The same functions with other shared numbers, such as `read` gives."""
+        other = copy(self)
+        other.shared = shared
+        return other
 
     def read(self) -> Shared | None:
         """The numbers that all problems share, as they are now; None where a function is to be traced again."""

@@ -20,7 +20,7 @@ from torchgco.tracing.arrays import NoCounterpart, boxed
 from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
-from torchgco.tracing.recorder import Operation, Recording, Slot, name_of, record, replay_all
+from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
@@ -41,6 +41,11 @@ class Traced:
         own: tensors, objects that nothing else holds (`base.tree.apart`), that are treated as one problem's own even
             where all problems of the batch share them: the expressions, and with them the last bits, then don't depend
             on the other problems of the batch.
+
+    Attributes:
+        looked: whether Python code of the function has read values of tensors, which it may branch on.
+        outside: the tensors that it has read, other than its arguments and `own`.
+        pattern: see `shared_numbers`.
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
@@ -74,7 +79,8 @@ class Traced:
         named = [slot for slot, tensor in self._captured.items() if id(tensor) in own_ids]
         varying = _followers(self._plain, [self._index, *named])
         self._own = [slot for slot in border if slot in varying]
-        outer = [slot for slot in _outer(recording) if slot not in named]
+        outer = [slot for slot in recording.outside if slot not in named]
+        self.looked, self.outside = recording.looked, [self._captured[slot] for slot in outer]
         read = [slot for slot in outer if slot.dtype.is_floating_point]
         reached = _followers(self._plain, read) - varying
         self._shared = [slot for slot in border if slot in reached and slot.dtype.is_floating_point]
@@ -239,14 +245,6 @@ def own_tensors(part: PerElement) -> list[Tensor]:
             elif isinstance(leaf, Tensor):
                 found.append(leaf)
     return found
-
-
-def _outer(recording: Recording) -> list[Slot]:
-    """The tensors that a function reads from outside: not those that it makes of Python's numbers itself."""
-    made = {slot for one in recording.operations if name_of(one.function) == "aten.lift_fresh" for slot in one.inputs}
-    # A tensor made of numbers has memory of its own; that of a NumPy array can't be resized.
-    captured = recording.captured.items()
-    return [slot for slot, tensor in captured if slot not in made or not tensor.untyped_storage().resizable()]
 
 
 def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
