@@ -254,7 +254,7 @@ def test_problems_of_every_form(form: str) -> None:
 def test_what_a_function_captures_is_read_at_each_call() -> None:
     wind, limit = torch.tensor([0.1, 0.0], dtype=D), np.array([0.8])
     weight, gain = torch.nn.Parameter(torch.zeros(1, dtype=D)), [1.0]
-    field = lambda x, u: torch.stack((x[..., 1], gain[0] * u[..., 0] + wind[0] + wind[1] * x[..., 1]), -1)
+    field = lambda x, u, load: torch.stack((x[..., 1], gain[0] * u[..., 0] + wind[0] / load + wind[1] * x[..., 1]), -1)
     table = torch.linspace(0.0, 1.0, N, dtype=D)
     cost = FunctionCost(
         lambda x, u, k: (x[..., 0] - table[k]).square() + 0.1 * u.square().sum(-1) + (weight[0] * x[..., 1]).square(),
@@ -262,7 +262,7 @@ def test_what_a_function_captures_is_read_at_each_call() -> None:
     )
     slow = FunctionConstraint(lambda x: x[..., 1:] - torch.from_numpy(limit))
     make = lambda: Problem(
-        FunctionDynamics(field, 2, 1, DT, "rk4"), cost, [ControlBounds(-2.0, 2.0), slow],
+        FunctionDynamics(field, 2, 1, DT, "rk4", values={"load": [1.5]}), cost, [ControlBounds(-2.0, 2.0), slow],
         torch.zeros(1, 2, dtype=D), N,
     )  # fmt: skip
     mpc = torchgco.compile(make(), "interior_point", tolerance=1e-10)

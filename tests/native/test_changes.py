@@ -572,7 +572,7 @@ def after(problem: Problem) -> tuple[Tensor, bool]:
     engine = engine_of(fresh)
     assert engine is not None
     found = engine.open_loop(fresh, U)
-    return found, any(engine.traces[0] is kept.traces[0] for kept, _ in dispatch._engines.values())
+    return found, any(engine.captured is kept.captured for kept, _ in dispatch._engines.values())
 
 
 def made(drag: Drag) -> Problem:

@@ -184,7 +184,7 @@ def test_captured_values_are_those_of_the_solve(place: str, kind: str) -> None:
 
 def test_kernels_are_those_of_the_same_computation_only() -> None:
     first, again = engine_of(BASE.renewed()), engine_of(BASE.renewed())
-    assert first is not None and again is not None and first.traces[0] is again.traces[0]
+    assert first is not None and again is not None and first.captured is again.captured
     planar = Problem(Planar(drag=torch.tensor([1.0, 2.0], dtype=D)), QuadraticCost([1] * 6, [1, 1], [1] * 6), [],
                      torch.zeros(2, 6, dtype=D), N)  # fmt: skip
     other = planar.started_at(planar.x0 + 1, (), dynamics=Planar(drag=torch.tensor([5.0, 7.0], dtype=D)))

@@ -241,9 +241,9 @@ class Compiled:
         """
         if self._kept is None:
             return None  # PyTorch's kernels call the functions themselves
-        then, now = self._kept.engine, Engine(self._now().renewed(), compiles=False)
-        read = then.read()
-        if read is None or (then.form.source() == now.form.source() and read.is_same(now.shared)):
+        problem, then = self._now().renewed(), self._kept.engine
+        read, now = then.captured.read(), Engine(problem, compiles=False)
+        if read is None or then.with_shared(read).computes_as(now, problem):  # None: a call compiles again by itself
             return None
         return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
 
@@ -278,7 +278,13 @@ class Compiled:
                 kept.refresh_constraint(part)
         self._changed.clear()
         kept.start()
-        if not kept.refresh_shared():
+        if kept.is_outdated:
+            self._refresh_captured(kept)
+
+    @_plainly()
+    def _refresh_captured(self, kept: Kept) -> None:
+        """Have C read what functions capture as it is now."""
+        if not kept.refresh_captured():
             self._pack(self._now().renewed())
 
     def _now(self) -> Problem:

@@ -97,16 +97,16 @@ def _engine(problem: Problem) -> Engine:
         return Engine(problem, ahead)
     key = before.key, find_compiler()
     known = _engines.pop(key, None)
-    if known is not None and (shared := known[0].read()) is not None:
+    if known is not None and (shared := known[0].captured.read()) is not None:
         _engines[key] = known  # the most recent one is the last
-        return known[0].with_shared(shared)
+        return known[0].with_shared(shared.copy())
     engine, after = Engine(problem, ahead), signature(problem)
     # Code that has changed what it reads, a counter for instance, does so at every solve.
-    if after is not None and after.key == before.key and after.covers(engine.traces):
+    if after is not None and after.key == before.key and after.covers(engine.captured.traces):
         _engines[key] = engine, after.facts
         if len(_engines) > KEPT:
             del _engines[next(iter(_engines))]
-    return engine
+    return engine.with_shared(engine.shared.copy())  # a compiled problem writes into it
 
 
 _engines: dict[Hashable, tuple[Engine, Facts]] = {}  # the facts hold what their key names by identity

@@ -35,11 +35,10 @@ from torchgco.native.packing import (
     quadratic_arrays,
     shared_fields,
 )
-from torchgco.native.shared import Shared, read
+from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
-from torchgco.tracing import Traced
 
 PACKED = "packed"  # marks the constraints that were packed last, among what a form keeps
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
@@ -74,6 +73,7 @@ class Engine:
         kinds = {type(constraint) for constraint in problem.constraints}
         self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
+        self.captured = Captured(self.model, self.cost, self.functions)
         self.shared = self._first_shared()
         self.form = Form(self.model, at, self.cost, dense, functions, BoundBoxes in kinds, BoundField in kinds)
         if ahead is not None:
@@ -82,12 +82,6 @@ class Engine:
         if compiles:
             self.library = load(self.form.source(), STRUCTURES)
 
-    @property
-    def traces(self) -> list[Traced]:
-        """The functions that the library computes."""
-        cost = () if self.cost is None else (part.span.traced for part in self.cost.parts)
-        return [self.model.traced, *cost, *(rows.span.traced for rows in self.functions.values())]
-
     def further(self, name: Hashable, source: Callable[[], str]) -> ctypes.CDLL:
         """A further library of this form, which this engine and those with other shared numbers keep."""
         if name not in self._libraries:
@@ -95,20 +89,30 @@ class Engine:
         return self._libraries[name]
 
     def with_shared(self, shared: Shared) -> Engine:
-        """The same functions with other shared numbers, such as `read` gives."""
+        """The same functions with other shared numbers, such as `captured.read` gives."""
         other = copy(self)
         other.shared = shared
         return other
 
-    def read(self) -> Shared | None:
-        """The numbers that all problems share, as they are now; None where a function is to be traced again."""
-        return read(self.model, self.cost, self.functions)
-
     def _first_shared(self) -> Shared:
-        found = self.read()
+        found = self.captured.read()
         if found is None:  # changed since the functions were traced, by another thread
             raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
         return found
+
+    def computes_as(self, other: Engine, problem: Problem) -> bool:
+        """Whether another engine computes the same for `problem`."""
+        if self.form.source() != other.form.source() or not self.shared.is_same(other.shared):
+            return False
+        return all(map(torch.equal, self._numbers(problem), other._numbers(problem)))
+
+    def _numbers(self, problem: Problem) -> list[Tensor]:
+        """What the functions read of problems."""
+        found = [self.model.numbers(problem.B, problem.dynamics, self.shared.model)]
+        if self.cost is not None:
+            found += (part for array in cost_arrays(problem, self.cost, self.shared.cost) for part in array.kept)
+        functions = self.functions.items()
+        return found + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X (B, N+1, n) from U (B, N, m)."""

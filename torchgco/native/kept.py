@@ -18,6 +18,7 @@ from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import run
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.packing import constraint_of, quadratic_arrays, shared_fields
+from torchgco.native.shared import Shared
 from torchgco.problem.problem import Problem
 
 
@@ -34,6 +35,7 @@ class Kept:
     def __init__(self, kernels: InteriorEngine, problem: Problem, **options: Any) -> None:
         B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
         self.engine, self.problem = kernels.engine, problem
+        self._read: Shared | None = None  # what functions have captured, when C was last given it
         self.library, self.lanes = kernels.for_few(B)
         self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
         self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
@@ -115,17 +117,24 @@ class Kept:
         for part, at in zip(self._moving, self._later[by], strict=True):
             part[:] = part[:, at]
 
-    def refresh_shared(self) -> bool:
-        """Read the numbers that all problems share again; whether the library computes with them as they are now."""
-        engine = self.engine
-        new = engine.read()
-        if new is not None and engine.shared.take_over(new):
-            # Some of them may be a knot's own.
-            for i in engine.functions:
-                self.refresh_constraint(i)
-            self.refresh_cost()
-            self.refresh_model()
-        return new is not None
+    @property
+    def is_outdated(self) -> bool:
+        """Whether tensors that functions capture may have other numbers than C."""
+        captured = self.engine.captured
+        return captured.is_mixed or not captured.is_still(self._read)
+
+    def refresh_captured(self) -> bool:
+        """Read what functions capture again; whether the library computes with it as it is now."""
+        self._read = self.engine.captured.read()
+        if self._read is None:
+            return False
+        self.engine.shared.take_over(self._read)
+        # Some of these numbers may be a knot's own, and problems' own ones computed from what was captured.
+        for i in self.engine.functions:
+            self.refresh_constraint(i)
+        self.refresh_cost()
+        self.refresh_model()
+        return True
 
     def refresh_constraint(self, i: int) -> None:
         """Read the numbers of constraint i again, after its tensors have changed."""

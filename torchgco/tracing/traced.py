@@ -46,6 +46,7 @@ class Traced:
         looked: whether Python code of the function has read values of tensors, which it may branch on.
         outside: the tensors that it has read, other than its arguments and `own`.
         pattern: see `shared_numbers`.
+        is_mixed: whether numbers that differ between problems depend on `outside` tensors, too.
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
@@ -92,6 +93,7 @@ class Traced:
         outside = _followers(self._plain, outer)
         self._fixed = {slot: computed[slot].detach().clone() for slot in others if slot in outside}
         self._again = _needed(self._plain, *self._shared, *self._fixed)
+        self.is_mixed = not outside.isdisjoint(self._own)
         learned = _followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
         self._numbers = _flat([computed[slot] for slot in self._shared])
         sizes = [computed[slot].numel() for slot in self._shared]
