@@ -87,13 +87,17 @@ def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
     compiler = find_compiler()
     known = (source, tuple(flags), compiler)
     # No lock: two threads that compile the same source do no harm, and a lock held across a fork would.
-    if known not in _loaded:
+    library = _loaded.pop(known, None)
+    if library is None:
         if compiler is None:
             raise NativeError(
                 "no C compiler found: install gcc or clang, or `pip install ziglang`, or name one in TORCHGCO_CC"
             )
-        _loaded[known] = _load(compiler, source, (*compiler.flags, *flags, *compiler.further))
-    return _loaded[known]
+        library = _load(compiler, source, (*compiler.flags, *flags, *compiler.further))
+    _loaded[known] = library  # the most recent one is the last
+    if len(_loaded) > _KEPT:
+        del _loaded[next(iter(_loaded))]
+    return library
 
 
 def begin(source: str) -> None:
@@ -119,6 +123,7 @@ class _Begun:
     process: subprocess.Popen[str]
 
 
+_KEPT = 256  # libraries with their sources, the most recent ones; what still runs keeps its own
 _loaded: dict[tuple[str, tuple[str, ...], Compiler | None], ctypes.CDLL] = {}
 _begun: dict[str, _Begun] = {}
 

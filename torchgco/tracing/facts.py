@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._device import DeviceContext
+from torch.utils._python_dispatch import _get_current_dispatch_mode_stack
 
 from torchgco.base.tree import PerElement
 
@@ -40,7 +42,7 @@ APART = "numpy.random", "torch.jit", "torch._C", "torch.hub"  # parts of them th
 ELSEWHERE = {
     "globals", "locals", "eval", "exec", "compile", "open", "input", "breakpoint", "__import__", "__builtins__",
     "__globals__", "random", "rand", "seed", "initial_seed", "load", "loadtxt", "genfromtxt", "fromfile", "from_file",
-    "memmap", "hub", "jit", "ctypes", "count", "cycle",
+    "memmap", "hub", "jit", "ctypes",
 }  # fmt: skip
 BY_NAME = {"getattr", "hasattr", "vars", "dir", "attrgetter", "methodcaller", "__dict__", "__getattribute__"}
 BESIDES = {"__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slots__", "_abc_impl"}
@@ -65,7 +67,7 @@ class Facts:
 
     def __init__(self, *roots: Any) -> None:
         self.alive: list[Any] = []
-        self._found: list[Hashable] = [str(torch.get_default_dtype()), str(torch.get_default_device())]
+        self._found: list[Hashable] = [*_surroundings()]
         self._met: dict[int, int] = {}
         self._passed: list[Any] = []  # what the walk has met: meanwhile nothing else gets these identities, either
         self._names: set[str] = set()
@@ -295,6 +297,15 @@ class Facts:
             self.walk(value)
 
 
+def _surroundings() -> tuple[Hashable, ...]:
+    """What operations of PyTorch depend on besides their arguments."""
+    modes = map(torch._C._get_function_stack_at, range(torch._C._len_torch_function_stack()))
+    if _get_current_dispatch_mode_stack() or any(type(mode) is not DeviceContext for mode in modes):
+        raise Unseen("a mode of PyTorch")
+    autocast = torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu")
+    return torch.get_default_dtype(), torch.get_default_device(), autocast
+
+
 def is_trusted(module: str | None) -> bool:
     """Whether the functions of a module compute by their arguments alone."""
     return module is not None and module.partition(".")[0] in TRUSTED and not module.startswith(APART)
@@ -319,7 +330,7 @@ def _code(code: types.CodeType) -> _Code:
             _codes.clear()
         reads, names = dict[str, None](), set(code.co_names)
         for step in dis.get_instructions(code):
-            if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            if step.opname in ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"):
                 reads[step.argval] = None
             elif step.opname == "IMPORT_NAME" and not is_trusted(step.argval):
                 names.add("__import__")

@@ -45,6 +45,7 @@ class Traced:
     Attributes:
         looked: whether Python code of the function has read values of tensors, which it may branch on.
         outside: the tensors that it has read, other than its arguments and `own`.
+        shared: the `shared_numbers` when it was traced.
         pattern: see `shared_numbers`.
         is_mixed: whether numbers that differ between problems depend on `outside` tensors, too.
 
@@ -95,9 +96,9 @@ class Traced:
         self._again = _needed(self._plain, *self._shared, *self._fixed)
         self.is_mixed = not outside.isdisjoint(self._own)
         learned = _followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
-        self._numbers = _flat([computed[slot] for slot in self._shared])
+        self.shared = _flat([computed[slot] for slot in self._shared])
         sizes = [computed[slot].numel() for slot in self._shared]
-        self.pattern = _pattern(self._numbers, np.repeat([slot in learned for slot in self._shared], sizes))
+        self.pattern = _pattern(self.shared, np.repeat([slot in learned for slot in self._shared], sizes))
         indices = {slot for one in self._symbolic if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
         self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
@@ -120,7 +121,7 @@ class Traced:
         number, an index, or the shape or type of a tensor has changed: the function is to be traced again.
         """
         if not self._shared and not self._fixed:
-            return self._numbers
+            return self.shared
         known: dict[Slot, Any] = dict(self._captured)
         shapes = self._shared_shapes.items()
         try:
@@ -214,7 +215,7 @@ class Traced:
         """
         known: dict[Slot, Any] = dict(zip(self._variables, variables, strict=True)) | self._constants
         known |= _placed(parameters, dict(zip(self._own, self._own_shapes, strict=True)))
-        known |= _placed(self._numbers.numpy().astype(object) if shared is None else shared, self._shared_shapes)
+        known |= _placed(self.shared.numpy().astype(object) if shared is None else shared, self._shared_shapes)
         if constants is not None:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
         for operation in self._symbolic:
