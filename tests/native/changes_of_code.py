@@ -337,6 +337,18 @@ def needs_gradient() -> Case:
 
 
 @is_code
+def gradient() -> Case:
+    weight = torch.nn.Parameter(number())
+    return lambda v: (LITTLE if weight.grad is None else MUCH) * v, lambda: setattr(weight, "grad", number())
+
+
+@is_code
+def version() -> Case:
+    drag = number()
+    return lambda v: float(drag._version) * v, lambda: drag.mul_(1.0)
+
+
+@is_code
 def module_of_the_users() -> Case:
     settings: Any = types.ModuleType("settings")
     sys.modules["settings"], settings.gain = settings, LITTLE

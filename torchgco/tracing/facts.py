@@ -46,6 +46,7 @@ ELSEWHERE = {
 }  # fmt: skip
 BY_NAME = {"getattr", "hasattr", "vars", "dir", "attrgetter", "methodcaller", "__dict__", "__getattribute__"}
 BESIDES = {"__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slots__", "_abc_impl"}
+HISTORY = {"grad", "_grad", "grad_fn", "is_leaf", "_version"}
 HEAP = 1 << 9  # the flag of classes that a program has made
 ABSENT = "absent"
 
@@ -72,12 +73,13 @@ class Facts:
         self._passed: list[Any] = []  # what the walk has met: meanwhile nothing else gets these identities, either
         self._names: set[str] = set()
         self._modules: list[types.ModuleType] = []
-        self._tensors: set[int] = set()
+        self._tensors: dict[int, Tensor] = {}
         self._memory: list[tuple[int, int]] = []
         try:
             for root in roots:
                 self.walk(root)
             self._walk_modules()
+            self._walk_histories()
         except (RecursionError, AttributeError, TypeError, ValueError, RuntimeError) as error:
             raise Unseen(str(error)) from error
         self.key = tuple(self._found)
@@ -135,7 +137,7 @@ class Facts:
             self.walk(thing)
 
     def _tensor(self, tensor: Tensor) -> None:
-        self._tensors.add(id(tensor))
+        self._tensors[id(tensor)] = tensor
         self.same(tensor)
         self.note(tensor.shape, tensor.stride(), tensor.dtype, tensor.device, tensor.requires_grad)
         if vars(tensor):
@@ -240,6 +242,13 @@ class Facts:
                     self.walk(vars(module)[name])
         if self._names & ELSEWHERE or (self._modules and self._names & BY_NAME):
             raise Unseen(f"one of {sorted(self._names & (ELSEWHERE | BY_NAME))}")
+
+    def _walk_histories(self) -> None:
+        """What tensors know of their past, where code may ask for it: it changes without any change of theirs."""
+        for name in sorted(HISTORY & self._names):
+            for tensor in list(self._tensors.values()):
+                value = getattr(tensor, name)
+                self.walk(value if type(value) in (bool, int, *TENSORS) else value is None)
 
     def _class(self, cls: type) -> None:
         """A class by identity, and with its code where it is a user's."""
