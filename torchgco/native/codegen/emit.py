@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import casadi as ca
 
-PRELUDE = (Path(__file__).parents[1] / "c" / "lanes.h").read_text()
+PRELUDE = "\n".join((Path(__file__).parents[1] / "c" / name).read_text() for name in ("lanes.h", "functions.h"))
 # Functions of the prelude, on each lane.
 _OF_ONE = (
     "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
