@@ -72,12 +72,17 @@ def engine_of(problem: Problem) -> Engine | None:
         except (InputError, NativeError) as error:
             problem.form["engine"] = None
             check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
-            reason = str(error).splitlines()[0]
-            warned = problem.form.setdefault(WARNED, set())
-            if reason not in warned:
-                warned.add(reason)
-                warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=4)
+            _warn(problem, error)
     return problem.form["engine"]
+
+
+def _warn(problem: Problem, error: Exception) -> None:
+    """Say once why PyTorch's kernels are used."""
+    reason = str(error).splitlines()[0]
+    warned = problem.form.setdefault(WARNED, set())
+    if reason not in warned:
+        warned.add(reason)
+        warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=5)
 
 
 def kernels_of(problem: Problem) -> str:
@@ -142,11 +147,14 @@ def interior_of(problem: Problem) -> InteriorKernels:
         InputError: rows that join knots.
     """
     engine = engine_of(problem)
-    if engine is None:
-        if EAGER_INTERIOR not in problem.form:
-            problem.form[EAGER_INTERIOR] = EagerInterior.of(problem)
-        return problem.form[EAGER_INTERIOR]
-    return InteriorEngine(engine)
+    if engine is not None:
+        try:
+            return InteriorEngine(engine)
+        except InputError as error:  # second derivatives whose code would be too long
+            _warn(problem, error)
+    if EAGER_INTERIOR not in problem.form:
+        problem.form[EAGER_INTERIOR] = EagerInterior.of(problem)
+    return problem.form[EAGER_INTERIOR]
 
 
 def cost_unit(problem: Problem) -> Tensor:

@@ -96,6 +96,11 @@ class Recording(TorchDispatchMode):
         """The tensors that the function reads from outside, other than its arguments."""
         return [slot for slot in self.captured if slot not in self._made]
 
+    @property
+    def shapes(self) -> dict[Slot, tuple[int, ...]]:
+        """Of all tensors."""
+        return {slot: tuple(tensor.shape) for slot, tensor in self._seen.values()}
+
     def _new(self, tensor: Tensor) -> Slot:
         self._seen[id(tensor)] = Slot(next(self._numbers), tensor.dtype), tensor
         return self._seen[id(tensor)][0]

@@ -19,6 +19,7 @@ from torchgco.base.tree import PerElement
 from torchgco.tracing.arrays import NoCounterpart, boxed
 from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
+from torchgco.tracing.nets import MOST_WEIGHTS, Call, Nets
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
 
@@ -85,20 +86,26 @@ class Traced:
         self.looked, self.outside = recording.looked, [self._captured[slot] for slot in outer]
         read = [slot for slot in outer if slot.dtype.is_floating_point]
         reached = _followers(self._plain, read) - varying
-        self._shared = [slot for slot in border if slot in reached and slot.dtype.is_floating_point]
+        shared = [slot for slot in border if slot in reached and slot.dtype.is_floating_point]
+        self._nets = Nets(self._symbolic, recording.shapes, shared, self._result)
+        if self._nets.size > MOST_WEIGHTS:
+            raise InputError(field, f"networks of at most {MOST_WEIGHTS} weights in native kernels", self._nets.size)
+        self._shared = [slot for slot in shared if slot not in self._nets.alone]
         computed = self._computed(index)
         self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
         self._shared_shapes = {slot: tuple(computed[slot].shape) for slot in self._shared}
-        others = [slot for slot in border if slot not in varying and slot not in self._shared_shapes]
+        others = [slot for slot in border if slot not in varying and slot not in shared]
         self._constants = {slot: _array(computed[slot]) for slot in others}
+        self._weights = {slot: _array(computed[slot]) for slot in self._nets.alone}
         outside = _followers(self._plain, outer)
         self._fixed = {slot: computed[slot].detach().clone() for slot in others if slot in outside}
-        self._again = _needed(self._plain, *self._shared, *self._fixed)
+        self._again = _needed(self._plain, *shared, *self._fixed)
         self.is_mixed = not outside.isdisjoint(self._own)
         learned = _followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
-        self.shared = _flat([computed[slot] for slot in self._shared])
+        self._numbers = _flat([computed[slot] for slot in self._shared])
+        self.shared = torch.cat((self._numbers, self._nets.numbers(computed, self._numbers.numel())))
         sizes = [computed[slot].numel() for slot in self._shared]
-        self.pattern = _pattern(self.shared, np.repeat([slot in learned for slot in self._shared], sizes))
+        self.pattern = _pattern(self._numbers, np.repeat([slot in learned for slot in self._shared], sizes))
         indices = {slot for one in self._symbolic if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
         self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
@@ -115,15 +122,16 @@ class Traced:
         return np.concatenate([np.zeros(0), *(self._constants[s].astype(float).reshape(-1) for s in self._replaceable)])
 
     def shared_numbers(self) -> Tensor | None:
-        """The numbers (s,) float64 that all problems share and that the expressions leave open, as they are now.
+        """The numbers (s + w,) float64 that all problems share and that the expressions leave open, as they are now;
+        the last w are weights of networks.
 
         `pattern` (s,) has those of them that belong to the expressions' form, NaN for all others. None where such a
         number, an index, or the shape or type of a tensor has changed: the function is to be traced again.
         """
-        if not self._shared and not self._fixed:
+        if not self._shared and not self._fixed and not self._nets.shapes:
             return self.shared
         known: dict[Slot, Any] = dict(self._captured)
-        shapes = self._shared_shapes.items()
+        shapes = (self._shared_shapes | self._nets.shapes).items()
         try:
             replay_all(self._again, known)
             same = all(torch.equal(known[slot], then) for slot, then in self._fixed.items())
@@ -133,7 +141,9 @@ class Traced:
             return None
         shared, pattern = _flat([known[slot] for slot in self._shared]), torch.from_numpy(self.pattern)
         same = (shared == pattern) & (shared.signbit() == pattern.signbit())
-        return shared if bool((same | pattern.isnan()).all()) else None
+        if not bool((same | pattern.isnan()).all()):
+            return None
+        return torch.cat((shared, self._nets.numbers(known, shared.numel())))
 
     def parameters(self, index: Tensor) -> np.ndarray:
         """The numbers (count,) that differ between problems, for the problem that index (1,) int64 selects."""
@@ -186,13 +196,13 @@ class Traced:
         """
         variables = dict(zip(self._variables, self._shapes, strict=True))
         own = dict(zip(self._own, self._own_shapes, strict=True))
-        shared = self._shared_shapes, self.pattern
+        shared = self._shared_shapes | self._nets.shapes, self.pattern
         return fingerprint(variables, own, shared, self._constants, self._symbolic, self._result)
 
     @property
     def kin(self) -> str:
         """A text that functions share which differ in numbers alone, and few others."""
-        shapes = self._shapes, self._own_shapes, [*self._shared_shapes.values()]
+        shapes = self._shapes, self._own_shapes, [*self._shared_shapes.values(), *self._nets.shapes.values()]
         return f"{shapes} {' '.join(name_of(one.function) for one in self._symbolic)}"
 
     def __call__(
@@ -201,6 +211,7 @@ class Traced:
         *variables: np.ndarray,
         constants: np.ndarray | None = None,
         shared: np.ndarray | None = None,
+        calls: list[Call] | None = None,
     ) -> np.ndarray:
         """The function on arrays of numbers or expressions.
 
@@ -208,19 +219,26 @@ class Traced:
             parameters: (count,).
             variables: shaped as the examples.
             constants: (c,), used in place of `self.constants`, which are the default.
-            shared: (s,), used in place of the `shared_numbers` when it was traced, which are the default.
+            shared: (s,), used in place of the first `shared_numbers` when it was traced, which are the default.
+            calls: networks stay whole and are added to it, in order; None: they are computed like all else, with the
+                weights that they had when it was traced.
 
         Raises:
             InputError: an operation that CasADi has no counterpart for with these arguments.
         """
         known: dict[Slot, Any] = dict(zip(self._variables, variables, strict=True)) | self._constants
         known |= _placed(parameters, dict(zip(self._own, self._own_shapes, strict=True)))
-        known |= _placed(self.shared.numpy().astype(object) if shared is None else shared, self._shared_shapes)
+        known |= _placed(self._numbers.numpy().astype(object) if shared is None else shared, self._shared_shapes)
         if constants is not None:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
-        for operation in self._symbolic:
+        if calls is None:
+            known |= self._weights
+        for part, operation in self._nets.steps(self._symbolic, calls is not None):
             try:
-                replay(operation, known, self._precision)
+                if part is not None and calls is not None:
+                    self._nets.call(part, known, len(self.pattern), self._precision, calls)
+                else:
+                    replay(operation, known, self._precision)
             except NoCounterpart as error:
                 raise _unknown(self.field, operation, str(error)) from None
             except Exception:  # any error of CasADi or NumPy with these arguments

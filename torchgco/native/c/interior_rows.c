@@ -2,7 +2,8 @@
 
    The generated part also defines
 
-       tgco_curve(x, u, parameters, w, y, H)            H += second derivatives of y' step, upper triangle
+       tgco_curve(x, u, parameters, w, y, H)            H += second derivatives of y' step, upper triangle; or both this
+                                                        and tgco_jacobian, tgco_together(x, u, parameters, w, y, f, H)
        tgco_push(f, z, out)                             out = F z
        tgco_model_rows(i, x, u, p, w, by, cc, lam, g, H)  traced rows: g[a] += c_z' by[a], H += c_z' cc c_z + lam' c_zz
        tgco_along_rows(i, x, u, p, w, z, out)           out = c_z z */

@@ -52,8 +52,12 @@ static void expand(Barrier *t) {
         if (!u) break;
         V y[NX];
         for (int i = 0; i < NX; i++) y[i] = t->objective * t->y[(k + 1) * NX + i];
+#ifdef TGCO_TOGETHER
+        tgco_together(x, u, model_at(s, k), s->of->shared, y, t->f + k * NJ, H);
+#else
         tgco_jacobian(x, u, model_at(s, k), s->of->shared, t->f + k * NJ);
         tgco_curve(x, u, model_at(s, k), s->of->shared, y, H);
+#endif
     }
 }
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import apart
 from torchgco.constraints.base import FunctionConstraint
-from torchgco.native.codegen import emit
+from torchgco.native.codegen import calls
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
@@ -61,14 +61,13 @@ def _code(knot: Knot, name: str) -> str:
     import casadi as ca
 
     inputs = knot.inputs
-    slopes = ca.sparsify(ca.jacobian(knot.rows, ca.vertcat(knot.x, knot.u), {"allow_reverse": False}))
+    ahead = calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
+    slopes = ahead.jacobian(knot.rows)
     rows, columns = slopes.sparsity().get_triplet()
     nonzeros: list[Any] = slopes.nonzeros()
     code = [
-        emit.emit(f"tgco_{name}_rows", ca.Function("rows", inputs, [knot.rows]), emit.SHARED),
-        emit.emit(
-            f"tgco_{name}_slopes", ca.Function("slopes", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)]), emit.SHARED
-        ),
+        calls.emit_staged(f"tgco_{name}_rows", inputs, [knot.rows], calls.values(knot.calls)),
+        calls.emit_staged(f"tgco_{name}_slopes", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)], ahead.stages),
         f"static inline void tgco_{name}_add(",
         "    const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc, V *g, V *H) {",
         f"    V e[{max(1, len(rows))}];",

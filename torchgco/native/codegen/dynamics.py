@@ -16,8 +16,9 @@ from torch import Tensor
 from torchgco.base.tree import apart
 from torchgco.dynamics import Dynamics
 from torchgco.native import store
-from torchgco.native.codegen import emit
-from torchgco.tracing import Traced, arrays, dtypes, operations, own_tensors
+from torchgco.native.codegen import calls, emit, layers
+from torchgco.tracing import Traced, arrays, dtypes, nets, operations, own_tensors
+from torchgco.tracing.nets import Call
 
 STEP, JACOBIAN = "tgco_step", "tgco_jacobian"
 
@@ -97,41 +98,45 @@ def trace_dynamics(
     key = "model", traced.fingerprint(), *makers()
     parts = store.made(key, lambda _: _made(traced, n, m), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
-    return DynamicsSource(n, m, traced.count, parts.content["code"], **lists, key=parts.key, traced=traced, own=own)
+    code = emit.checked(traced.field, parts.content["code"])
+    return DynamicsSource(n, m, traced.count, code, **lists, key=parts.key, traced=traced, own=own)
 
 
 def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
     """The parts of a DynamicsSource that take CasADi to make."""
-    inputs, ahead = stepped(traced, n, m)
-    return step_parts(inputs, ahead)
+    return step_parts(*stepped(traced, n, m))
 
 
-def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any]:
-    """CasADi's columns x (n), u (m), p and w, and the step (n) that a trace makes of them."""
+def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any, list[Call]]:
+    """CasADi's columns x (n), u (m), p and w, and the step (n) that a trace makes of them, with calls of networks."""
     import casadi as ca
 
     x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
     p, w = ca.SX.sym("p", traced.count), ca.SX.sym("w", len(traced.pattern))
     shared = np.where(np.isnan(traced.pattern), elements(w), traced.pattern)
-    ahead = traced(elements(p), elements(x)[None], elements(u)[None], shared=shared).reshape(-1)
-    return [x, u, p, w], ca.densify(ca.vertcat(*ahead))
+    found: list[Call] = []
+    ahead = traced(elements(p), elements(x)[None], elements(u)[None], shared=shared, calls=found).reshape(-1)
+    return [x, u, p, w], ca.densify(ca.vertcat(*ahead)), found
 
 
-def step_parts(inputs: Sequence[Any], ahead: Any) -> dict[str, Any]:
-    """The code of a step `ahead` (n) of inputs x, u, p, w, CasADi's columns, and the lists of a DynamicsSource."""
+def step_parts(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> dict[str, Any]:
+    """The code of a step `ahead` (n) of inputs x, u, p, w, CasADi's columns, and the lists of a DynamicsSource.
+
+    `found` are the calls of networks in it.
+    """
     import casadi as ca
 
-    # Forward mode only, as `torch.func.jvp`: reverse mode would let a NaN of the branch not taken through as 0 * NaN.
-    jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(*inputs[:2]), {"allow_reverse": False}))
+    tangents = calls.Ahead(found, ca.vertcat(*inputs[:2]))
+    jacobian = tangents.jacobian(ahead)
     step, jacobian = ca.cse([ahead, jacobian])
     rows, columns = jacobian.sparsity().get_triplet()
     entries: list[Any] = jacobian.nonzeros()
+    changing = computed_entries(jacobian)
     fixed: list[bool] = [entry.is_constant() for entry in entries]
     places = np.where(fixed, -1, np.cumsum(np.logical_not(fixed)) - 1)
-    changing = ca.vertcat(ca.SX(0, 1), *(entry for entry, is_fixed in zip(entries, fixed, strict=True) if not is_fixed))
     code = [
-        emit.emit(name, ca.Function(name, inputs, [ca.densify(result)]), emit.SHARED)
-        for name, result in ((STEP, step), (JACOBIAN, changing))
+        calls.emit_staged(name, inputs, [ca.densify(result)], stages)
+        for name, result, stages in ((STEP, step, calls.values(found)), (JACOBIAN, changing, tangents.stages))
     ]
     return {
         "code": "\n".join(code),
@@ -140,6 +145,13 @@ def step_parts(inputs: Sequence[Any], ahead: Any) -> dict[str, Any]:
         "places": places.tolist(),
         "values": [float(entry) if is_fixed else 0.0 for entry, is_fixed in zip(entries, fixed, strict=True)],
     }
+
+
+def computed_entries(jacobian: Any) -> Any:
+    """The column of a Jacobian's nonzeros that `tgco_jacobian` writes: those that aren't constants."""
+    import casadi as ca
+
+    return ca.vertcat(ca.SX(0, 1), *(entry for entry in jacobian.nonzeros() if not entry.is_constant()))
 
 
 def elements(column: Any) -> np.ndarray:
@@ -153,7 +165,8 @@ def elements(column: Any) -> np.ndarray:
 @cache
 def makers(*more: str) -> Sequence[str]:
     """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
-    files = (operations.__file__, arrays.__file__, dtypes.__file__, emit.__file__, __file__, *more)
+    modules = (operations, arrays, dtypes, nets, emit, layers, calls)
+    files = (*(module.__file__ for module in modules), str(layers.LOOPS), __file__, *more)
     try:
         casadi = version("casadi")
     except PackageNotFoundError:

@@ -11,10 +11,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchgco.base.errors import InputError
+
 if TYPE_CHECKING:
     import casadi as ca
 
 PRELUDE = "\n".join((Path(__file__).parents[1] / "c" / name).read_text() for name in ("lanes.h", "functions.h"))
+MOST_LINES = 150_000  # compiled in some three minutes
 # Functions of the prelude, on each lane.
 _OF_ONE = (
     "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
@@ -55,6 +58,18 @@ def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
 def input_type(i: int, shared: int | None = SHARED) -> str:
     """The type of input i, a pointer's up to the name."""
     return "const double *restrict" if i == shared else "const V *restrict"
+
+
+def checked(field: str, code: str) -> str:
+    """The code of a function of the user's, `field`.
+
+    Raises:
+        InputError: it would take minutes to compile.
+    """
+    lines = code.count("\n")
+    if lines > MOST_LINES:
+        raise InputError(field, f"a function that native kernels hold in {MOST_LINES} lines of C", f"{lines} lines")
+    return code
 
 
 def _statement(function: ca.Function, k: int, shared: int | None) -> str:

@@ -60,5 +60,5 @@ def _span(model: Dynamics, N: int) -> Span:
 
 
 def _parts(knot: Knot, _: str) -> dict[str, Any]:
-    parts = step_parts(knot.inputs, knot.rows)
+    parts = step_parts(knot.inputs, knot.rows, knot.calls)
     return {**parts, "places_of_entries": parts.pop("places")}
