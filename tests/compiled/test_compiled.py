@@ -6,6 +6,7 @@ import pickle
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -250,13 +251,48 @@ def test_problems_of_every_form(form: str) -> None:
     torch.testing.assert_close(mpc.solution().cost, expected.cost, rtol=1e-4, atol=1e-6)
 
 
-def test_what_a_function_captures_is_compiled_and_seen_to_change() -> None:
-    wind = torch.tensor([0.1], dtype=D)
-    model = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0] + wind[0]), -1), 2, 1, DT, "rk4")
-    cost = QuadraticCost([1.0, 0.1], [0.1], [10.0, 1.0], [1.0, 0.0])
-    mpc = torchgco.compile(Problem(model, cost, [ControlBounds(-2.0, 2.0)], torch.zeros(1, 2, dtype=D), N))
-    assert mpc.stale() is None
-    wind += 0.5
+def test_what_a_function_captures_is_read_at_each_call() -> None:
+    wind, limit = torch.tensor([0.1, 0.0], dtype=D), np.array([0.8])
+    weight, gain = torch.nn.Parameter(torch.zeros(1, dtype=D)), [1.0]
+    field = lambda x, u, load: torch.stack((x[..., 1], gain[0] * u[..., 0] + wind[0] / load + wind[1] * x[..., 1]), -1)
+    table = torch.linspace(0.0, 1.0, N, dtype=D)
+    cost = FunctionCost(
+        lambda x, u, k: (x[..., 0] - table[k]).square() + 0.1 * u.square().sum(-1) + (weight[0] * x[..., 1]).square(),
+        lambda x: 10.0 * (x[..., 0] - table[-1]).square(),
+    )
+    slow = FunctionConstraint(lambda x: x[..., 1:] - torch.from_numpy(limit))
+    make = lambda: Problem(
+        FunctionDynamics(field, 2, 1, DT, "rk4", values={"load": [1.5]}), cost, [ControlBounds(-2.0, 2.0), slow],
+        torch.zeros(1, 2, dtype=D), N,
+    )  # fmt: skip
+    mpc = torchgco.compile(make(), "interior_point", tolerance=1e-10)
+    before = mpc()
+
+    def now() -> None:
+        nonlocal before
+        answer, fresh = mpc(), torchgco.solve(make(), solver=replace(InteriorPoint(), tolerance=1e-10))
+        assert answer.statuses == [Status.CONVERGED] and mpc.stale() is None
+        torch.testing.assert_close(answer.X, fresh.X, rtol=1e-6, atol=1e-7)
+        torch.testing.assert_close(mpc.solution().cost, fresh.cost, rtol=1e-9, atol=1e-9)
+        assert float((answer.X - before.X).abs().max()) > 1e-4
+        before = answer
+
+    wind[0] = 0.6
+    now()
+    limit[0] = 0.5
+    now()
+    table *= 0.7
+    now()
+    with torch.no_grad():
+        weight.fill_(0.5)
+    now()
+    wind[1] = -0.3  # no longer a zero, which is part of the code: compiled again
+    now()
+    wind.data = torch.tensor([0.2, 0.1], dtype=D)
+    now()
+    gain[0] = 1.1
+    assert "compile it again" in str(mpc.stale())
+    gain[0], wind = 1.0, torch.tensor([0.3, 0.1], dtype=D)
     assert "compile it again" in str(mpc.stale())
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey, words
 from torchgco.native.codegen.dynamics import JACOBIAN, STEP, DynamicsSource
-from torchgco.native.codegen.emit import PRELUDE
+from torchgco.native.codegen.emit import PRELUDE, SHARED
 from torchgco.native.codegen.source import C
 from torchgco.native.compiler import build
 from torchgco.native.declarations import head
@@ -18,27 +18,34 @@ LANES = 8
 
 
 class Emitted:
-    """A C function `name` on arrays (B, size); `inputs` and `outputs` are the sizes of its arguments."""
+    """A C function `name` on arrays (B, size); `inputs` and `outputs` are the sizes of its arguments.
+
+    Input `shared`, if any, is one array (size,) for all problems.
+    """
 
     def __init__(
-        self, code: str, name: str, inputs: list[int], outputs: list[int], real: str = "double", lanes: int = LANES
+        self,
+        code: str,
+        name: str,
+        inputs: list[int],
+        outputs: list[int],
+        real: str = "double",
+        lanes: int = LANES,
+        shared: int | None = None,
     ) -> None:
         sizes = [max(size, 1) for size in (*inputs, *outputs)]
         arguments = [f"a{i}" for i in range(len(sizes))]
         given = ", ".join(f"REAL *{argument}" for argument in arguments)
         local = " ".join(f"V v{i}[{size}];" for i, size in enumerate(sizes))
-        copies = [f"memcpy(v{i}, a{i}, sizeof v{i});" for i in range(len(inputs))]
-        copies += [f"{name}({', '.join(f'v{i}' for i in range(len(sizes)))});"]
+        copies = [f"memcpy(v{i}, a{i}, sizeof v{i});" for i in range(len(inputs)) if i != shared]
+        passed = [f"(const double *)a{i}" if i == shared else f"v{i}" for i in range(len(sizes))]
+        copies += [f"{name}({', '.join(passed)});"]
         copies += [f"memcpy(a{i}, v{i}, sizeof v{i});" for i in range(len(inputs), len(sizes))]
         driver = f"#include <string.h>\nvoid tgco_run({given}) {{ {local} {' '.join(copies)} }}\n"
         header = f"#define REAL {real}\n#define LANES {lanes}\n"
         self._run = build(header + PRELUDE + code + driver).tgco_run
-        self._dtype, self._lanes, self._outputs, self._sizes = (
-            np.dtype(real.replace("float", "f4")),
-            lanes,
-            outputs,
-            sizes,
-        )
+        self._dtype, self._lanes = np.dtype(real.replace("float", "f4")), lanes
+        self._outputs, self._sizes, self._shared = outputs, sizes, shared
 
     def __call__(self, *values: np.ndarray) -> list[np.ndarray]:
         """Outputs (B, size). The last group of lanes is filled up by repeating its problems."""
@@ -47,8 +54,11 @@ class Emitted:
         for first in range(0, B, self._lanes):
             rows = np.resize(np.arange(first, min(first + self._lanes, B)), self._lanes)
             arrays = [np.zeros((size, self._lanes), self._dtype) for size in self._sizes]
-            for array, value in zip(arrays, values, strict=False):
-                array[: value.shape[1]] = value[rows].T
+            for i, value in enumerate(values):
+                if i == self._shared:
+                    arrays[i] = value
+                else:
+                    arrays[i][: value.shape[1]] = value[rows].T
             self._run(*(ctypes.c_void_p(array.ctypes.data) for array in arrays))
             for out, array in zip(made, arrays[len(values) :], strict=True):
                 out[rows] = array[: out.shape[1]].T
@@ -81,10 +91,10 @@ class Model:
     """Step and Jacobian of a model in C."""
 
     def __init__(self, source: DynamicsSource, real: str = "double", lanes: int = LANES) -> None:
-        inputs = [source.n, source.m, source.count]
+        inputs = [source.n, source.m, source.count, len(source.traced.pattern)]
         self._source = source
-        self._step = Emitted(source.code, STEP, inputs, [source.n], real, lanes)
-        self._jacobian = Emitted(source.code, JACOBIAN, inputs, [source.computed], real, lanes)
+        self._step = Emitted(source.code, STEP, inputs, [source.n], real, lanes, SHARED)
+        self._jacobian = Emitted(source.code, JACOBIAN, inputs, [source.computed], real, lanes, SHARED)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """(B, n) by (B, n), (B, m), for the problems 0 to B - 1."""
@@ -100,4 +110,6 @@ class Model:
         return whole
 
     def _inputs(self, x: Tensor, u: Tensor) -> tuple[np.ndarray, ...]:
-        return x.numpy(), u.numpy(), self._source.parameters(torch.arange(len(x))).numpy()
+        shared = self._source.traced.shared_numbers()
+        assert shared is not None
+        return x.numpy(), u.numpy(), self._source.parameters(torch.arange(len(x))).numpy(), shared.numpy()

@@ -100,6 +100,22 @@ def test_sine_and_cosine_of_all_sizes(real: str, spacing: float) -> None:
     np.testing.assert_allclose(emitted(values)[0][tiny, 0], values[tiny, 0], rtol=1e-10)
 
 
+@pytest.mark.parametrize(("real", "spacing"), [("double", 2.2e-16), ("float", 1.2e-7)])
+def test_exponentials_logarithms_and_the_tangent_of_all_sizes(real: str, spacing: float) -> None:
+    x = ca.SX.sym("x")
+    names = "exp", "expm1", "tanh", "tan", "log", "log1p"
+    function = ca.Function("made", [x], [ca.vertcat(*(getattr(ca, name)(x) for name in names))])
+    emitted = Emitted(emit("tgco_made", function), "tgco_made", [1], [len(names)], real)
+    random = np.random.default_rng(3)
+    sizes = np.concatenate((10.0 ** random.uniform(-12, 1.9, (4096, 1)), 1.0 + random.uniform(-0.02, 0.02, (512, 1))))
+    values = (sizes * random.choice([-1.0, 1.0], sizes.shape)).astype(np.float32 if real == "float" else np.float64)
+    exact, (made,) = values.astype(np.longdouble), emitted(values)
+    for column, name in zip(made.T, names, strict=True):
+        within = values[:, 0] > {"log": 0.0, "log1p": -1.0}.get(name, -np.inf)
+        expected = getattr(np, name)(exact[within, 0])
+        np.testing.assert_allclose(column[within], expected.astype(float), rtol=4 * spacing, err_msg=name)
+
+
 @pytest.mark.parametrize("name", [*EXACT, *CLOSE])
 def test_single_precision(name: str) -> None:
     function, emitted = functions(name, "float")

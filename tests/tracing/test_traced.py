@@ -221,11 +221,48 @@ def test_a_clamped_nan_stays_one() -> None:
 def test_constants_may_be_replaced() -> None:
     """All constants but index tensors."""
     weights, picked = torch.tensor([2.0, 3.0], **DOUBLE), torch.tensor([1, 0])
-    traced = Traced("field", lambda i, x: weights * x[:, picked] + (weights > 2.5), torch.zeros(1, 2, **DOUBLE))
-    assert sorted(traced.constants) == [0.0, 1.0, 2.0, 3.0]
+    function = lambda i, x: x.new_tensor([2.0, 3.0]) * x[:, picked] + (weights > 2.5)
+    traced = Traced("field", function, torch.zeros(1, 2, **DOUBLE))
+    assert sorted(traced.constants) == [0.0, 1.0, 2.0, 3.0] and traced.pattern.size == 0
     x = np.array([[5.0, 7.0]], dtype=object)
     assert traced(np.zeros(0), x).tolist() == traced(np.zeros(0), x, constants=traced.constants).tolist() == [[14, 16]]
     assert traced(np.zeros(0), x, constants=np.zeros(4)).tolist() == [[0.0, 0.0]]
+
+
+WEIGHTS = torch.tensor([[2.0, 0.0], [1.0, -1.0]], **DOUBLE)
+LEARNED = torch.zeros(2, **DOUBLE, requires_grad=True)
+ARRAY = np.array([4.0, 5.0])
+
+
+def test_captured_numbers_are_read_again_and_a_structure_of_others_stays() -> None:
+    def function(i: Tensor, x: Tensor) -> Tensor:
+        return x @ WEIGHTS.T.exp().log() + LEARNED.tanh() + torch.from_numpy(ARRAY) + (WEIGHTS[0] > 1.0)
+
+    weights, learned, array = WEIGHTS.clone(), LEARNED.detach().clone(), ARRAY.copy()
+    traced = Traced("field", function, torch.zeros(1, 2, **DOUBLE))
+    key, x = traced.fingerprint(), np.array([[5.0, 7.0]], dtype=object)
+    try:
+        # The exponentials are PyTorch's part: rounding may move 1 and -1, so the zero alone is structural.
+        assert 1 <= (~np.isnan(traced.pattern)).sum() <= 3 and len(traced.pattern) == 8
+        WEIGHTS[0, 0], ARRAY[1] = 3.0, 0.5
+        with torch.no_grad():
+            LEARNED.fill_(0.2)
+        shared, again = traced.shared_numbers(), Traced("field", function, torch.zeros(1, 2, **DOUBLE))
+        assert shared is not None and again.fingerprint() == key
+        for one in (traced(np.zeros(0), x, shared=shared.numpy()), again(np.zeros(0), x)):
+            expected = function(torch.zeros(1), torch.tensor(x.astype(float))).detach()
+            np.testing.assert_allclose(one.astype(float), expected.numpy(), rtol=1e-14)
+        WEIGHTS[0, 1] = 0.1
+        assert traced.shared_numbers() is None
+        assert Traced("field", function, torch.zeros(1, 2, **DOUBLE)).fingerprint() != key
+        WEIGHTS[0, 1], WEIGHTS[0, 0] = 0.0, 0.9  # no longer above 1, which is a constant
+        assert traced.shared_numbers() is None
+        WEIGHTS[0, 0], WEIGHTS.data = 3.0, WEIGHTS.data.view(1, 4)
+        assert traced.shared_numbers() is None
+    finally:
+        WEIGHTS.data = weights
+        LEARNED.data.copy_(learned)
+        ARRAY[:] = array
 
 
 def test_writing_in_place() -> None:

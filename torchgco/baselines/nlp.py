@@ -50,10 +50,8 @@ class Program:
         """
         step, cost, constraints = _traces(problem)
         sources = (step, cost, *constraints)
-        same = self.free == _free(problem)
-        if not same or [source.fingerprint() for source in sources] != [
-            source.fingerprint() for source in self.sources
-        ]:
+        key = lambda source: (source.fingerprint(), source.shared.tolist())
+        if self.free != _free(problem) or list(map(key, sources)) != list(map(key, self.sources)):
             raise InputError("problem", "one of the form that was prepared", "another form")
         return replace(self, sources=sources)
 

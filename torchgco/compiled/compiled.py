@@ -88,8 +88,9 @@ def compile(
         answer = mpc(x0=x, x_ref=reference)
 
     The first call solves as `torchgco.solve` does. Later ones begin with the last trajectories and multipliers, by the
-    interior point in C; what that doesn't solve, `solver` solves again. What the problem's functions do, what they
-    capture, and which bounds are infinite stay as they are now: see `Compiled.stale`.
+    interior point in C; what that doesn't solve, `solver` solves again. Tensors that the problem's functions capture,
+    such as the weights of a module, are read again at each call. What the functions do, Python's numbers in them, and
+    which bounds are infinite stay as they are now: see `Compiled.stale`.
 
     Args:
         problem: B problems, on a CPU.
@@ -145,14 +146,20 @@ class Compiled:
         self._lock = threading.Lock()
         self._warm = np.zeros(problem.B, dtype=bool)  # which problems have an answer to begin with
         self._found: Solution | None = None  # the last answer, where it isn't what C has left
-        self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
-        form = current(for_solvers(problem))
         self._kept: Kept | None = None
+        self._pack(problem)
+
+    def _pack(self, problem: Problem) -> None:
+        """Compile and pack a problem as it is now; what was packed before hands its iterates on."""
+        self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
+        form, before, self._kept = current(for_solvers(problem)), self._kept, None
         if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
             kernels = interior_of(form)
             if isinstance(kernels, InteriorEngine):
                 self._problem, self._unit = form, cost_unit(form)
                 self._kept = Kept(kernels, form, **self._options(form))
+                if before is not None:
+                    self._kept.begin_with(before)
 
     def _options(self, problem: Problem) -> dict[str, Any]:
         interior = self.interior
@@ -229,12 +236,14 @@ class Compiled:
     def stale(self) -> str | None:
         """What the compiled code would compute otherwise if it were compiled now, in a line; None: nothing.
 
-        It sees functions that do something else, and other contents of what they capture: tensors, modules, numbers.
+        It sees functions that do something else, other numbers in them, and other tensors in the place of those that
+        they captured.
         """
         if self._kept is None:
             return None  # PyTorch's kernels call the functions themselves
-        then, now = self._kept.engine, Engine(self._now().renewed(), compiles=False)
-        if then.form.units() == now.form.units():
+        problem, then = self._now().renewed(), self._kept.engine
+        read, now = then.captured.read(), Engine(problem, compiles=False)
+        if read is None or then.with_shared(read).computes_as(now, problem):  # None: a call compiles again by itself
             return None
         return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
 
@@ -254,10 +263,12 @@ class Compiled:
         if number.derived:
             self._changed.add(number.part)
 
-    def _refresh(self) -> None:
-        """Have C read what it doesn't share with the problem's tensors."""
+    def _refresh(self, shift: int = 0) -> None:
+        """Have C begin `shift` stages later, and read what it doesn't share with the problem's tensors."""
         kept = self._kept
         assert kept is not None
+        if shift:
+            kept.shift(shift)
         for part in self._changed:
             if part == "dynamics":
                 kept.refresh_model()
@@ -267,6 +278,14 @@ class Compiled:
                 kept.refresh_constraint(part)
         self._changed.clear()
         kept.start()
+        if kept.is_outdated:
+            self._refresh_captured(kept)
+
+    @_plainly()
+    def _refresh_captured(self, kept: Kept) -> None:
+        """Have C read what functions capture as it is now."""
+        if not kept.refresh_captured():
+            self._pack(self._now().renewed())
 
     def _now(self) -> Problem:
         """The problem with its numbers as they are, and nothing that was computed from others."""
@@ -280,12 +299,11 @@ class Compiled:
         return now
 
     def _solved(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
+        if self._kept is not None:
+            self._refresh(shift)
         kept = self._kept
         if kept is None:
             return self._by_solver_alone(able, shift, began, until)
-        if shift:
-            kept.shift(shift)
-        self._refresh()
         good = late = np.zeros_like(able)
         if able.any():
             left = math.inf if until == math.inf else max(0.0, until - time.perf_counter())

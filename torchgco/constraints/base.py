@@ -153,8 +153,8 @@ class FunctionConstraint(Constraint):
 
     The function may take an argument k (without a default), the numbers (K,) of the knots of x (B, K, n). `values` are
     numbers per problem by name, (B, ...), `knot_values` numbers per problem and knot, (B|1, N+1, ...); the function
-    takes them as arguments of these names, shaped to fit x. Numbers that change from solve to solve belong there: with
-    another captured number the code is compiled again.
+    takes them as arguments of these names, shaped to fit x. Numbers that change from solve to solve belong there, or in
+    captured tensors: with another captured Python number the code is compiled again.
 
     Raises:
         InputError: on `Problem(...)`: bad sense, knots, or `of`; values of another shape or that the function doesn't

@@ -24,8 +24,9 @@ class FunctionCost(Cost):
             values={"goal": goals},  # (B, 2)
         )
 
-    Numbers that change from solve to solve belong into `values`: with another captured number the code is compiled
-    again. A solver looks for paths among obstacles only where it knows the goal: pass `goal` to `Problem`.
+    Numbers that change from solve to solve belong into `values`, or in captured tensors: with another captured Python
+    number the code is compiled again. A solver looks for paths among obstacles only where it knows the goal: pass
+    `goal` to `Problem`.
 
     Args:
         stage_function: function(x, u) of (..., n), (..., m) to costs (...); may take an argument k (without a

@@ -101,7 +101,7 @@ class FunctionDynamics(Dynamics):
             steps of dt.
         values: numbers per problem by name, (B, ...), which the function takes as arguments of these names, shaped to
             fit x: (B, ...), or (B, 1, ...) where x has an axis of knots or samples. Numbers that change from solve to
-            solve belong here: with another captured number the code is compiled again.
+            solve belong here, or in captured tensors: with another captured Python number the code is compiled again.
         knot_values: the same per stage, (B|1, N, ...); the function sees the rows of its stages, (B, ...), (B, K, ...)
             or (B, 1, ...).
 

@@ -44,7 +44,7 @@ _SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? genera
 _LOOPS, _STRAIGHT, _BEGIN, _LONG = 1.0e-3, 0.2e-3, 0.2, 170_000
 _SHARES = {"-O0": 0.2, "-Og": 0.3, "-O1": 0.5, "-O2": 0.7, "-O3": 1.0}
 _BRIEF = 2.0  # s: compilations that are shorter are announced only to those who watch
-_KEPT = 32  # objects in memory
+_OBJECTS = 32  # in memory
 _AMD_HALVES = 25  # family of AMD processors, at most, that compute vectors of 512 bits in two steps
 
 
@@ -102,13 +102,17 @@ def build(source: str | Sequence[Unit], flags: Sequence[str] = ()) -> ctypes.CDL
     units = (Unit(source, own=True),) if isinstance(source, str) else tuple(source)
     known = (units, tuple(flags), compiler)
     # No lock: two threads that compile the same source do no harm, and a lock held across a fork would.
-    if known not in _loaded:
+    library = _loaded.pop(known, None)
+    if library is None:
         if compiler is None:
             raise NativeError(
                 "no C compiler found: install gcc or clang, or `pip install ziglang`, or name one in TORCHGCO_CC"
             )
-        _loaded[known] = _load(compiler, units, (*compiler.flags, *flags, *compiler.further))
-    return _loaded[known]
+        library = _load(compiler, units, (*compiler.flags, *flags, *compiler.further))
+    _loaded[known] = library  # the most recent one is the last
+    if len(_loaded) > _KEPT:
+        del _loaded[next(iter(_loaded))]
+    return library
 
 
 def begin(*libraries: tuple[Unit, ...]) -> None:
@@ -133,6 +137,7 @@ class _Begun:
     process: subprocess.Popen[str]
 
 
+_KEPT = 256  # libraries with their sources, the most recent ones; what still runs keeps its own
 _loaded: dict[tuple[tuple[Unit, ...], tuple[str, ...], Compiler | None], ctypes.CDLL] = {}
 _begun: dict[str, _Begun] = {}  # by the key of the object
 _objects: dict[str, bytes] = {}  # the most recent ones: both libraries of a form have its model's
@@ -230,7 +235,7 @@ def _known(key: str, unit: Unit) -> bytes | None:
 
 def _remember(key: str, content: bytes) -> None:
     _objects[key] = content
-    if len(_objects) > _KEPT:
+    if len(_objects) > _OBJECTS:
         del _objects[next(iter(_objects))]
 
 

@@ -25,15 +25,15 @@ from torchgco.obstacles.base import TOUCH, Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
+from torchgco.tracing import Facts
 
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
 CURRENT = "current"  # marks the form of problems that a solve works on
-INTERIOR = "interior"  # marks the library of the interior point
 EAGER_INTERIOR = "eager interior"  # marks the interior point's kernels in PyTorch
 EXPECTED = "expected"  # marks that the interior point will be asked for
 EAGER = "eager"  # marks that PyTorch's kernels have differentiated a user's parts
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
-KEPT = 64  # engines of problems without a user's code, the most recent ones
+KEPT = 64  # engines, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
 
 
@@ -44,8 +44,8 @@ class EagerWarning(UserWarning):
 def current(problem: Problem) -> Problem:
     """The problem as its parts are now: nothing is kept from an earlier solve but code of the same computation.
 
-    Every solve begins with this call. A user's code is traced anew: the tensors, numbers and modules that it captures
-    may have changed. Within a solve, subsets and other forms of the problem share the kernels of its beginning.
+    Every solve begins with this call: the tensors, numbers and modules that a user's code captures may have changed.
+    Within a solve, subsets and other forms of the problem share the kernels of its beginning.
     """
     if CURRENT in problem.form:
         return problem
@@ -72,12 +72,17 @@ def engine_of(problem: Problem) -> Engine | None:
         except (InputError, NativeError) as error:
             problem.form["engine"] = None
             check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
-            reason = str(error).splitlines()[0]
-            warned = problem.form.setdefault(WARNED, set())
-            if reason not in warned:
-                warned.add(reason)
-                warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=4)
+            _warn(problem, error)
     return problem.form["engine"]
+
+
+def _warn(problem: Problem, error: Exception) -> None:
+    """Say once why PyTorch's kernels are used."""
+    reason = str(error).splitlines()[0]
+    warned = problem.form.setdefault(WARNED, set())
+    if reason not in warned:
+        warned.add(reason)
+        warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=5)
 
 
 def kernels_of(problem: Problem) -> str:
@@ -91,20 +96,25 @@ def expect_interior(problem: Problem) -> None:
 
 
 def _engine(problem: Problem) -> Engine:
-    same, ahead = signature(problem), begin_interior if EXPECTED in problem.form else None
-    if same is None:
+    """The engine of an earlier solve where nothing that its code depends on has changed, else a new one."""
+    before, ahead = signature(problem), begin_interior if EXPECTED in problem.form else None
+    if before is None:
         return Engine(problem, ahead)
-    key = same, find_compiler()
-    if key in _engines:
-        _engines[key] = _engines.pop(key)  # the most recent one is the last
-    else:
-        _engines[key] = Engine(problem, ahead)
+    key = before.key, find_compiler()
+    known = _engines.pop(key, None)
+    if known is not None and (shared := known[0].captured.read()) is not None:
+        _engines[key] = known  # the most recent one is the last
+        return known[0].with_shared(shared.copy())
+    engine, after = Engine(problem, ahead), signature(problem)
+    # Code that has changed what it reads, a counter for instance, does so at every solve.
+    if after is not None and after.key == before.key and after.covers(engine.captured.traces):
+        _engines[key] = engine, after.facts
         if len(_engines) > KEPT:
             del _engines[next(iter(_engines))]
-    return _engines[key]
+    return engine.with_shared(engine.shared.copy())  # a compiled problem writes into it
 
 
-_engines: dict[Hashable, Engine] = {}
+_engines: dict[Hashable, tuple[Engine, Facts]] = {}  # the facts hold what their key names by identity
 
 
 def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
@@ -137,13 +147,14 @@ def interior_of(problem: Problem) -> InteriorKernels:
         InputError: rows that join knots.
     """
     engine = engine_of(problem)
-    if engine is None:
-        if EAGER_INTERIOR not in problem.form:
-            problem.form[EAGER_INTERIOR] = EagerInterior.of(problem)
-        return problem.form[EAGER_INTERIOR]
-    if INTERIOR not in vars(engine):
-        vars(engine)[INTERIOR] = InteriorEngine(engine)
-    return vars(engine)[INTERIOR]
+    if engine is not None:
+        try:
+            return InteriorEngine(engine)
+        except InputError as error:  # second derivatives whose code would be too long
+            _warn(problem, error)
+    if EAGER_INTERIOR not in problem.form:
+        problem.form[EAGER_INTERIOR] = EagerInterior.of(problem)
+    return problem.form[EAGER_INTERIOR]
 
 
 def cost_unit(problem: Problem) -> Tensor:

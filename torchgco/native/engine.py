@@ -5,8 +5,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from copy import copy
 from itertools import pairwise
 from typing import Any
 
@@ -23,8 +24,18 @@ from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.codegen.stages import trace_model
+from torchgco.native.compiler import Unit
 from torchgco.native.declarations import load
-from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, numbers_of, quadratic_arrays
+from torchgco.native.packing import (
+    KINDS,
+    constraint_of,
+    guide_of,
+    is_bounded,
+    numbers_of,
+    quadratic_arrays,
+    shared_fields,
+)
+from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.problem.problem import Problem
 
@@ -60,11 +71,46 @@ class Engine:
         dense = quadratic is not None and not quadratic.diagonal
         self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
+        self.captured = Captured(self.model, self.cost, self.functions)
+        self.shared = self._first_shared()
         self.form = Form(self.model, at, self.cost, dense, functions)
         if ahead is not None:
             ahead(self)
+        self._libraries: dict[Hashable, ctypes.CDLL] = {}
         if compiles:
             self.library = load(self.form.units(), STRUCTURES)
+
+    def further(self, name: Hashable, units: Callable[[], Sequence[Unit]]) -> ctypes.CDLL:
+        """A further library of this form, which this engine and those with other shared numbers keep."""
+        if name not in self._libraries:
+            self._libraries[name] = load(units(), STRUCTURES)
+        return self._libraries[name]
+
+    def with_shared(self, shared: Shared) -> Engine:
+        """The same functions with other shared numbers, such as `captured.read` gives."""
+        other = copy(self)
+        other.shared = shared
+        return other
+
+    def _first_shared(self) -> Shared:
+        found = self.captured.read()
+        if found is None:  # changed since the functions were traced, by another thread
+            raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
+        return found
+
+    def computes_as(self, other: Engine, problem: Problem) -> bool:
+        """Whether another engine computes the same for `problem`."""
+        if self.form.units() != other.form.units() or not self.shared.is_same(other.shared):
+            return False
+        return all(map(torch.equal, self._numbers(problem), other._numbers(problem)))
+
+    def _numbers(self, problem: Problem) -> list[Tensor]:
+        """What the functions read of problems."""
+        found = [self.model.numbers(problem.B, problem.dynamics, self.shared.model)]
+        if self.cost is not None:
+            found += (part for array in cost_arrays(problem, self.cost, self.shared.cost) for part in array.kept)
+        functions = self.functions.items()
+        return found + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X (B, N+1, n) from U (B, N, m)."""
@@ -213,10 +259,12 @@ class Engine:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
         rows = self._constraints(problem)
-        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
+        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows, **shared_fields(self.shared))
         if self.model.count > 0:
-            packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
-        packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
+            numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
+            packed.parameters = array(numbers, knots=True)
+        cost, shared = self.cost, self.shared.cost
+        packed.cost_data = quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, shared)
         packed.bounded = int(self.cost is None and is_bounded(problem.cost))
         return packed, rows
 
@@ -227,11 +275,17 @@ class Engine:
             return rows
         rows = []
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
-            source = self.functions.get(i)
-            numbers = None if source is None else rows_numbers(problem, i, source)
-            rows.append(constraint_of(constraint, shape, numbers_of(constraint, numbers, problem), problem))
+            rows.append(constraint_of(constraint, shape, self.row_numbers(problem, i), problem))
         problem.form[PACKED] = problem.constraints, rows
         return rows
+
+    def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
+        """The fields of a `Constraint` in C that hold the numbers of constraint i."""
+        source, constraint = self.functions.get(i), problem.constraints[i]
+        if source is None:
+            return numbers_of(constraint, None, problem)
+        shared = self.shared.rows[i]
+        return {**numbers_of(constraint, rows_numbers(problem, i, source, shared), problem), "shared": shared}
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:

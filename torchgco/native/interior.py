@@ -12,9 +12,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.native.codegen.source import INTERIOR, LANES
 from torchgco.native.compiler import begin
-from torchgco.native.declarations import load
 from torchgco.native.engine import Engine, run
-from torchgco.native.structures import STRUCTURES, Interior
+from torchgco.native.structures import Interior
 from torchgco.problem.problem import Problem
 
 FEW = 2, 4  # lanes of libraries for few problems
@@ -30,14 +29,15 @@ class InteriorEngine:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self.library = load(engine.form.units(INTERIOR), STRUCTURES)
+        self.library = self._with_lanes(LANES)
 
     def for_few(self, B: int) -> tuple[ctypes.CDLL, int]:
         """A library for B problems, and how many it solves side by side: lanes without a problem take time, too."""
         lanes = next((lanes for lanes in FEW if B <= lanes < LANES), LANES)
-        if lanes == LANES:
-            return self.library, lanes
-        return load(self.engine.form.units(INTERIOR, lanes=lanes), STRUCTURES), lanes
+        return self._with_lanes(lanes), lanes
+
+    def _with_lanes(self, lanes: int) -> ctypes.CDLL:
+        return self.engine.further(("interior", lanes), lambda: self.engine.form.units(INTERIOR, lanes=lanes))
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any

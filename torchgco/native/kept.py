@@ -13,12 +13,12 @@ from torch import Tensor
 
 from torchgco.lagrangian.lagrangian import later
 from torchgco.native import structures as c
-from torchgco.native.codegen.constraint import rows_numbers
 from torchgco.native.codegen.cost import cost_arrays
 from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import run
 from torchgco.native.interior import InteriorEngine
-from torchgco.native.packing import constraint_of, numbers_of, quadratic_arrays
+from torchgco.native.packing import constraint_of, quadratic_arrays, shared_fields
+from torchgco.native.shared import Shared
 from torchgco.problem.problem import Problem
 
 
@@ -35,6 +35,7 @@ class Kept:
     def __init__(self, kernels: InteriorEngine, problem: Problem, **options: Any) -> None:
         B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
         self.engine, self.problem = kernels.engine, problem
+        self._read: Shared | None = None  # what functions have captured, when C was last given it
         self.library, self.lanes = kernels.for_few(B)
         self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
         self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
@@ -43,7 +44,7 @@ class Kept:
         self.barrier = like.new_zeros(B)
         self._numbers = [self._own_numbers(i) for i in range(len(problem.constraints))]
         rows = [self._row(i, numbers) for i, numbers in enumerate(self._numbers)]
-        self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows)
+        self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(self.engine.shared))
         self._model = self._model_array()
         self._cost = self._cost_arrays()
         self.packed.fill({"parameters": self._model, "cost_data": self._cost})
@@ -89,6 +90,11 @@ class Kept:
         if self.engine.measures:
             run(library.tgco_violation, B, LANES, self._follow)
 
+    def begin_with(self, other: Kept) -> None:
+        """Take over the iterates of another one of the same shapes."""
+        for own, its in zip(self._moving, other._moving, strict=True):
+            own[:] = its
+
     @property
     def finite(self) -> np.ndarray:
         """Whether all states and controls of `rolled` are, (B,)."""
@@ -111,6 +117,25 @@ class Kept:
         for part, at in zip(self._moving, self._later[by], strict=True):
             part[:] = part[:, at]
 
+    @property
+    def is_outdated(self) -> bool:
+        """Whether tensors that functions capture may have other numbers than C."""
+        captured = self.engine.captured
+        return captured.is_mixed or not captured.is_still(self._read)
+
+    def refresh_captured(self) -> bool:
+        """Read what functions capture again; whether the library computes with it as it is now."""
+        self._read = self.engine.captured.read()
+        if self._read is None:
+            return False
+        self.engine.shared.take_over(self._read)
+        # Some of these numbers may be a knot's own, and problems' own ones computed from what was captured.
+        for i in self.engine.functions:
+            self.refresh_constraint(i)
+        self.refresh_cost()
+        self.refresh_model()
+        return True
+
     def refresh_constraint(self, i: int) -> None:
         """Read the numbers of constraint i again, after its tensors have changed."""
         new = self._own_numbers(i)
@@ -132,17 +157,17 @@ class Kept:
         return row
 
     def _own_numbers(self, i: int) -> dict[str, Any]:
-        source = self.engine.functions.get(i)
-        numbers = None if source is None else rows_numbers(self.problem, i, source)
-        return numbers_of(self.problem.constraints[i], numbers, self.problem)
+        return self.engine.row_numbers(self.problem, i)
 
     def _cost_arrays(self) -> list[c.Array]:
-        cost = self.engine.cost
-        return quadratic_arrays(self.problem.cost) if cost is None else cost_arrays(self.problem, cost)
+        cost, problem = self.engine.cost, self.problem
+        return quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, self.engine.shared.cost)
 
     def _model_array(self) -> c.Array:
         model, problem = self.engine.model, self.problem
-        return c.Array() if model.count == 0 else c.array(model.numbers(problem.B, problem.dynamics), knots=True)
+        if model.count == 0:
+            return c.Array()
+        return c.array(model.numbers(problem.B, problem.dynamics, self.engine.shared.model), knots=True)
 
 
 def _spans(rows: np.ndarray) -> list[tuple[int, int]]:

@@ -12,6 +12,7 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.penalties import GuideRegion, Penalty
 from torchgco.maps.field import BoundField
 from torchgco.native import structures as c
+from torchgco.native.shared import Shared
 from torchgco.native.structures import NOWHERE, QUADRATIC, Guide, Kind, array
 from torchgco.obstacles.base import ABSENT, marked
 from torchgco.obstacles.boxes import BoundBoxes
@@ -37,6 +38,12 @@ def is_bounded(cost: Any) -> bool:
     if not cost.diagonal or any(part is not None for part in (cost.q, cost.r, cost.qf, cost.H)):
         return False
     return all(bool((weights >= 0).all()) for weights in (cost.Q, cost.R, cost.Qf))
+
+
+def shared_fields(shared: Shared) -> dict[str, Any]:
+    """The fields of a problem that hold the numbers of model and cost that all problems share."""
+    stage, last = shared.cost
+    return {"shared": shared.model, "stage_shared": stage, "last_shared": last}
 
 
 def constraint_of(

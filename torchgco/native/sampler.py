@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from torchgco.native.codegen.source import SAMPLER
-from torchgco.native.declarations import load
 from torchgco.native.engine import Engine, run
-from torchgco.native.structures import STRUCTURES, Sampling
+from torchgco.native.structures import Sampling
 from torchgco.problem.problem import Problem
 
 REALS = {torch.float64: ("double", 8), torch.float32: ("float", 16)}  # type and lanes in C
@@ -23,7 +22,7 @@ class Sampler:
 
     def __init__(self, engine: Engine, dtype: torch.dtype) -> None:
         self.engine = engine
-        self.library = load(engine.form.units(SAMPLER, *REALS[dtype]), STRUCTURES)
+        self.library = engine.further(dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]))
 
     def improve(self, problem: Problem, U: Tensor, sampling: Sampling) -> Tensor:
         """Controls (B, N, m): the weighted mean of the last round's samples, the first drawn around U.

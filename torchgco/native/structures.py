@@ -62,6 +62,7 @@ class Constraint(Structure):
         (Array, "velocities"),  # SPHERES: as centres, or NULL
         (Array, "stops"),  # SPHERES, BOXES, FIELD: the last knot at which they count (E, 1, 1), or NULL
         ("double", "dt"),
+        ("const double *", "shared"),  # FUNCTION: numbers w that all problems share
         ("const float *", "map"),  # FIELD: distances at the nodes of all maps (G, map_x, map_y, map_z)
         ("const int64_t *", "map_of"),  # FIELD: (E)
         ("int64_t", "map_x map_y map_z"),
@@ -97,6 +98,8 @@ class Problem(Structure):
         ("int64_t *", "inner iterations rung"),
         ("int32_t *", "status converged refused lost"),
         (Array, "parameters"),  # of the model: (E, N, count)
+        # numbers w that all problems share, of the model, and of stages and the last knot of a traced cost
+        ("const double *", "shared stage_shared last_shared"),
         ((Array, COST_ARRAYS), "cost_data"),
         ("const Constraint *", "constraint"),
         ("int32_t", "guide phr replicas optimality bounded"),  # bounded: no stage's cost is below 0

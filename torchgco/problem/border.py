@@ -47,8 +47,8 @@ def check_code(
 
     A part that has passed isn't tried again: the same object has the same code, and a loop that makes a problem per
     period would spend most of its time here. What the code reads may have changed since, such as captured tensors,
-    attributes, the mode of a module, or x0: a mistake that arises so is found later, where the part is traced anew for
-    each solve (operations that draw at random or leave PyTorch, other shapes) or by its result (`certify` compares
+    attributes, the mode of a module, or x0: a mistake that arises so is found later, where the part is traced again
+    (operations that draw at random or leave PyTorch, other shapes) or by its result (`certify` compares
     derivatives). All parts are tried again for another number of problems, stages, states or controls, time step,
     position, dtype or device. Parts without weak references are always tried.
 

@@ -1,4 +1,7 @@
 """Functions of PyTorch tensors, recorded once and replayed with CasADi expressions."""
 
+from torchgco.tracing.facts import Facts as Facts
+from torchgco.tracing.facts import Unseen as Unseen
 from torchgco.tracing.traced import Traced as Traced
 from torchgco.tracing.traced import own_tensors as own_tensors
+from torchgco.tracing.watch import Watch as Watch

@@ -11,12 +11,13 @@ import numpy as np
 
 from torchgco.tracing.recorder import Operation, Slot
 
-FORMAT = 2  # to be raised when the digested text changes, or its meaning in a replay
+FORMAT = 3  # to be raised when the digested text changes, or its meaning in a replay
 
 
 def fingerprint(
     variables: Mapping[Slot, tuple[int, ...]],
     own: Mapping[Slot, tuple[int, ...]],
+    shared: tuple[Mapping[Slot, tuple[int, ...]], np.ndarray],
     constants: Mapping[Slot, np.ndarray],
     operations: Sequence[Operation],
     result: Slot,
@@ -25,6 +26,7 @@ def fingerprint(
 
     Args:
         variables, own: shapes of the function's arguments, and of the numbers that differ between problems.
+        shared: shapes of the numbers that all problems share, and which of them are structural.
         constants: all other tensors that no operation makes.
         operations: in order, with slots in the place of tensors.
         result: the slot of the result.
@@ -32,11 +34,12 @@ def fingerprint(
     # A slot's own number may differ between recordings: here, slots are numbered in the order in which they occur.
     order = count()
     made = (slot for operation in operations for slot in operation.outputs)
-    names = {slot: f"${next(order)} {slot.dtype}" for slot in (*variables, *own, *constants, *made)}
+    names = {slot: f"${next(order)} {slot.dtype}" for slot in (*variables, *own, *shared[0], *constants, *made)}
     digest = hashlib.sha256(f"format {FORMAT}\n".encode())
-    for kind, shapes in (("variable", variables), ("own", own)):
+    for kind, shapes in (("variable", variables), ("own", own), ("shared", shared[0])):
         for slot, shape in shapes.items():
             digest.update(f"{kind} {names[slot]} {shape}\n".encode())
+    digest.update(f"pattern {shared[1].shape}\n".encode() + np.nan_to_num(shared[1], nan=2.0).tobytes())
     for slot, value in constants.items():
         plain = value.astype(np.float64) if value.dtype == object else value
         digest.update(f"constant {names[slot]} {plain.dtype.str} {plain.shape}\n".encode() + plain.tobytes() + b"\n")

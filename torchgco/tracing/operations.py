@@ -160,6 +160,17 @@ def _log_sigmoid(a: np.ndarray) -> np.ndarray:
     return _sub(_where(_lt(a, 0.0), a, 0.0), _unary("log1p")(_falling(a)))
 
 
+_gelu = _unary(lambda x: 0.5 * x * (1.0 + _casadi().erf(x / math.sqrt(2.0))))
+_gelu_by_tanh = _unary(
+    lambda x: 0.5 * x * (1.0 + _casadi().tanh(math.sqrt(2.0 / math.pi) * (x + 0.044715 * x * x * x)))
+)
+
+
+def _elu(a: np.ndarray, alpha: float = 1.0, scale: float = 1.0, input_scale: float = 1.0) -> np.ndarray:
+    below = _mul(_unary("expm1")(_mul(a, input_scale)), alpha * scale)
+    return _where(_gt(a, 0.0), _mul(a, scale), below)
+
+
 def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     # CasADi's own product: entry by entry, the thousands of entries of an obstacle constraint would take long.
     ca = _casadi()
@@ -320,7 +331,8 @@ OPERATIONS: dict[str, Callable] = {
     "aten.relu": lambda a: _where(_le(a, 0.0), 0.0, a),
     "aten.leaky_relu": lambda a, slope=0.01: _where(_gt(a, 0.0), a, _mul(a, slope)),
     "aten.softplus": _softplus,
-    "aten.gelu": _unary(lambda x: 0.5 * x * (1.0 + _casadi().erf(x / math.sqrt(2.0)))),
+    "aten.gelu": lambda a, approximate="none": (_gelu if approximate == "none" else _gelu_by_tanh)(a),
+    "aten.elu": _elu,
     # choices
     "aten.where": _where,
     "aten.clamp": _clamp,

@@ -77,6 +77,9 @@ class Recording(TorchDispatchMode):
         self.lenient = False  # whether what can't be followed is recorded nevertheless
         self.unfit: _Unfit | None = None  # why the function can't be recorded; its own code may have caught it
         self.captured: dict[Slot, Tensor] = {}
+        self.looked = False  # whether Python code reads values of tensors from outside, which it may branch on
+        self._made: set[Slot] = set()  # captured tensors that the function itself makes of Python's numbers
+        self._outer: set[Slot] = set()  # what depends on the others
         self.examples = list(inputs)
         self.inputs = [self._new(tensor) for tensor in self.examples]
         self._followers = set(self.inputs)
@@ -87,6 +90,16 @@ class Recording(TorchDispatchMode):
         if id(tensor) not in self._seen:
             self.captured[self._new(tensor)] = tensor
         return self._seen[id(tensor)][0]
+
+    @property
+    def outside(self) -> list[Slot]:
+        """The tensors that the function reads from outside, other than its arguments."""
+        return [slot for slot in self.captured if slot not in self._made]
+
+    @property
+    def shapes(self) -> dict[Slot, tuple[int, ...]]:
+        """Of all tensors."""
+        return {slot: tuple(tensor.shape) for slot, tensor in self._seen.values()}
 
     def _new(self, tensor: Tensor) -> Slot:
         self._seen[id(tensor)] = Slot(next(self._numbers), tensor.dtype), tensor
@@ -105,9 +118,11 @@ class Recording(TorchDispatchMode):
         if not _makes_tensors(func):
             if self._follows(args, kwargs):
                 raise self._unfit("one that looks at the values of its arguments", func, _Looks)
+            self.looked |= self._is_outer(args, kwargs)
             return func(*args, **kwargs)  # a constant's value may be read
         if SHAPED_BY_VALUES in func.tags and self._follows(*_shaping(func, args), kwargs):
             raise self._unfit("one with shapes that depend on the values of its arguments", func, _Looks)
+        self.looked |= SHAPED_BY_VALUES in func.tags and self._is_outer(*_shaping(func, args), kwargs)
         if name_of(func) not in OPERATIONS:
             with self:  # the parts are dispatched here in turn
                 parts = func.decompose(*args, **kwargs)
@@ -116,6 +131,8 @@ class Recording(TorchDispatchMode):
                     parts = _decompositions()[func](*args, **kwargs)
             if parts is not NotImplemented:
                 return parts
+        if name_of(func) == "aten.lift_fresh" and _has_own_memory(args[0]):
+            self._made.add(self.slot(args[0]))
         inputs, options = _mapped(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
         if not func._schema.returns:  # it raises where values don't suit it, which the function may catch
             self.operations.append(Operation(func, inputs, options, (), self._calls.called, torch.get_default_dtype()))
@@ -126,6 +143,8 @@ class Recording(TorchDispatchMode):
         self.operations.append(operation)
         if not self._followers.isdisjoint(operation.inputs):
             self._followers.update(operation.outputs)
+        if self._is_outer(args, kwargs):
+            self._outer.update(operation.outputs)
         return out
 
     def _unfit(self, what: str, operation: Any, kind: type[_Unfit] | None = None) -> _Unfit:
@@ -136,6 +155,18 @@ class Recording(TorchDispatchMode):
     def _follows(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on the function's arguments."""
         return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in _leaves(tree))
+
+
+    def _is_outer(self, *tree: Any) -> bool:
+        """Whether a tensor in `tree` depends on one from outside that isn't an argument."""
+        slots = (self.slot(leaf) for leaf in _leaves(tree) if isinstance(leaf, Tensor))
+        return any(slot in self._outer or (slot in self.captured and slot not in self._made) for slot in slots)
+
+
+def _has_own_memory(tensor: Tensor) -> bool:
+    """Whether a new tensor was made of numbers: the memory of a NumPy array, which it may share, can't be resized."""
+    with torch._C.DisableTorchFunction():
+        return tensor.untyped_storage().resizable()
 
 
 class _Unfit(RuntimeError):
@@ -179,6 +210,7 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     except Exception as error:  # any error of the function
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", message) from theirs(error)
+    recording.looked |= bool(calls.seen)
     recording.result = recording.slot(result)
     if not _is_reproduced(recording, result):
         what = "one that changes the memory of a captured tensor or array while it runs"

@@ -1,7 +1,7 @@
 """A function of PyTorch tensors, recorded once and replayed with CasADi expressions.
 
-PyTorch itself computes the parts that don't depend on the variables: constants once, and a problem's own numbers for
-each problem. Only the rest needs a counterpart in CasADi.
+PyTorch itself computes the parts that don't depend on the variables: constants once, numbers that all problems share
+whenever they are asked for, and a problem's own numbers for each problem. Only the rest needs a counterpart in CasADi.
 """
 
 from __future__ import annotations
@@ -19,14 +19,21 @@ from torchgco.base.tree import PerElement
 from torchgco.tracing.arrays import NoCounterpart, boxed
 from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
+from torchgco.tracing.nets import MOST_WEIGHTS, Call, Nets
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
+STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
 
 class Traced:
     """function(index, *variables), where index (1,) int64 selects the problem of the batch.
+
+    Of the other floating tensors that the function reads (it captures them, or they are a module's parameters) the
+    numbers stay inputs of the expressions, `shared_numbers`. Where one is 0, 1 or -1 this is part of the form, as a
+    matrix's zeros are, except in tensors that need a gradient: those are about to change. Integers and booleans, what
+    is made of Python's numbers, and all that is used as an index are constants.
 
     Args:
         field: the function's name in errors.
@@ -35,6 +42,13 @@ class Traced:
         own: tensors, objects that nothing else holds (`base.tree.apart`), that are treated as one problem's own even
             where all problems of the batch share them: the expressions, and with them the last bits, then don't depend
             on the other problems of the batch.
+
+    Attributes:
+        looked: whether Python code of the function has read values of tensors, which it may branch on.
+        outside: the tensors that it has read, other than its arguments and `own`.
+        shared: the `shared_numbers` when it was traced.
+        pattern: see `shared_numbers`.
+        is_mixed: whether numbers that differ between problems depend on `outside` tensors, too.
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
@@ -68,9 +82,30 @@ class Traced:
         named = [slot for slot, tensor in self._captured.items() if id(tensor) in own_ids]
         varying = _followers(self._plain, [self._index, *named])
         self._own = [slot for slot in border if slot in varying]
+        outer = [slot for slot in recording.outside if slot not in named]
+        self.looked, self.outside = recording.looked, [self._captured[slot] for slot in outer]
+        read = [slot for slot in outer if slot.dtype.is_floating_point]
+        reached = _followers(self._plain, read) - varying
+        shared = [slot for slot in border if slot in reached and slot.dtype.is_floating_point]
+        self._nets = Nets(self._symbolic, recording.shapes, shared, self._result)
+        if self._nets.size > MOST_WEIGHTS:
+            raise InputError(field, f"networks of at most {MOST_WEIGHTS} weights in native kernels", self._nets.size)
+        self._shared = [slot for slot in shared if slot not in self._nets.alone]
         computed = self._computed(index)
         self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
-        self._constants = {slot: _array(computed[slot]) for slot in border if slot not in varying}
+        self._shared_shapes = {slot: tuple(computed[slot].shape) for slot in self._shared}
+        others = [slot for slot in border if slot not in varying and slot not in shared]
+        self._constants = {slot: _array(computed[slot]) for slot in others}
+        self._weights = {slot: _array(computed[slot]) for slot in self._nets.alone}
+        outside = _followers(self._plain, outer)
+        self._fixed = {slot: computed[slot].detach().clone() for slot in others if slot in outside}
+        self._again = _needed(self._plain, *shared, *self._fixed)
+        self.is_mixed = not outside.isdisjoint(self._own)
+        learned = _followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
+        self._numbers = _flat([computed[slot] for slot in self._shared])
+        self.shared = torch.cat((self._numbers, self._nets.numbers(computed, self._numbers.numel())))
+        sizes = [computed[slot].numel() for slot in self._shared]
+        self.pattern = _pattern(self._numbers, np.repeat([slot in learned for slot in self._shared], sizes))
         indices = {slot for one in self._symbolic if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
         self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
@@ -85,6 +120,30 @@ class Traced:
     def constants(self) -> np.ndarray:
         """The numbers (c,) that all problems share, except those used as indices."""
         return np.concatenate([np.zeros(0), *(self._constants[s].astype(float).reshape(-1) for s in self._replaceable)])
+
+    def shared_numbers(self) -> Tensor | None:
+        """The numbers (s + w,) float64 that all problems share and that the expressions leave open, as they are now;
+        the last w are weights of networks.
+
+        `pattern` (s,) has those of them that belong to the expressions' form, NaN for all others. None where such a
+        number, an index, or the shape or type of a tensor has changed: the function is to be traced again.
+        """
+        if not self._shared and not self._fixed and not self._nets.shapes:
+            return self.shared
+        known: dict[Slot, Any] = dict(self._captured)
+        shapes = (self._shared_shapes | self._nets.shapes).items()
+        try:
+            replay_all(self._again, known)
+            same = all(torch.equal(known[slot], then) for slot, then in self._fixed.items())
+        except (RuntimeError, IndexError, TypeError, ValueError):  # shapes or types that don't fit each other any more
+            return None
+        if not same or any((known[s].shape, known[s].dtype) != (torch.Size(shape), s.dtype) for s, shape in shapes):
+            return None
+        shared, pattern = _flat([known[slot] for slot in self._shared]), torch.from_numpy(self.pattern)
+        same = (shared == pattern) & (shared.signbit() == pattern.signbit())
+        if not bool((same | pattern.isnan()).all()):
+            return None
+        return torch.cat((shared, self._nets.numbers(known, shared.numel())))
 
     def parameters(self, index: Tensor) -> np.ndarray:
         """The numbers (count,) that differ between problems, for the problem that index (1,) int64 selects."""
@@ -132,19 +191,27 @@ class Traced:
     def fingerprint(self) -> str:
         """A hexadecimal digest of the computation of `__call__`, the same in every process, made without CasADi.
 
-        It doesn't depend on the values of the numbers that differ from problem to problem.
+        It doesn't depend on the values of the numbers that differ from problem to problem, and of those that all share
+        only on the `pattern`.
         """
         variables = dict(zip(self._variables, self._shapes, strict=True))
         own = dict(zip(self._own, self._own_shapes, strict=True))
-        return fingerprint(variables, own, self._constants, self._symbolic, self._result)
+        shared = self._shared_shapes | self._nets.shapes, self.pattern
+        return fingerprint(variables, own, shared, self._constants, self._symbolic, self._result)
 
     @property
     def kin(self) -> str:
         """A text that functions share which differ in numbers alone, and few others."""
-        return f"{self._shapes} {self._own_shapes} {' '.join(name_of(one.function) for one in self._symbolic)}"
+        shapes = self._shapes, self._own_shapes, [*self._shared_shapes.values(), *self._nets.shapes.values()]
+        return f"{shapes} {' '.join(name_of(one.function) for one in self._symbolic)}"
 
     def __call__(
-        self, parameters: np.ndarray, *variables: np.ndarray, constants: np.ndarray | None = None
+        self,
+        parameters: np.ndarray,
+        *variables: np.ndarray,
+        constants: np.ndarray | None = None,
+        shared: np.ndarray | None = None,
+        calls: list[Call] | None = None,
     ) -> np.ndarray:
         """The function on arrays of numbers or expressions.
 
@@ -152,17 +219,26 @@ class Traced:
             parameters: (count,).
             variables: shaped as the examples.
             constants: (c,), used in place of `self.constants`, which are the default.
+            shared: (s,), used in place of the first `shared_numbers` when it was traced, which are the default.
+            calls: networks stay whole and are added to it, in order; None: they are computed like all else, with the
+                weights that they had when it was traced.
 
         Raises:
             InputError: an operation that CasADi has no counterpart for with these arguments.
         """
         known: dict[Slot, Any] = dict(zip(self._variables, variables, strict=True)) | self._constants
         known |= _placed(parameters, dict(zip(self._own, self._own_shapes, strict=True)))
+        known |= _placed(self._numbers.numpy().astype(object) if shared is None else shared, self._shared_shapes)
         if constants is not None:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
-        for operation in self._symbolic:
+        if calls is None:
+            known |= self._weights
+        for part, operation in self._nets.steps(self._symbolic, calls is not None):
             try:
-                replay(operation, known, self._precision)
+                if part is not None and calls is not None:
+                    self._nets.call(part, known, len(self.pattern), self._precision, calls)
+                else:
+                    replay(operation, known, self._precision)
             except NoCounterpart as error:
                 raise _unknown(self.field, operation, str(error)) from None
             except Exception:  # any error of CasADi or NumPy with these arguments
@@ -192,9 +268,23 @@ def own_tensors(part: PerElement) -> list[Tensor]:
     return found
 
 
-def _needed(operations: list[Operation], result: Slot) -> list[Operation]:
-    """The operations that the result depends on."""
-    wanted, kept = {result}, []
+def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
+    """Numbers (s,) where they are structural, and NaN for the others, and for learned ones, (s,) bool."""
+    pattern = numbers.numpy().copy()
+    structural = np.isin(pattern, STRUCTURAL) & ~((pattern == 0.0) & np.signbit(pattern))
+    pattern[learned.astype(bool) | ~structural] = np.nan
+    return pattern
+
+
+def _flat(values: Sequence[Tensor]) -> Tensor:
+    """All numbers of some tensors (s,) float64."""
+    parts = [value.detach().cpu().to_dense().double().flatten() for value in values]
+    return torch.cat([torch.zeros(0, dtype=torch.float64, device="cpu"), *parts])
+
+
+def _needed(operations: list[Operation], *results: Slot) -> list[Operation]:
+    """The operations that the results depend on."""
+    wanted, kept = set(results), []
     for operation in reversed(operations):
         if not wanted.isdisjoint(operation.outputs):
             wanted.update(operation.inputs)
@@ -224,7 +314,7 @@ def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict
 def _array(value: Tensor) -> np.ndarray:
     """Floating-point numbers as objects; integers and booleans keep their type, so that they can index."""
     plain = value.detach().cpu().to_dense()
-    return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy()
+    return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy().copy()
 
 
 def _unknown(field: str, operation: Operation, why: str = "") -> InputError:

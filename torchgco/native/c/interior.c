@@ -329,14 +329,13 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
     Track track, *k = &track;
     if (!start_barrier(t, how)) return 0;
     memset(k, 0, sizeof *k);
-    I running = SET(0.0) != SET(0.0), fresh = ~running;
+    I running = SET(0.0) == SET(0.0), fresh = running;
     int64_t next = first;
     double until = seconds_now() + how->seconds;
-    for (int l = 0; l < LANES; l++) {
-        /* Lanes without a problem repeat the first problem, so that all lanes hold finite numbers. */
-        enter_barrier(t, l, next < last ? next : first);
-        running[l] = next < last ? -1 : 0;
-        if (next < last) next++;
+    int64_t own = last - first < LANES ? last - first : LANES;
+    for (int l = 0; l < LANES; l++) { /* lanes without a problem repeat the first problem: its networks are computed once */
+        enter_barrier(t, l, l < own ? first + l : first);
+        if (l < own) next++;
     }
     begin(t, k, fresh);
     while (any(running)) {
@@ -352,7 +351,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         }
         for (int l = 0; l < LANES; l++) {
             if (!ended[l]) continue;
-            leave_barrier(t, k, l, status[l], error[l]);
+            if (l < own) leave_barrier(t, k, l, status[l], error[l]);
             if (next < last && !late) { enter_barrier(t, l, next++); fresh[l] = -1; }
             else running[l] = 0;
         }

@@ -98,13 +98,14 @@ typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const Response *at);
 static void respond(Barrier *t, int64_t k, Response *at) {
     V f[NJ + 1], next[NX], moved[NX];
     const V *parameters = model_at(&t->lanes, k);
-    model_jacobian(at[1].x, at[1].x + NX, parameters, f);
+    const double *w = t->lanes.of->shared;
+    model_jacobian(at[1].x, at[1].x + NX, parameters, w, f);
     model_push(f, at[1].z, next);
-    model_step(at[1].x, at[1].x + NX, parameters, moved);
+    model_step(at[1].x, at[1].x + NX, parameters, w, moved);
     for (int i = 0; i < NX; i++) at[1].z[i] = next[i];
-    model_step(at->x, at->x + NX, parameters, next);
+    model_step(at->x, at->x + NX, parameters, w, next);
     for (int i = 0; i < NX; i++) at[1].x[i] = t->lanes.X[(k + 1) * NX + i] + (moved[i] - next[i]);
-    model_jacobian(at->x, at->x + NX, parameters, f);
+    model_jacobian(at->x, at->x + NX, parameters, w, f);
     model_push(f, at->z, next);
     for (int i = 0; i < NX; i++) at->z[i] = next[i];
 }

@@ -21,7 +21,7 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     } else if (con->kind == FIELD) {
         c[0] = field_row(con, rows, k, x, 0, 0);
 #endif
-    } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
+    } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
 }
 
 /* `inside` of rows in the barrier, `fixed` of bounds that coincide, and nothing of rows that no variable moves. */
@@ -146,7 +146,8 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
     }
     V *g[PARTS];
     for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
-    model_bend_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), by, cc, lam, g, t->H + k * S * S);
+    const V *numbers = at(rows->bound, &con->bound, con->place[k]);
+    model_bend_rows((int)i, x, u, numbers, con->shared, by, cc, lam, g, t->H + k * S * S);
 }
 
 /* The change of the rows of constraint i at knot k along z = [dx, du], into out. */
@@ -176,5 +177,5 @@ static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, con
         out[0] = SET(0.0);
         for (int a = 0; a < DIM; a++) ADD(out[0], slopes[a], z[POSITION + a]);
 #endif
-    } else model_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), z, out);
+    } else model_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, z, out);
 }

@@ -17,7 +17,7 @@ static V values(const Barrier *t, const V *X, const V *U, V *c, V *gap) {
         total += cost_value(s, k, x, u);
         if (!u) break;
         V next[NX];
-        model_step(x, u, model_at(s, k), next);
+        model_step(x, u, model_at(s, k), s->of->shared, next);
         for (int i = 0; i < NX; i++) gap[k * NX + i] = next[i] - X[(k + 1) * NX + i];
     }
     return t->scale * total;
@@ -53,8 +53,7 @@ static void expand(Barrier *t) {
         if (!u) break;
         V y[NX];
         for (int i = 0; i < NX; i++) y[i] = t->objective * t->y[(k + 1) * NX + i];
-        model_jacobian(x, u, model_at(s, k), t->f + k * NJ);
-        model_curve(x, u, model_at(s, k), y, H);
+        model_expand(x, u, model_at(s, k), s->of->shared, y, t->f + k * NJ, H);
     }
 }
 

@@ -37,7 +37,7 @@ __attribute__((noinline)) static V traced_value(
     const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V total) {
     const Constraint *con = s->of->constraint + i;
     V c[MAX_ROWS];
-    model_rows((int)i, x, u, at(s->rows[i].bound, &con->bound, con->place[k]), c);
+    model_rows((int)i, x, u, at(s->rows[i].bound, &con->bound, con->place[k]), con->shared, c);
     for (int j = 0; j < con->rows; j++) total += worth(s, con->equality, c[j], lam[j]);
     return total;
 }
@@ -47,9 +47,9 @@ __attribute__((noinline)) static void traced_expand(
     const Constraint *con = s->of->constraint + i;
     const V *numbers = at(s->rows[i].bound, &con->bound, con->place[k]);
     V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
-    model_rows((int)i, x, u, numbers, c);
+    model_rows((int)i, x, u, numbers, con->shared, c);
     for (int j = 0; j < con->rows; j++) slope[j] = pull(s, con->equality, c[j], lam[j], rho + j);
-    model_add_rows((int)i, x, u, numbers, slope, rho, g, H);
+    model_add_rows((int)i, x, u, numbers, con->shared, slope, rho, g, H);
 }
 
 static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {

@@ -108,9 +108,8 @@ static inline V tgco_single(V a) { /* rounded to single precision */
         for (int i = 0; i < LANES; i++) r[i] = TGCO_MATH(name)(a[i], b[i]); \
         return r; \
     }
-TGCO_BY_LANE_1(exp) TGCO_BY_LANE_1(expm1) TGCO_BY_LANE_1(log) TGCO_BY_LANE_1(log1p)
-TGCO_BY_LANE_1(tan) TGCO_BY_LANE_1(asin) TGCO_BY_LANE_1(acos) TGCO_BY_LANE_1(atan)
-TGCO_BY_LANE_1(sinh) TGCO_BY_LANE_1(cosh) TGCO_BY_LANE_1(tanh)
+TGCO_BY_LANE_1(asin) TGCO_BY_LANE_1(acos) TGCO_BY_LANE_1(atan)
+TGCO_BY_LANE_1(sinh) TGCO_BY_LANE_1(cosh)
 TGCO_BY_LANE_1(asinh) TGCO_BY_LANE_1(acosh) TGCO_BY_LANE_1(atanh)
 TGCO_BY_LANE_1(erf) TGCO_BY_LANE_1(sqrt) TGCO_BY_LANE_1(floor) TGCO_BY_LANE_1(ceil)
 TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hypot)
@@ -137,9 +136,9 @@ TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hy
     sine = tgco_fused(s * SET(-1.0 / (2 * (i) * (2 * (i) + 1))), sine, SET(1.0)); \
     cosine = tgco_fused(s * SET(-1.0 / ((2 * (i)-1) * (2 * (i)))), cosine, SET(1.0));
 
-static inline V tgco_wave(V x, int shift) {
+/* sin r and cos r; returns k. */
+static inline I tgco_series(V x, V *of_sine, V *of_cosine) {
     V t = tgco_fused(x, SET(0x1.45f306dc9c883p-1), SET(TGCO_WHOLE)), k = t - SET(TGCO_WHOLE), r = x;
-    I quarter = (I)t + shift;
     SUBTRACT(r, k, SET(TGCO_QUARTER_1));
     SUBTRACT(r, k, SET(TGCO_QUARTER_2));
     SUBTRACT(r, k, SET(TGCO_QUARTER_3));
@@ -149,7 +148,14 @@ static inline V tgco_wave(V x, int shift) {
     TGCO_TERM(8) TGCO_TERM(7) TGCO_TERM(6) TGCO_TERM(5)
 #endif
     TGCO_TERM(4) TGCO_TERM(3) TGCO_TERM(2) TGCO_TERM(1)
-    V value = tgco_choose((quarter & 1) != 0, cosine, r * sine);
+    *of_sine = r * sine;
+    *of_cosine = cosine;
+    return (I)t;
+}
+static inline V tgco_wave(V x, int shift) {
+    V sine, cosine;
+    I quarter = tgco_series(x, &sine, &cosine) + shift;
+    V value = tgco_choose((quarter & 1) != 0, cosine, sine);
     I sign = (quarter & 2) << (8 * (int)sizeof(REAL) - 2);
     return (V)((I)value ^ sign);
 }

@@ -53,7 +53,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
 #endif
         V c[MAX_ROWS], u[NU];
         memset(u, 0, sizeof u); /* a geometric constraint reads x alone */
-        model_rows((int)i, x, u, at(q->s.rows[i].bound, &con->bound, con->place[k]), c);
+        model_rows((int)i, x, u, at(q->s.rows[i].bound, &con->bound, con->place[k]), con->shared, c);
         for (int j = 0; j < con->rows; j++) count += tgco_truth(c[j] >= SET(0.0));
     }
     return count;
@@ -68,7 +68,7 @@ static void fly(Samples *q, int64_t first) {
     for (int64_t k = 0; k < p->N; k++) {
         draw(q, k, eps, u);
         cost += cost_value(&q->s, k, x, u);
-        model_step(x, u, model_at(&q->s, k), x + NX);
+        model_step(x, u, model_at(&q->s, k), p->shared, x + NX);
         memcpy(x, x + NX, NX * sizeof(V));
         touched += hits(q, k + 1, x);
         if (o->knots == 0)

@@ -62,7 +62,7 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
 #endif
     } else {
         V c[MAX_ROWS];
-        model_rows((int)i, x, u, at(rows->bound, &con->bound, place), c);
+        model_rows((int)i, x, u, at(rows->bound, &con->bound, place), con->shared, c);
         for (int j = 0; j < con->rows; j++) {
             V violated = con->equality ? tgco_fabs(c[j]) : tgco_choose(c[j] < zero, zero, c[j]);
             note(s, con, c[j], violated, lam + j, &pushed, sweep);

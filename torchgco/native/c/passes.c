@@ -18,7 +18,7 @@ void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
         total += cost_value(s, k, x, u);
         more += value(s, k, x, u);
         if (!any(total + more <= enough)) { *cost = total; *merit = total + more; return; }
-        model_step(x, u, model_at(s, k), x + NX);
+        model_step(x, u, model_at(s, k), s->of->shared, x + NX);
     }
     total += cost_value(s, p->N, s->Xn + p->N * NX, 0);
     more += value(s, p->N, s->Xn + p->N * NX, 0);
@@ -43,7 +43,7 @@ void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *
     for (int64_t k = p->N - 1; k >= 0; k--) {
         const V *x = s->X + k * NX, *u = s->U + k * NU;
         V *G = s->G + k * NU * NZ;
-        tgco_jacobian(x, u, model_at(s, k), f);
+        tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         tgco_gather(P, f, T);
         tgco_product(f, T, H);
         if (gap) for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) ADD(vector[i], P[i * NX + j], gap[k * NX + j]);
@@ -94,7 +94,7 @@ I is_finite(const Lanes *s, Expand *expand) {
         for (int i = 0; i < S; i++) sum += SET(0.0) * g[i];
         for (int i = 0; i < S * S; i++) sum += SET(0.0) * H[i];
         if (k == p->N) break;
-        tgco_jacobian(x, u, model_at(s, k), f);
+        tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         for (int i = 0; i < NJ; i++) sum += SET(0.0) * f[i];
     }
     return sum == SET(0.0);
@@ -104,7 +104,7 @@ I is_finite(const Lanes *s, Expand *expand) {
 void gaps(const Lanes *s, V *gap) {
     for (int64_t k = 0; k < s->of->N; k++) {
         V next[NX];
-        model_step(s->X + k * NX, s->U + k * NU, model_at(s, k), next);
+        model_step(s->X + k * NX, s->U + k * NU, model_at(s, k), s->of->shared, next);
         for (int i = 0; i < NX; i++) gap[k * NX + i] = next[i] - s->X[(k + 1) * NX + i];
     }
 }
@@ -117,7 +117,7 @@ void linear_step(Lanes *s, const V *gap) {
     for (int64_t k = 0; k < s->of->N; k++) {
         V *x = s->X + k * NX, *u = s->U + k * NU;
         const V *G = s->G + k * NU * NZ;
-        tgco_jacobian(x, u, model_at(s, k), f);
+        tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         tgco_gather(one, f, F);
         memcpy(z, dx, sizeof dx);
         for (int j = 0; j < NU; j++) {

@@ -1,17 +1,17 @@
 /* A traced cost times one number per problem, less another one per stage: its value, gradient and Hessian at a knot.
 
-   The generated part defines, for `stage` and `last` alike, with a knot's own numbers p:
+   The generated part defines, for `stage` and `last` alike, with a knot's own numbers p, and w that all problems share:
 
-       tgco_stage_value(x, u, p, value)
-       tgco_stage_entries(x, u, p, e)   STAGE_ENTRIES derivatives: STAGE_SLOPES of the gradient, then the Hessian's
+       tgco_stage_value(x, u, p, w, value)
+       tgco_stage_entries(x, u, p, w, e)   STAGE_ENTRIES derivatives: STAGE_SLOPES of the gradient, then the Hessian's
        tgco_stage_places                where they belong in g and H */
 
 /* The cost of stage k at x, u; of the last knot where u is NULL. */
 V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     V value;
     const V *scale = cost_at(s, FACTOR, k);
-    if (u) tgco_stage_value(x, u, cost_at(s, STAGE, k), &value);
-    else tgco_last_value(x, u, cost_at(s, LAST, k), &value);
+    if (u) tgco_stage_value(x, u, cost_at(s, STAGE, k), s->of->stage_shared, &value);
+    else tgco_last_value(x, u, cost_at(s, LAST, k), s->of->last_shared, &value);
     return u ? scale[0] * value - scale[1] : scale[0] * value;
 }
 
@@ -24,11 +24,11 @@ static inline void add_entries(V factor, int slopes, int count, const int *place
 void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     if (u) {
         V e[STAGE_ENTRIES + 1];
-        tgco_stage_entries(x, u, cost_at(s, STAGE, k), e);
+        tgco_stage_entries(x, u, cost_at(s, STAGE, k), s->of->stage_shared, e);
         add_entries(cost_at(s, FACTOR, k)[0], STAGE_SLOPES, STAGE_ENTRIES, tgco_stage_places, e, g, H);
     } else {
         V e[LAST_ENTRIES + 1];
-        tgco_last_entries(x, u, cost_at(s, LAST, k), e);
+        tgco_last_entries(x, u, cost_at(s, LAST, k), s->of->last_shared, e);
         add_entries(cost_at(s, FACTOR, k)[0], LAST_SLOPES, LAST_ENTRIES, tgco_last_places, e, g, H);
     }
 }

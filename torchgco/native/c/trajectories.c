@@ -66,7 +66,7 @@ static inline __attribute__((always_inline)) int roll_out(const Problem *p, int6
                 for (int j = 0; feedback && j < NU; j++) p->U[((e + l) * N + k) * NU + j] = u[j][l];
                 for (int i = 0; i < NX; i++) p->X[((e + l) * (N + 1) + k) * NX + i] = x[i][l];
             }
-            model_step(x, u, parameters, x + NX);
+            model_step(x, u, parameters, p->shared, x + NX);
             memcpy(x, x + NX, NX * sizeof(V));
         }
         for (int l = 0; l < LANES && e + l < last; l++)

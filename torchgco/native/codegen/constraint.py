@@ -10,17 +10,18 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import apart
 from torchgco.constraints.base import FunctionConstraint
-from torchgco.native.codegen import emit
+from torchgco.native.codegen import calls
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 
 
 def trace_rows(problem: Problem, i: int) -> KnotSource:
-    """C of the rows c of constraint i, for the prelude of `emit`, with x (n), u (m) and a knot's own numbers p:
+    """C of the rows c of constraint i, for the prelude of `emit`, with x (n), u (m), a knot's own numbers p, and the
+    numbers w that all problems share:
 
-        tgco_KEY_rows(x, u, p, c)
-        tgco_KEY_add(x, u, p, by_c, by_cc, g, H)     g += c_z' by_c,  H += c_z' diag(by_cc) c_z, its upper triangle
+        tgco_KEY_rows(x, u, p, w, c)
+        tgco_KEY_add(x, u, p, w, by_c, by_cc, g, H)     g += c_z' by_c,  H += c_z' diag(by_cc) c_z, its upper triangle
 
     Raises:
         InputError: the rows can't be traced, hold an operation without a counterpart, or join several knots.
@@ -28,9 +29,9 @@ def trace_rows(problem: Problem, i: int) -> KnotSource:
     return knot_source("rows", span_of_rows(problem, i), _code, __file__)
 
 
-def rows_numbers(problem: Problem, i: int, source: KnotSource) -> Tensor:
-    """The numbers (B|1, K|1, count) of constraint i."""
-    return source.numbers(problem.B, own_tensors(problem.constraints[i]), lambda: span_of_rows(problem, i))
+def rows_numbers(problem: Problem, i: int, source: KnotSource, shared: Tensor) -> Tensor:
+    """The numbers (B|1, K|1, count) of constraint i; `shared` are those that all problems share."""
+    return source.numbers(problem.B, own_tensors(problem.constraints[i]), shared, lambda: span_of_rows(problem, i))
 
 
 def span_of_rows(problem: Problem, i: int) -> Span:
@@ -59,17 +60,18 @@ def span_of_rows(problem: Problem, i: int) -> Span:
 def _code(knot: Knot, name: str) -> str:
     import casadi as ca
 
-    inputs = [knot.x, knot.u, knot.numbers]
-    slopes = ca.sparsify(ca.jacobian(knot.rows, ca.vertcat(knot.x, knot.u), {"allow_reverse": False}))
+    inputs = knot.inputs
+    ahead = calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
+    slopes = ahead.jacobian(knot.rows)
     rows, columns = slopes.sparsity().get_triplet()
     nonzeros: list[Any] = slopes.nonzeros()
     code = [
-        emit.emit(f"tgco_{name}_rows", ca.Function("rows", inputs, [knot.rows])),
-        emit.emit(f"tgco_{name}_slopes", ca.Function("slopes", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)])),
+        calls.emit_staged(f"tgco_{name}_rows", inputs, [knot.rows], calls.values(knot.calls)),
+        calls.emit_staged(f"tgco_{name}_slopes", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)], ahead.stages),
         f"static inline void tgco_{name}_add(",
-        "    const V *x, const V *u, const V *p, const V *by_c, const V *by_cc, V *g, V *H) {",
+        "    const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc, V *g, V *H) {",
         f"    V e[{max(1, len(rows))}];",
-        f"    tgco_{name}_slopes(x, u, p, e);",
+        f"    tgco_{name}_slopes(x, u, p, w, e);",
     ]
     places = sorted(zip(rows, columns, range(len(rows)), strict=True))
     for row, column, i in places:

@@ -14,7 +14,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.tree import apart
 from torchgco.base.values import whole_numbers_become
 from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
-from torchgco.native.codegen import emit
+from torchgco.native.codegen import calls
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
 from torchgco.native.structures import COST_ARRAYS, Array, TracedCost, array
 from torchgco.problem.problem import Problem
@@ -27,6 +27,10 @@ class CostSource:
 
     stage: KnotSource
     last: KnotSource
+
+    @property
+    def parts(self) -> tuple[KnotSource, KnotSource]:
+        return self.stage, self.last
 
     @property
     def code(self) -> str:
@@ -65,12 +69,15 @@ def trace_cost(problem: Problem) -> CostSource:
     )
 
 
-def cost_arrays(problem: Problem, source: CostSource) -> list[Array]:
-    """The arrays of traced.c: factor and shift (B, 1, 2), and the numbers (B|1, K|1, count) of stages and last knot."""
+def cost_arrays(problem: Problem, source: CostSource, shared: tuple[Tensor, Tensor]) -> list[Array]:
+    """The arrays of traced.c: factor and shift (B, 1, 2), and the numbers (B|1, K|1, count) of stages and last knot.
+
+    `shared` are the numbers that all problems share, of stages and last knot.
+    """
     cost, factor, shift = unscaled(problem)
     own = own_tensors(cost)
-    stage = source.stage.numbers(problem.B, own, lambda: spans_of_cost(problem)[0])
-    last = source.last.numbers(problem.B, own, lambda: spans_of_cost(problem)[1])
+    stage = source.stage.numbers(problem.B, own, shared[0], lambda: spans_of_cost(problem)[0])
+    last = source.last.numbers(problem.B, own, shared[1], lambda: spans_of_cost(problem)[1])
     scale = torch.stack((factor, shift), dim=-1).unsqueeze(1)
     numbers = {TracedCost.FACTOR: scale, TracedCost.STAGE: stage, TracedCost.LAST: last}
     arrays = [array(numbers[which], knots=True) for which in TracedCost]
@@ -125,8 +132,8 @@ def _named(method: str, cost: Cost) -> str:
 def _code(name: str, own: int | None, knot: Knot, _: str) -> str:
     import casadi as ca
 
-    inputs, value = [knot.x, knot.u, knot.numbers], knot.rows[0]
-    gradient, hessian = _derivatives(knot) if own is None else _blocks(knot, own)
+    inputs, value = knot.inputs, knot.rows[0]
+    gradient, hessian, stages = _derivatives(knot) if own is None else _blocks(knot, own)
     size = knot.x.numel() + knot.u.numel()
     slopes = [(i, gradient[i]) for i in range(size) if not gradient[i].is_zero()]
     curvatures = [
@@ -136,8 +143,8 @@ def _code(name: str, own: int | None, knot: Knot, _: str) -> str:
     column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *entries)))
     return "\n".join(
         [
-            emit.emit(f"tgco_{name}_value", ca.Function("value", inputs, [ca.densify(value)])),
-            emit.emit(f"tgco_{name}_entries", ca.Function("entries", inputs, [column])),
+            calls.emit_staged(f"tgco_{name}_value", inputs, [ca.densify(value)], calls.values(knot.calls)),
+            calls.emit_staged(f"tgco_{name}_entries", inputs, [column], stages),
             f"static const int tgco_{name}_places[] = {{{', '.join(map(str, places or [0]))}}};",
             f"#define {name.upper()}_SLOPES {len(slopes)}",
             f"#define {name.upper()}_ENTRIES {len(entries)}",
@@ -145,21 +152,27 @@ def _code(name: str, own: int | None, knot: Knot, _: str) -> str:
     )
 
 
-def _derivatives(knot: Knot) -> tuple[Any, Any]:
-    """Gradient (n+m) and Hessian (n+m, n+m)."""
+def _derivatives(knot: Knot) -> tuple[Any, Any, list[calls.Stage]]:
+    """Gradient (n+m) and Hessian (n+m, n+m), and the stages of networks that they need."""
     import casadi as ca
 
+    def second(total: Any, z: Any) -> Any:
+        # Forward mode only: in reverse mode, a NaN of the branch not taken would come through as 0 * NaN.
+        return ca.jacobian(ca.jacobian(total, z, forward).T, z, forward)
+
     z, forward = ca.vertcat(knot.x, knot.u), {"allow_reverse": False}
-    # Forward mode only: in reverse mode, a NaN of the branch not taken would come through as 0 * NaN.
-    gradient = ca.jacobian(knot.rows[0], z, forward).T
-    return gradient, ca.jacobian(gradient, z, forward)
+    if not knot.calls:
+        return ca.jacobian(knot.rows[0], z, forward).T, second(knot.rows[0], z), []
+    ahead = calls.Ahead(knot.calls, z)
+    stages, hessian = ahead.hessian(knot.rows[0], second)
+    return ahead.jacobian(knot.rows[0]).T, hessian, stages
 
 
-def _blocks(knot: Knot, s: int) -> tuple[Any, Any]:
+def _blocks(knot: Knot, s: int) -> tuple[Any, Any, list[calls.Stage]]:
     """Gradient and Hessian from a block (s, s) in the order [x, 1, u] that follows the value, row by row."""
     import casadi as ca
 
     n = knot.x.numel()
     block = ca.reshape(knot.rows[1:], s, s).T
     z = [i for i in range(s) if i != n]
-    return block[z, n], block[z, z]
+    return block[z, n], block[z, z], calls.values(knot.calls)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from torchgco.native import store
-from torchgco.native.codegen import emit
-from torchgco.native.codegen.dynamics import DynamicsSource, elements, makers
+from torchgco.native.codegen import calls, emit
+from torchgco.native.codegen.dynamics import DynamicsSource, computed_entries, makers, stepped
 from torchgco.native.codegen.knot import Knot, KnotSource, knot_source
 from torchgco.native.codegen.stages import StagesSource
+from torchgco.tracing.nets import Call
 
 # Operations whose derivatives are finite wherever their arguments are.
 SMOOTH = (
@@ -27,48 +28,58 @@ def curvature_code(model: DynamicsSource, functions: Iterable[tuple[int, KnotSou
 
 
 def _model_code(model: DynamicsSource) -> str:
-    """`tgco_curve(x, u, p, y, H)`: H += sum_i y_i times the second derivatives of state i, upper triangle."""
+    """`tgco_curve(x, u, p, w, y, H)`: H += sum_i y_i times the second derivatives of state i, upper triangle.
+
+    With networks it is `tgco_together(x, u, p, w, y, f, H)`, which also does what `tgco_jacobian` does: both need the
+    networks' tangents.
+    """
 
     if isinstance(model, StagesSource):
         return knot_source("curvature", model.stage.span, _stage_code, __file__).code
 
     def make(_: str) -> dict[str, Any]:
-        import casadi as ca
-
-        x, u = ca.SX.sym("x", model.n), ca.SX.sym("u", model.m)
-        p, y = ca.SX.sym("p", model.traced.count), ca.SX.sym("y", model.n)
-        ahead = model.traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
-        total = ca.dot(y, ca.densify(ca.vertcat(*ahead)))
-        return {"code": _curves("tgco_curve", [x, u, p, y], total, ca.vertcat(x, u))}
+        return {"code": _step_code(*stepped(model.traced, model.n, model.m))}
 
     key = "curvature", model.key, *makers(__file__)
-    return store.made(key, make, f"curvature {model.traced.kin}").content["code"]
+    code = store.made(key, make, f"curvature {model.traced.kin}").content["code"]
+    return emit.checked(model.traced.field, code)
 
 
 def _stage_code(knot: Knot, _: str) -> str:
+    return _step_code(knot.inputs, knot.rows, knot.calls)
+
+
+def _step_code(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> str:
+    """Of a step `ahead` (n), CasADi's column, with calls of networks."""
     import casadi as ca
 
-    y = ca.SX.sym("y", knot.rows.numel())
-    return _curves("tgco_curve", [knot.x, knot.u, knot.numbers, y], ca.dot(y, knot.rows), ca.vertcat(knot.x, knot.u))
+    y = ca.SX.sym("y", ahead.numel())
+    if not found:
+        return _curves("tgco_curve", [*inputs, y], ca.dot(y, ahead))
+    tangents = calls.Ahead(found, ca.vertcat(*inputs[:2]))
+    slopes = computed_entries(tangents.jacobian(ahead))
+    code = _curves("tgco_together", [*inputs, y], ca.dot(y, ahead), tangents, slopes)
+    return f"{code}\n#define TGCO_TOGETHER"
 
 
 def _rows_code(knot: Knot, name: str) -> str:
     """`tgco_NAME_model` and `tgco_NAME_along` of a traced constraint, as interior_rows.c describes them."""
     import casadi as ca
 
-    z, inputs = ca.vertcat(knot.x, knot.u), [knot.x, knot.u, knot.numbers]
-    slopes = ca.sparsify(ca.jacobian(knot.rows, z, {"allow_reverse": False}))
+    inputs, ahead = knot.inputs, calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
+    slopes = ahead.jacobian(knot.rows)
     rows, columns = slopes.sparsity().get_triplet()
     nonzeros: list[Any] = slopes.nonzeros()
     places = sorted(zip(rows, columns, range(len(rows)), strict=True))
     lam = ca.SX.sym("lam", knot.rows.numel())
+    column = ca.vertcat(ca.SX(0, 1), *nonzeros)
     lines = [
-        _curves(f"tgco_{name}_bend", [*inputs, lam], ca.dot(lam, knot.rows), z),
-        emit.emit(f"tgco_{name}_slants", ca.Function("slants", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)])),
-        f"static inline void tgco_{name}_model(const V *x, const V *u, const V *p, const V *by, const V *cc,",
-        "    const V *lam, V *const *g, V *H) {",
+        _curves(f"tgco_{name}_bend", [*inputs, lam], ca.dot(lam, knot.rows), ahead, column if knot.calls else None),
+        calls.emit_staged(f"tgco_{name}_slants", inputs, [column], ahead.stages),
+        f"static inline void tgco_{name}_model(const V *x, const V *u, const V *p, const double *w, const V *by,",
+        "    const V *cc, const V *lam, V *const *g, V *H) {",
         f"    V e[{max(1, len(rows))}];",
-        f"    tgco_{name}_slants(x, u, p, e);",
+        f"    tgco_{name}_bend(x, u, p, w, lam, e, H);" if knot.calls else f"    tgco_{name}_slants(x, u, p, w, e);",
     ]
     for row, column, i in places:
         lines.append(f"    for (int a = 0; a < PARTS; a++) ADD(g[a][{column}], e[{i}], by[a * MAX_ROWS + {row}]);")
@@ -76,11 +87,12 @@ def _rows_code(knot: Knot, name: str) -> str:
             if other == row and later >= column:
                 lines.append(f"    ADD(H[{column} * (NX + NU) + {later}], e[{i}] * cc[{row}], e[{j}]);")
     lines += [
-        f"    tgco_{name}_bend(x, u, p, lam, H);",
+        *([] if knot.calls else [f"    tgco_{name}_bend(x, u, p, w, lam, H);"]),
         "}",
-        f"static inline void tgco_{name}_along(const V *x, const V *u, const V *p, const V *z, V *out) {{",
+        f"static inline void tgco_{name}_along(",
+        "    const V *x, const V *u, const V *p, const double *w, const V *z, V *out) {",
         f"    V e[{max(1, len(rows))}];",
-        f"    tgco_{name}_slants(x, u, p, e);",
+        f"    tgco_{name}_slants(x, u, p, w, e);",
         f"    for (int j = 0; j < {knot.rows.numel()}; j++) out[j] = SET(0.0);",
         *(f"    ADD(out[{row}], e[{i}], z[{column}]);" for row, column, i in places),
         "}",
@@ -88,20 +100,33 @@ def _rows_code(knot: Knot, name: str) -> str:
     return "\n".join(lines)
 
 
-def _curves(name: str, inputs: list[Any], total: Any, z: Any) -> str:
-    """`NAME(inputs, H)`: H += the second derivatives of `total` by z, upper triangle."""
+def _curves(
+    name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | None = None, slopes: Any = None
+) -> str:
+    """`NAME(inputs, H)`: H += the second derivatives of `total` by the first two inputs, upper triangle.
+
+    Args:
+        tangents: of the calls of networks in `total`.
+        slopes: a column that is to be written, too: `NAME(inputs, slopes, H)`.
+    """
     import casadi as ca
 
-    hessian = ca.sparsify(_hessian(total, z, inputs))
-    size = z.numel()
+    z, stages, size = ca.vertcat(*inputs[:2]), [], inputs[0].numel() + inputs[1].numel()
+    if tangents is not None and tangents.calls:
+        stages, hessian = tangents.hessian(total, lambda total, z: _hessian(total, z, ca.symvar(total)))
+    else:
+        hessian = ca.sparsify(_hessian(total, z, inputs))
     found: list[Any] = hessian.nonzeros()
     rows, columns = hessian.sparsity().get_triplet()
     upper = [(i, j, entry) for i, j, entry in zip(rows, columns, found, strict=True) if j >= i]
     column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *(entry for *_, entry in upper))))
-    arguments = ", ".join(f"const V *in{i}" for i in range(len(inputs)))
+    arguments = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
     passed = ", ".join(f"in{i}" for i in range(len(inputs)))
+    outputs = [column]
+    if slopes is not None:
+        arguments, passed, outputs = f"{arguments}, V *f", f"{passed}, f", [slopes, column]
     lines = [
-        emit.emit(f"{name}_entries", ca.Function("entries", inputs, [column])),
+        calls.emit_staged(f"{name}_entries", inputs, outputs, stages),
         f"__attribute__((noinline)) static void {name}({arguments}, V *H) {{",
         f"    V e[{max(1, len(upper))}];",
         f"    {name}_entries({passed}, e);",
@@ -178,14 +203,15 @@ def _switches(rows: Iterable[tuple[int, KnotSource]]) -> str:
     """`tgco_model_rows` and `tgco_along_rows`, which call the functions of a constraint by its place."""
     models, alongs = [], []
     for i, source in rows:
-        models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, by, cc, lam, g, H); break;")
-        alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, z, out); break;")
+        models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, w, by, cc, lam, g, H); break;")
+        alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, w, z, out); break;")
     return "\n".join(
         [
-            "static inline void tgco_model_rows(int i, const V *x, const V *u, const V *p, const V *by, const V *cc,",
-            "    const V *lam, V *const *g, V *H) {",
+            "static inline void tgco_model_rows(int i, const V *x, const V *u, const V *p, const double *w,",
+            "    const V *by, const V *cc, const V *lam, V *const *g, V *H) {",
             "    switch (i) {", *models, "    }", "}",
-            "static inline void tgco_along_rows(int i, const V *x, const V *u, const V *p, const V *z, V *out) {",
+            "static inline void tgco_along_rows(",
+            "    int i, const V *x, const V *u, const V *p, const double *w, const V *z, V *out) {",
             "    switch (i) {", *alongs, "    }", "}",
         ]
     )  # fmt: skip

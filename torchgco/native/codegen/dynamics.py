@@ -16,19 +16,21 @@ from torch import Tensor
 from torchgco.base.tree import apart
 from torchgco.dynamics import Dynamics
 from torchgco.native import store
-from torchgco.native.codegen import emit
-from torchgco.tracing import Traced, arrays, dtypes, operations, own_tensors
+from torchgco.native.codegen import calls, emit, layers
+from torchgco.tracing import Traced, arrays, dtypes, nets, operations, own_tensors
+from torchgco.tracing.nets import Call
 
 STEP, JACOBIAN = "tgco_step", "tgco_jacobian"
 
 
 @dataclass(frozen=True)
 class DynamicsSource:
-    """A model in C, for the prelude of `emit`, with x (n), u (m), and a problem's own numbers p (count) in vectors V:
+    """A model in C, for the prelude of `emit`, with x (n), u (m), and a problem's own numbers p (count) in vectors V,
+    and the numbers w that all problems share:
 
         static inline void tgco_step(const V *restrict x, const V *restrict u, const V *restrict p,
-                                     V *restrict x_next)       n
-        static inline void tgco_jacobian(the same three, V *restrict entries)      computed
+                                     const double *restrict w, V *restrict x_next)       n
+        static inline void tgco_jacobian(the same four, V *restrict entries)      computed
 
     No output may overlap an input. [fx, fu] (n, n+m) is zero except at `rows`, `columns`, listed column by column.
     Nonzero i is `values[i]` where `places[i]` is -1, else `entries[places[i]]`.
@@ -51,8 +53,10 @@ class DynamicsSource:
         """Number of the Jacobian's entries that `tgco_jacobian` writes."""
         return sum(place >= 0 for place in self.places)
 
-    def numbers(self, B: int, of: Dynamics) -> Tensor:
-        """The own numbers (B|1, K|1, count) of B problems with the model `of`, with an axis of stages."""
+    def numbers(self, B: int, of: Dynamics, shared: Tensor) -> Tensor:
+        """The own numbers (B|1, K|1, count) of B problems with the model `of`, with an axis of stages; `shared` are
+        the numbers that all problems share, of which some may be a stage's own.
+        """
         return self.parameters(torch.arange(B), of).unsqueeze(1)
 
     def parameters(self, index: Tensor, of: Dynamics | None = None) -> Tensor:
@@ -75,8 +79,8 @@ def trace_dynamics(
 ) -> DynamicsSource:
     """The C of `dynamics.step`, taken from the cache folder if it was made before.
 
-    Tensors in `per_element` and `batched` are numbers of each problem; all others, including those that a function
-    closes over, become constants in the code.
+    Tensors in `per_element` and `batched` are numbers of each problem. All others, including those that a function
+    closes over, are numbers that all problems share, or constants in the code: see `Traced`.
 
     Args:
         dynamics: of the whole batch.
@@ -94,33 +98,45 @@ def trace_dynamics(
     key = "model", traced.fingerprint(), *makers()
     parts = store.made(key, lambda _: _made(traced, n, m), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
-    return DynamicsSource(n, m, traced.count, parts.content["code"], **lists, key=parts.key, traced=traced, own=own)
+    code = emit.checked(traced.field, parts.content["code"])
+    return DynamicsSource(n, m, traced.count, code, **lists, key=parts.key, traced=traced, own=own)
 
 
 def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
     """The parts of a DynamicsSource that take CasADi to make."""
+    return step_parts(*stepped(traced, n, m))
+
+
+def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any, list[Call]]:
+    """CasADi's columns x (n), u (m), p and w, and the step (n) that a trace makes of them, with calls of networks."""
     import casadi as ca
 
-    x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", traced.count)
-    ahead = traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
-    return step_parts(x, u, p, ca.densify(ca.vertcat(*ahead)))
+    x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+    p, w = ca.SX.sym("p", traced.count), ca.SX.sym("w", len(traced.pattern))
+    shared = np.where(np.isnan(traced.pattern), elements(w), traced.pattern)
+    found: list[Call] = []
+    ahead = traced(elements(p), elements(x)[None], elements(u)[None], shared=shared, calls=found).reshape(-1)
+    return [x, u, p, w], ca.densify(ca.vertcat(*ahead)), found
 
 
-def step_parts(x: Any, u: Any, p: Any, ahead: Any) -> dict[str, Any]:
-    """The code of a step `ahead` (n) of x, u and the numbers p, CasADi's columns, and the lists of a DynamicsSource."""
+def step_parts(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> dict[str, Any]:
+    """The code of a step `ahead` (n) of inputs x, u, p, w, CasADi's columns, and the lists of a DynamicsSource.
+
+    `found` are the calls of networks in it.
+    """
     import casadi as ca
 
-    # Forward mode only, as `torch.func.jvp`: reverse mode would let a NaN of the branch not taken through as 0 * NaN.
-    jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(x, u), {"allow_reverse": False}))
+    tangents = calls.Ahead(found, ca.vertcat(*inputs[:2]))
+    jacobian = tangents.jacobian(ahead)
     step, jacobian = ca.cse([ahead, jacobian])
     rows, columns = jacobian.sparsity().get_triplet()
     entries: list[Any] = jacobian.nonzeros()
+    changing = computed_entries(jacobian)
     fixed: list[bool] = [entry.is_constant() for entry in entries]
     places = np.where(fixed, -1, np.cumsum(np.logical_not(fixed)) - 1)
-    changing = ca.vertcat(ca.SX(0, 1), *(entry for entry, is_fixed in zip(entries, fixed, strict=True) if not is_fixed))
     code = [
-        emit.emit(name, ca.Function(name, [x, u, p], [ca.densify(result)]))
-        for name, result in ((STEP, step), (JACOBIAN, changing))
+        calls.emit_staged(name, inputs, [ca.densify(result)], stages)
+        for name, result, stages in ((STEP, step, calls.values(found)), (JACOBIAN, changing, tangents.stages))
     ]
     return {
         "code": "\n".join(code),
@@ -129,6 +145,13 @@ def step_parts(x: Any, u: Any, p: Any, ahead: Any) -> dict[str, Any]:
         "places": places.tolist(),
         "values": [float(entry) if is_fixed else 0.0 for entry, is_fixed in zip(entries, fixed, strict=True)],
     }
+
+
+def computed_entries(jacobian: Any) -> Any:
+    """The column of a Jacobian's nonzeros that `tgco_jacobian` writes: those that aren't constants."""
+    import casadi as ca
+
+    return ca.vertcat(ca.SX(0, 1), *(entry for entry in jacobian.nonzeros() if not entry.is_constant()))
 
 
 def elements(column: Any) -> np.ndarray:
@@ -142,7 +165,8 @@ def elements(column: Any) -> np.ndarray:
 @cache
 def makers(*more: str) -> Sequence[str]:
     """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
-    files = (operations.__file__, arrays.__file__, dtypes.__file__, emit.__file__, __file__, *more)
+    modules = (operations, arrays, dtypes, nets, emit, layers, calls)
+    files = (*(module.__file__ for module in modules), str(layers.LOOPS), __file__, *more)
     try:
         casadi = version("casadi")
     except PackageNotFoundError:

@@ -13,10 +13,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchgco.base.errors import InputError
+
 if TYPE_CHECKING:
     import casadi as ca
 
-PRELUDE = (Path(__file__).parents[1] / "c" / "lanes.h").read_text()
+PRELUDE = "\n".join((Path(__file__).parents[1] / "c" / name).read_text() for name in ("lanes.h", "functions.h"))
+MOST_LINES = 150_000  # compiled in some three minutes
 # Functions of the prelude, on each lane.
 _OF_ONE = (
     "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
@@ -25,7 +28,10 @@ _OF_ONE = (
 _OF_TWO = ("pow", "fmod", "atan2", "hypot", "copysign")
 
 
-def emit(name: str, function: ca.Function) -> str:
+SHARED = 3  # of the functions of a model, a cost, a constraint: the input with the numbers that all problems share
+
+
+def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
     """`static inline void NAME(const V *restrict in0, ..., V *restrict out0, ...)`, as straight-line code.
 
     An input is an array of its entries, an output one of its nonzeros in the order of its sparsity; outputs overlap
@@ -35,22 +41,40 @@ def emit(name: str, function: ca.Function) -> str:
     Args:
         name: of the C function.
         function: of scalar expressions (SX).
+        shared: the place of an input that is the same in all lanes, `const double *restrict`; None: there is none.
 
     Raises:
         ValueError: `function` isn't an SX function, or holds an operation without a counterpart in C.
     """
     if not function.is_a("SXFunction"):
         raise ValueError(f"{name}: expected a CasADi function of scalar expressions, got {function.class_name()}")
-    arguments = [f"const V *restrict in{i}" for i in range(function.n_in())]
+    arguments = [f"{input_type(i, shared)} in{i}" for i in range(function.n_in())]
     arguments += [f"V *restrict out{i}" for i in range(function.n_out())]
-    lines, size = _statements(function)
+    lines, size = _statements(function, shared)
     work = ", ".join(f"w{i}" for i in range(size))
     declared = [f"V {work};"] if work else []
     body = "\n".join(f"    {line}" for line in (*declared, *lines))
     return f"static inline void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"
 
 
-def _statements(function: ca.Function) -> tuple[list[str], int]:
+def input_type(i: int, shared: int | None = SHARED) -> str:
+    """The type of input i, a pointer's up to the name."""
+    return "const double *restrict" if i == shared else "const V *restrict"
+
+
+def checked(field: str, code: str) -> str:
+    """The code of a function of the user's, `field`.
+
+    Raises:
+        InputError: it would take minutes to compile.
+    """
+    lines = code.count("\n")
+    if lines > MOST_LINES:
+        raise InputError(field, f"a function that native kernels hold in {MOST_LINES} lines of C", f"{lines} lines")
+    return code
+
+
+def _statements(function: ca.Function, shared: int | None) -> tuple[list[str], int]:
     """A line for each instruction but for products that a sum takes, and how many variables w these lines have."""
     operations, reads = _read(function)
     sums = _sums(operations, reads)
@@ -67,7 +91,7 @@ def _statements(function: ca.Function) -> tuple[list[str], int]:
             place, entry = function.instruction_output(k)
             lines.append(f"out{place}[{entry}] = {given[0]};")
             continue
-        value = sums[k][1].format(*given) if k in sums else _value(function, k, given)
+        value = sums[k][1].format(*given) if k in sums else _value(function, k, given, shared)
         if not free:
             free.append(f"w{size}")
             size += 1
@@ -110,12 +134,13 @@ def _sums(operations: list[int], reads: list[list[int]]) -> dict[int, tuple[int,
     return found
 
 
-def _value(function: ca.Function, k: int, read: list[str]) -> str:
+def _value(function: ca.Function, k: int, read: list[str], shared: int | None) -> str:
     """What an instruction makes of the variables that it reads."""
     at, operation = _codes(), function.instruction_id(k)
     if operation == at["INPUT"]:
         place, entry = function.instruction_input(k)
-        return f"in{place}[{entry}]"
+        value = f"in{place}[{entry}]"
+        return f"SET({value})" if place == shared else value
     if operation == at["CONST"]:
         return f"SET({literal(function.instruction_constant(k))})"
     if operation in _templates():

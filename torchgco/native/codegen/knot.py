@@ -18,8 +18,11 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.native import store
+from torchgco.native.codegen import emit
 from torchgco.native.codegen.dynamics import elements, makers
+from torchgco.native.codegen.layers import NetSource
 from torchgco.tracing import Traced
+from torchgco.tracing.nets import Call
 
 
 @dataclass(frozen=True)
@@ -40,19 +43,30 @@ class Span:
 
 @dataclass(frozen=True)
 class Knot:
-    """CasADi expressions: rows (p) of x (n), u (m) and a knot's numbers (count)."""
+    """CasADi expressions: rows (p) of x (n), u (m), a knot's numbers (count), and the numbers that all share.
+
+    `calls` of networks have inputs of the same, and outputs that the rows depend on.
+    """
 
     x: Any
     u: Any
     numbers: Any
+    shared: Any
     rows: Any
+    calls: Sequence[Call] = ()
+
+    @property
+    def inputs(self) -> list[Any]:
+        """Of the functions that are made of it, in order."""
+        return [self.x, self.u, self.numbers, self.shared]
 
 
 @dataclass(frozen=True)
 class KnotSource:
     """C of one knot's rows (size), and where its numbers come from.
 
-    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span`.
+    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span` and
+    the numbers that all problems share.
     """
 
     code: str
@@ -62,29 +76,29 @@ class KnotSource:
     span: Span = field(repr=False, compare=False)
 
     @cached_property
-    def shared(self) -> Tensor | None:
-        """The numbers (1, K|1, count) where none differs from problem to problem."""
-        fixed = torch.from_numpy(self.span.traced.constants)
-        at = self.places - self.span.traced.count
-        return None if bool((at < 0).any()) else fixed[at].unsqueeze(0)
+    def _is_own(self) -> bool:
+        """Whether some of the numbers differ from problem to problem."""
+        return bool((self.places < self.span.traced.count).any())
 
-    def numbers(self, B: int, own: Sequence[Tensor], again: Callable[[], Span]) -> Tensor:
+    def numbers(self, B: int, own: Sequence[Tensor], shared: Tensor, again: Callable[[], Span]) -> Tensor:
         """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `own`.
 
         Args:
+            shared: `Traced.shared_numbers`.
             again: traces these problems, where a new trace is needed.
 
         Raises:
             InputError: the problems have another function.
         """
-        if self.shared is not None:
-            return self.shared
+        fixed = torch.cat((torch.from_numpy(self.span.traced.constants), shared))
+        if not self._is_own:
+            return fixed[self.places - self.span.traced.count].unsqueeze(0)
         traced = self.span.traced.rebound(self.span.own, own, B)
         if traced is None:
             traced = again().traced
             if traced.fingerprint() != self.span.traced.fingerprint():
                 raise InputError(traced.field, "the same operations for all subsets of a batch", "others")
-        count, fixed = traced.count, torch.from_numpy(traced.constants)
+        count, fixed = traced.count, torch.cat((torch.from_numpy(traced.constants), shared))
         each = traced.parameters_of(torch.arange(B))[:, self.places.clamp(max=count - 1)]
         return torch.where(self.places < count, each, torch.cat((fixed.new_zeros(count), fixed))[self.places])
 
@@ -112,12 +126,15 @@ def knot_parts(
         import casadi as ca
 
         knot, places = _one_knot(span)
-        function = ca.Function("knot", [knot.x, knot.u, knot.numbers], [knot.rows])
-        name = store.key_of((kind, str((span.n, span.m, *_form(function))), *makers(__file__, *files)))[:16]
+        made = [call.outputs for call in knot.calls]
+        function = ca.Function("knot", [*knot.inputs, *made], [knot.rows, *(call.inputs for call in knot.calls)])
+        form = span.n, span.m, *_form(function), *(NetSource(call.net, 0).key for call in knot.calls)
+        name = store.key_of((kind, str(form), *makers(__file__, *files)))[:16]
         return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "places": places}
 
     key = kind, shape, span.traced.fingerprint(), *makers(__file__, *files)
     _, parts = store.made(key, make, f"{kind} {shape} {span.traced.kin}")
+    emit.checked(span.traced.field, parts["code"])
     places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
     return KnotSource(parts["code"], parts["name"], parts["size"], places, span), parts
 
@@ -127,44 +144,102 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
     import casadi as ca
 
     traced, count = span.traced, span.traced.count
-    constants = traced.constants
+    constants, pattern = traced.constants, traced.pattern
+    first_shared = count + len(constants)
     X, U = ca.SX.sym("X", span.states * span.n), ca.SX.sym("U", span.controls * span.m)
-    # Constants are symbols until it is known which ones differ: a 0 or 1 among them would change its knot's form.
-    numbers = ca.SX.sym("p", count + len(constants))
-    each = elements(numbers)
+    # All are symbols until it is known which ones differ: a 0 or 1 among them would change its knot's form.
+    numbers = ca.SX.sym("p", first_shared + len(pattern))
+    each, calls = elements(numbers), _Calls()
     found = traced(
         each[:count],
         elements(X).reshape(1, span.states, span.n),
         elements(U).reshape(1, span.controls, span.m),
-        constants=each[count:],
+        constants=each[count:first_shared],
+        shared=each[first_shared:],
+        calls=calls.all,
     ).reshape(len(span.knots), -1)
     x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
     functions, places, forms, first = [], [], {}, None
     for k, row in zip(span.knots, found, strict=True):
         x_k, u_k = X[k * span.n : (k + 1) * span.n], U[k * span.m : (k + 1) * span.m] if k < span.controls else u
         column = ca.densify(ca.vertcat(ca.SX(0, 1), *row))
-        function = ca.Function("knot", [x_k, u_k, numbers], [column], {"allow_free": True})
+        inside = calls.inside(column)
+        made = [call.outputs for call in inside]
+        results = [column, *(call.inputs for call in inside)]
+        function = ca.Function("knot", [x_k, u_k, numbers, *made], results, {"allow_free": True})
         if function.has_free():
             raise InputError(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
         # Of the same symbols: most knots have the same text, and reading its instructions one by one takes long.
-        functions.append(ca.Function("knot", [x, u, numbers], function.call([x, u, numbers])))
+        inputs = [x, u, numbers, *calls.symbols(inside)]
+        functions.append(ca.Function("knot", inputs, function.call(inputs)))
         text = functions[-1].serialize()
         if text not in forms:
             forms[text] = _form(functions[-1])
         form, used = forms[text]
+        form = [*form, *(calls.key(call) for call in inside)]
         places.append(used)
         first = first or form
         if form != first:
             raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
     differ = [len(set(column)) > 1 for column in zip(*places, strict=True)]
     own = [i for i, place in enumerate(places[0]) if place < count or differ[i]]
-    p = ca.SX.sym("p", len(own))
+    p, w = ca.SX.sym("p", len(own)), ca.SX.sym("w", len(pattern))
     values: list[Any] = [0.0] * count + constants.tolist()
+    values += [w[i] if np.isnan(value) else value for i, value in enumerate(pattern.tolist())]
     for i, place in enumerate(own):
         values[places[0][place]] = p[i]
-    rows = functions[0](x, u, ca.vertcat(ca.SX(0, 1), *values))
+    inside, made = calls.first, calls.symbols(calls.first)
+    rows, *points = functions[0].call([x, u, ca.vertcat(ca.SX(0, 1), *values), *made])
     chosen = [[used[i] for i in own] for used in (places if any(differ) else places[:1])]
-    return Knot(x, u, p, rows), chosen
+    found = [Call(call.net, point, out) for call, point, out in zip(inside, points, made, strict=True)]
+    return Knot(x, u, p, w, rows, found), chosen
+
+
+class _Calls:
+    """The calls of networks at all knots, which of them one knot's rows need, and symbols for these."""
+
+    def __init__(self) -> None:
+        self.all: list[Call] = []
+        self.first: list[Call] = []  # those of the first knot that was asked for
+        self._symbols: list[Any] = []
+        self._owners: dict[int, int] = {}  # the call that makes a symbol
+        self._keys: dict[int, str] = {}
+        self._asked = False
+
+    def inside(self, rows: Any) -> list[Call]:
+        """The calls that rows depend on, be it through other calls, in order."""
+        import casadi as ca
+
+        if not self._owners:
+            self._owners = {name: i for i, call in enumerate(self.all) for name in _names(call.outputs)}
+        places, open_ = set(), [rows] if self.all else []
+        while open_:
+            read = {self._owners[name] for name in _names(open_.pop()) if name in self._owners} - places
+            places |= read
+            open_ += [self.all[i].inputs for i in read]
+        found = [self.all[i] for i in sorted(places)]
+        if not self._asked:
+            self._asked, self.first = True, found
+            self._symbols = [ca.SX.sym(f"o{i}", call.net.size) for i, call in enumerate(found)]
+        return found
+
+    def symbols(self, inside: Sequence[Call]) -> list[Any]:
+        """One knot's outputs: the same symbols at each, where it has the networks of the first one."""
+        same = [call.net.size for call in inside] == [call.net.size for call in self.first]
+        return self._symbols if same else [call.outputs for call in inside]
+
+    def key(self, call: Call) -> str:
+        """What a call computes."""
+        if id(call.net) not in self._keys:
+            self._keys[id(call.net)] = NetSource(call.net, 0).key
+        return self._keys[id(call.net)]
+
+
+def _names(expression: Any) -> set[int]:
+    """The symbols of an expression."""
+    import casadi as ca
+
+    return {symbol.element_hash() for symbol in ca.symvar(expression)}
 
 
 def _form(function: Any) -> tuple[list[tuple], list[int]]:

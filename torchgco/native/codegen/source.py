@@ -190,14 +190,15 @@ def _switches(functions: Iterable[tuple[int, KnotSource]]) -> str:
     """`tgco_rows` and `tgco_add_rows`, which call the functions of a constraint by its place."""
     values, adds = [], []
     for i, rows in functions:
-        values.append(f"    case {i}: tgco_{rows.key}_rows(x, u, p, c); break;")
-        adds.append(f"    case {i}: tgco_{rows.key}_add(x, u, p, by_c, by_cc, g, H); break;")
+        values.append(f"    case {i}: tgco_{rows.key}_rows(x, u, p, w, c); break;")
+        adds.append(f"    case {i}: tgco_{rows.key}_add(x, u, p, w, by_c, by_cc, g, H); break;")
     return "\n".join(
         [
-            "static inline void tgco_rows(int i, const V *x, const V *u, const V *p, V *c) {",
+            "static inline void tgco_rows(int i, const V *x, const V *u, const V *p, const double *w, V *c) {",
             "    switch (i) {", *values, "    }", "}",
             "static inline void tgco_add_rows(",
-            "    int i, const V *x, const V *u, const V *p, const V *by_c, const V *by_cc, V *g, V *H) {",
+            "    int i, const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc,",
+            "    V *g, V *H) {",
             "    switch (i) {", *adds, "    }", "}",
         ]
     )  # fmt: skip

@@ -24,8 +24,8 @@ class StagesSource(DynamicsSource):
 
     stage: KnotSource = field(repr=False, compare=False)
 
-    def numbers(self, B: int, of: Dynamics) -> Tensor:
-        return self.stage.numbers(B, own_tensors(of), lambda: _span(of, len(self.stage.span.knots)))
+    def numbers(self, B: int, of: Dynamics, shared: Tensor) -> Tensor:
+        return self.stage.numbers(B, own_tensors(of), shared, lambda: _span(of, len(self.stage.span.knots)))
 
 
 def trace_model(problem: Problem) -> DynamicsSource:
@@ -60,5 +60,5 @@ def _span(model: Dynamics, N: int) -> Span:
 
 
 def _parts(knot: Knot, _: str) -> dict[str, Any]:
-    parts = step_parts(knot.x, knot.u, knot.numbers, knot.rows)
+    parts = step_parts(knot.inputs, knot.rows, knot.calls)
     return {**parts, "places_of_entries": parts.pop("places")}

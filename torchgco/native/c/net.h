@@ -1,0 +1,208 @@
+/* Layers of a network, for one problem: vectors run over neurons.
+
+   The order of sums depends on the processor alone, not on the number of lanes. Matrices M (k, h) lie row by row, so that
+   y = b + M' a, and there are their transposes T (h, k). Arrays over neurons have NET_SIZE(h) numbers, of which those
+   from h on are of no account; tangents G are such arrays for each column. */
+
+#include <stdint.h>
+#include <string.h>
+
+#ifdef __AVX512F__
+#define NET_WIDTH 8
+#else
+#define NET_WIDTH 4
+#endif
+#define NET_SIZE(h) (((h) + 15) / 16 * 16) /* whole vectors of neurons or lanes, in single precision, too */
+typedef REAL Wide __attribute__((vector_size(NET_WIDTH * sizeof(REAL))));
+
+/* a b + c, rounded once where the processor can, whatever the compiler makes of sums and products. */
+#if defined(__FMA__) && !defined(__clang__)
+#if defined(__AVX512F__)
+#define NET_FMA_double(a, b, c) __builtin_ia32_vfmaddpd512_mask(a, b, c, -1, 4)
+#define NET_FMA_float(a, b, c) __builtin_ia32_vfmaddps256(a, b, c)
+#else
+#define NET_FMA_double(a, b, c) __builtin_ia32_vfmaddpd256(a, b, c)
+#define NET_FMA_float(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
+#endif
+#endif
+static inline __attribute__((always_inline)) REAL net_fused_1(REAL a, REAL b, REAL c) {
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+    return TGCO_MATH(fma)(a, b, c);
+#else
+    return a * b + c;
+#endif
+}
+static inline __attribute__((always_inline)) Wide net_fused(Wide a, Wide b, Wide c) {
+#ifdef NET_FMA_double
+    return TGCO_JOIN(NET_FMA_, REAL)(a, b, c);
+#else
+    for (int i = 0; i < NET_WIDTH; i++) c[i] = net_fused_1(a[i], b[i], c[i]);
+    return c;
+#endif
+}
+/* Over the columns and vectors of a block, whose sums are in registers only where the loop is unrolled. */
+#define NET_EACH(i, n) _Pragma("GCC unroll 8") for (int i = 0; i < n; i++)
+
+static inline __attribute__((always_inline)) Wide net_set(REAL a) { return a - (Wide){0}; }
+
+static inline Wide net_load(const double *from) {
+    Wide r;
+#if TGCO_IS_DOUBLE
+    memcpy(&r, from, sizeof r);
+#else
+    for (int i = 0; i < NET_WIDTH; i++) r[i] = (REAL)from[i];
+#endif
+    return r;
+}
+static inline Wide net_wide(const REAL *from) { Wide r; memcpy(&r, from, sizeof r); return r; }
+static inline V net_lanes(const REAL *from) { V r; memcpy(&r, from, sizeof r); return r; }
+static inline void net_store(REAL *to, V a) { memcpy(to, &a, sizeof a); }
+
+/* Weights as numbers of a layer's neurons. */
+static inline void net_weights(const double *from, int h, REAL *to) {
+    memset(to + h, 0, (NET_SIZE(h) - h) * sizeof(REAL));
+    for (int i = 0; i < h; i++) to[i] = (REAL)from[i];
+}
+
+/* Lanes whose numbers have the same bits as those of lane l. */
+static inline I net_alike(V a, int l) { return (I)a == ((I)a)[l]; }
+static inline int net_first(I left) { int l = 0; while (!left[l]) l++; return l; }
+
+/* R vectors of y. */
+#define NET_AFFINE(R) \
+    static inline __attribute__((always_inline)) void net_affine_##R( \
+        const double *M, const double *b, int k, int h, const REAL *a, REAL *y) { \
+        Wide s[R]; \
+        NET_EACH(r, R) s[r] = b ? net_load(b + r * NET_WIDTH) : (Wide){0}; \
+        for (int j = 0; j < k; j++) { \
+            Wide z = net_set(a[j]); \
+            NET_EACH(r, R) s[r] = net_fused(z, net_load(M + (int64_t)j * h + r * NET_WIDTH), s[r]); \
+        } \
+        memcpy(y, s, sizeof s); \
+    }
+NET_AFFINE(8)
+NET_AFFINE(4)
+NET_AFFINE(2)
+NET_AFFINE(1)
+
+/* The sum of w a over n neurons. */
+static inline REAL net_dot(const double *w, const REAL *a, int n) {
+    Wide s = {0};
+    int i = 0;
+    for (; i + NET_WIDTH <= n; i += NET_WIDTH) s = net_fused(net_load(w + i), net_wide(a + i), s);
+    REAL total = 0;
+    for (int l = 0; l < NET_WIDTH; l++) total += s[l];
+    for (; i < n; i++) total = net_fused_1((REAL)w[i], a[i], total);
+    return total;
+}
+
+/* y (h) = b + M' a for a (k); b may be none. What fills y up to whole vectors is 0. */
+__attribute__((noinline)) static void net_affine(
+    const double *M, const double *T, const double *b, int k, int h, const REAL *a, REAL *y) {
+    int i = 0;
+    memset(y + h, 0, (NET_SIZE(h) - h) * sizeof(REAL));
+    if (h <= 8) { /* few long sums */
+        for (; i < h; i++) y[i] = (b ? (REAL)b[i] : 0) + net_dot(T + (int64_t)i * k, a, k);
+        return;
+    }
+    for (; i + 8 * NET_WIDTH <= h; i += 8 * NET_WIDTH) net_affine_8(M + i, b ? b + i : 0, k, h, a, y + i);
+    for (; i + 4 * NET_WIDTH <= h; i += 4 * NET_WIDTH) net_affine_4(M + i, b ? b + i : 0, k, h, a, y + i);
+    for (; i + 2 * NET_WIDTH <= h; i += 2 * NET_WIDTH) net_affine_2(M + i, b ? b + i : 0, k, h, a, y + i);
+    for (; i < h; i += NET_WIDTH) {
+        if (i > h - NET_WIDTH) i = h - NET_WIDTH; /* the last vector computes again some that are there already */
+        net_affine_1(M + i, b ? b + i : 0, k, h, a, y + i);
+    }
+}
+
+/* R vectors of M' G for C columns. */
+#define NET_COLUMNS(R, C) \
+    static inline __attribute__((always_inline)) void net_columns_##R##_##C( \
+        const double *M, int k, int h, const REAL *G, REAL *sums) { \
+        Wide s[R][C]; \
+        NET_EACH(r, R) NET_EACH(c, C) s[r][c] = (Wide){0}; \
+        for (int j = 0; j < k; j++) { \
+            Wide m[R]; \
+            NET_EACH(r, R) m[r] = net_load(M + (int64_t)j * h + r * NET_WIDTH); \
+            NET_EACH(c, C) { \
+                Wide g = net_set(G[c * NET_SIZE(k) + j]); \
+                NET_EACH(r, R) s[r][c] = net_fused(m[r], g, s[r][c]); \
+            } \
+        } \
+        NET_EACH(r, R) NET_EACH(c, C) \
+            memcpy(sums + c * NET_SIZE(h) + r * NET_WIDTH, &s[r][c], sizeof s[r][c]); \
+    } \
+
+#define NET_COLUMN_BLOCKS(C) \
+    NET_COLUMNS(2, C) \
+    NET_COLUMNS(1, C) \
+    static void net_columns_##C(const double *M, int k, int h, const REAL *G, REAL *sums) { \
+        int i = 0; \
+        for (; i + 2 * NET_WIDTH <= h; i += 2 * NET_WIDTH) net_columns_2_##C(M + i, k, h, G, sums + i); \
+        for (; i < h; i += NET_WIDTH) { \
+            if (i > h - NET_WIDTH) i = h - NET_WIDTH; /* the last vector computes again some that are there already */ \
+            net_columns_1_##C(M + i, k, h, G, sums + i); \
+        } \
+    }
+NET_COLUMN_BLOCKS(6)
+NET_COLUMN_BLOCKS(4)
+NET_COLUMN_BLOCKS(2)
+NET_COLUMN_BLOCKS(1)
+
+/* sums (d, h) = M' G for tangents G (d, k). */
+__attribute__((noinline)) static void net_columns(
+    const double *M, const double *T, int k, int h, int d, const REAL *G, REAL *sums) {
+    if (h <= 8) {
+        for (int i = 0; i < h; i++)
+            for (int c = 0; c < d; c++) sums[c * NET_SIZE(h) + i] = net_dot(T + (int64_t)i * k, G + c * NET_SIZE(k), k);
+        return;
+    }
+    for (int c = 0, step; c < d; c += step, G += step * NET_SIZE(k), sums += step * NET_SIZE(h)) {
+        step = d - c >= 6 ? 6 : d - c >= 4 ? 4 : d - c >= 2 ? 2 : 1;
+        if (step == 6) net_columns_6(M, k, h, G, sums);
+        else if (step == 4) net_columns_4(M, k, h, G, sums);
+        else if (step == 2) net_columns_2(M, k, h, G, sums);
+        else net_columns_1(M, k, h, G, sums);
+    }
+}
+
+/* v (k) += M y for y (h). */
+static inline void net_back(const double *M, const double *T, int k, int h, const REAL *y, REAL *v) {
+    REAL s[NET_SIZE(k)];
+    net_affine(T, M, 0, h, k, y, s);
+    for (int j = 0; j < k; j++) v[j] += s[j];
+}
+
+/* H[a][b] += sum_i w_i s_i t_i for two tangents s, the columns a and a + 1, and up to C tangents t, b and after. */
+#define NET_PAIRS(C) \
+    static void net_pairs_##C(int h, int d, const REAL *w, const REAL *s, const REAL *t, REAL *H) { \
+        Wide sum[2][C]; \
+        NET_EACH(a, 2) NET_EACH(b, C) sum[a][b] = (Wide){0}; \
+        int i = 0, size = NET_SIZE(h); \
+        for (; i + NET_WIDTH <= h; i += NET_WIDTH) { \
+            Wide by = net_wide(w + i), first = by * net_wide(s + i), second = by * net_wide(s + size + i); \
+            NET_EACH(b, C) { \
+                Wide other = net_wide(t + b * size + i); \
+                sum[0][b] = net_fused(first, other, sum[0][b]); \
+                sum[1][b] = net_fused(second, other, sum[1][b]); \
+            } \
+        } \
+        for (int a = 0; a < 2; a++) NET_EACH(b, C) { \
+            REAL total = 0; \
+            for (int l = 0; l < NET_WIDTH; l++) total += sum[a][b][l]; \
+            for (int j = i; j < h; j++) total = net_fused_1(w[j] * s[a * size + j], t[b * size + j], total); \
+            H[a * d + b] += total; \
+        } \
+    }
+NET_PAIRS(6)
+NET_PAIRS(2)
+
+/* H (d, d) += sum_i w_i s_i t_i', its upper triangle at least, for tangents s and t (d, h); H, s and t have a column
+   more than d where d is odd. */
+__attribute__((noinline)) static void net_congruence(int h, int d, const REAL *w, const REAL *s, const REAL *t, REAL *H) {
+    int even = d + d % 2, size = NET_SIZE(h);
+    for (int a = 0; a < even; a += 2)
+        for (int b = a, step; b < even; b += step) {
+            step = even - b >= 6 ? 6 : 2;
+            (step == 6 ? net_pairs_6 : net_pairs_2)(h, even, w, s + a * size, t + b * size, H + a * even + b);
+        }
+}

@@ -1,0 +1,170 @@
+"""Expressions with calls of networks in them: their derivatives, and their C.
+
+Between the calls lie expressions of scalars. C computes the inputs of a call, then the call, and so on; what a call
+gives (outputs, tangents, products with its Jacobian, second derivatives) are symbols in all that comes after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torchgco.base.errors import InputError
+from torchgco.native.codegen import emit
+from torchgco.native.codegen.layers import NetSource
+from torchgco.tracing.nets import Call
+
+MOST_KEPT = 4_000_000  # bytes of the stack that the networks of a function may take
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A function of a network in C: CasADi's columns of what it reads, expressions, and writes, symbols."""
+
+    source: NetSource
+    inputs: Any
+    outputs: Any
+    ahead: int | None  # of a product with the transposed Jacobian: the stage that went before it
+
+
+class Ahead:
+    """Calls with their tangents along the columns of `z`, a column of symbols.
+
+    A call whose inputs don't depend on z has none.
+    """
+
+    def __init__(self, calls: Sequence[Call], z: Any) -> None:
+        import casadi as ca
+
+        self.z, self.calls = z, calls
+        self.stages: list[Stage] = []
+        self.columns: list[list[int]] = []  # of z, on which each call's inputs depend
+        self.slopes: list[Any] = []  # of each call's outputs by z
+        for i, call in enumerate(calls):
+            of_inputs = self.jacobian(call.inputs)
+            columns, plain = _columns(of_inputs)
+            tangents = ca.SX.sym(f"t{i}", call.outputs.numel(), len(columns))
+            slopes = ca.SX(call.outputs.numel(), z.numel())
+            if columns:
+                slopes[:, columns] = tangents
+            inputs = call.inputs if plain else ca.vertcat(call.inputs, ca.densify(ca.vec(of_inputs[:, columns])))
+            source = NetSource(call.net, len(columns), plain)
+            self.stages.append(Stage(source, inputs, ca.vertcat(call.outputs, ca.vec(tangents)), None))
+            self.columns.append(columns)
+            self.slopes.append(slopes)
+
+    def jacobian(self, expression: Any) -> Any:
+        """Derivatives of a column by z, through all calls so far.
+
+        By forward mode alone: reverse mode would let a NaN of the branch not taken through as 0 * NaN.
+        """
+        import casadi as ca
+
+        forward = {"allow_reverse": False}
+        total = ca.jacobian(expression, self.z, forward)
+        for call, slopes in zip(self.calls, self.slopes, strict=False):
+            through = ca.sparsify(ca.jacobian(expression, call.outputs, forward))
+            if through.nnz():
+                total += ca.mtimes(through, slopes)
+        return ca.sparsify(total)
+
+    def hessian(self, total: Any, second: Callable[[Any, Any], Any]) -> tuple[list[Stage], Any]:
+        """Second derivatives of a scalar by z, and the stages that they need.
+
+        Args:
+            second: second derivatives of a scalar by a column, calls left aside.
+        """
+        import casadi as ca
+
+        stages, bent = list(self.stages), ca.SX(self.z.numel(), self.z.numel())
+        for i in reversed(range(len(self.calls))):
+            call, columns = self.calls[i], self.columns[i]
+            by = ca.densify(ca.jacobian(total, call.outputs, {"allow_reverse": False})).T
+            if not columns or by.is_zero():
+                continue
+            back = ca.SX.sym(f"v{i}", call.inputs.numel())
+            upper = ca.SX.sym(f"h{i}", len(columns) * (len(columns) + 1) // 2)
+            stages.append(Stage(self.stages[i].source, by, ca.vertcat(back, upper), i))
+            pairs = [(p, q) for at, p in enumerate(columns) for q in columns[at:]]
+            for (p, q), entry in zip(pairs, ca.vertsplit(upper), strict=True):
+                bent[p, q] += entry
+                if p != q:
+                    bent[q, p] += entry
+            total += ca.dot(back, call.inputs)
+        symbols = [self.z, *(call.outputs for call in self.calls)]
+        along = ca.vertcat(ca.SX.eye(self.z.numel()), *self.slopes)
+        own = ca.sparsify(second(total, ca.vertcat(*symbols)))
+        return stages, ca.sparsify(bent + ca.mtimes(ca.mtimes(along.T, own), along))
+
+
+def _columns(of_inputs: Any) -> tuple[list[int], bool]:
+    """The columns in which a Jacobian isn't zero; and whether it is the unit matrix there, in this order."""
+    rows, columns = of_inputs.sparsity().get_triplet()
+    ones = all(entry.is_one() for entry in of_inputs.nonzeros())
+    if ones and sorted(rows) == list(range(of_inputs.size1())) and len(set(columns)) == len(columns):
+        return [column for _, column in sorted(zip(rows, columns, strict=True))], True
+    return sorted(set(columns)), False
+
+
+def values(calls: Sequence[Call]) -> list[Stage]:
+    """Calls without derivatives."""
+    return [Stage(NetSource(call.net, 0), call.inputs, call.outputs, None) for call in calls]
+
+
+def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages: Sequence[Stage]) -> str:
+    """`emit` of columns of expressions, which may depend on what the stages write.
+
+    Raises:
+        InputError: the networks' derivatives take too much memory.
+    """
+    import casadi as ca
+
+    kept = _needed(stages, ca.vertcat(*outputs))
+    if not kept:
+        return emit.emit(name, ca.Function(name, [*inputs], [*outputs]), emit.SHARED)
+    if (kept_bytes := sum(stages[i].source.kept_bytes for i in kept if stages[i].ahead is None)) > MOST_KEPT:
+        raise InputError("networks", f"derivatives of at most {MOST_KEPT} bytes in native kernels", kept_bytes)
+    given = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
+    passed = ", ".join(f"in{i}" for i in range(len(inputs)))
+    helpers, declared, lines, symbols = [], [], [], [*inputs]
+    for i in kept:
+        stage = stages[i]
+        helpers.append(stage.source.code)
+        helpers.append(emit.emit(f"{name}_{i}", ca.Function(name, symbols, [stage.inputs]), emit.SHARED))
+        declared.append(f"    V a{i}[{stage.inputs.numel()}], b{i}[{stage.outputs.numel()}];")
+        if stage.source.d and stage.ahead is None:
+            declared.append(f"    tgco_net_{stage.source.key}_kept kept{i}[1];")
+        lines += [f"    {name}_{i}({passed}, a{i});", f"    {_called(i, stage)};"]
+        symbols, passed = [*symbols, stage.outputs], f"{passed}, b{i}"
+    helpers.append(emit.emit(f"{name}_end", ca.Function(name, symbols, [*outputs]), emit.SHARED))
+    lines.append(f"    {name}_end({passed}, {', '.join(f'out{i}' for i in range(len(outputs)))});")
+    written = ", ".join(f"V *restrict out{i}" for i in range(len(outputs)))
+    head = f"__attribute__((noinline)) static void {name}({given}, {written}) {{"
+    return "\n".join([*dict.fromkeys(helpers), head, *declared, *lines, "}\n"])
+
+
+def _called(i: int, stage: Stage) -> str:
+    """The call of stage i, from a to b."""
+    net, key, w = stage.source.net, stage.source.key, f"in{emit.SHARED}"
+    if stage.ahead is not None:
+        return f"tgco_net_{key}_back({w}, kept{stage.ahead}, a{i}, b{i}, b{i} + {net.k})"
+    if stage.source.d:
+        tangents = "0" if stage.source.plain else f"a{i} + {net.k}"
+        return f"tgco_net_{key}_ahead({w}, a{i}, {tangents}, b{i}, b{i} + {net.size}, kept{i})"
+    return f"tgco_net_{key}({w}, a{i}, b{i})"
+
+
+def _needed(stages: Sequence[Stage], outputs: Any) -> list[int]:
+    """The stages that an expression depends on."""
+    import casadi as ca
+
+    wanted, kept = {symbol.element_hash() for symbol in ca.symvar(outputs)}, set()
+    for i in reversed(range(len(stages))):
+        stage = stages[i]
+        if i in kept or not wanted.isdisjoint(symbol.element_hash() for symbol in ca.symvar(stage.outputs)):
+            kept.add(i)
+            wanted |= {symbol.element_hash() for symbol in ca.symvar(stage.inputs)}
+            if stage.ahead is not None:
+                kept.add(stage.ahead)
+    return sorted(kept)
