@@ -51,6 +51,7 @@ def make_study(folder: Path, compiler: bool = False, code: int = 0, **environmen
     return done.stdout, log.read_text().splitlines()
 
 
+@pytest.mark.slow
 def test_a_machine_without_a_compiler_gets_one(tmp_path: Path) -> None:
     said, calls = make_study(tmp_path)
     assert "No C compiler found: installing the extra native, which brings one." in said

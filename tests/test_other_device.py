@@ -119,7 +119,7 @@ OTHERS = ("spheres", "boxes", "capsules", "oscillating", "function")
 SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS]
 
 
-@pytest.mark.parametrize("kind", ["map", "states", *SLOW])
+@pytest.mark.parametrize("kind", ["states", pytest.param("map", marks=pytest.mark.slow), *SLOW])
 def test_local_solves_are_judged_and_certified(kind: str) -> None:
     def work(problem: Problem, U0: Tensor) -> list[Tensor]:
         found, parts = solved(problem, U0)
@@ -138,7 +138,7 @@ def test_the_longest_step_is_found() -> None:
     on_both(work, "states")
 
 
-@pytest.mark.parametrize("kind", ["boxes", "map", *SLOW])
+@pytest.mark.parametrize("kind", ["states", pytest.param("map", marks=pytest.mark.slow), *SLOW])
 def test_the_interior_point_solves(kind: str) -> None:
     """Another device has the same iterates; a part of the start is free, and a bound has no room."""
 

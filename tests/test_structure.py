@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -42,9 +43,14 @@ def layer_of(name: str) -> tuple[int, str]:
     raise AssertionError(f"{name} is in no layer")
 
 
+@cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text())))
+
+
 def imports_of(path: Path) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes_of(path):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("torchgco"):
             names.add(node.module.removeprefix("torchgco").removeprefix("."))
     return names - {""}
@@ -52,7 +58,7 @@ def imports_of(path: Path) -> set[str]:
 
 def modules_of(path: Path) -> set[str]:
     """All modules that a file may import: each imported name may be a module itself."""
-    froms = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom) and node.module]
+    froms = [node for node in nodes_of(path) if isinstance(node, ast.ImportFrom) and node.module]
     named = {f"{node.module}.{alias.name}" for node in froms for alias in node.names} | {node.module for node in froms}
     return {name.removeprefix("torchgco.") for name in named if name.startswith("torchgco.")}
 

@@ -215,13 +215,13 @@ def test_a_cost_keeps_its_own_sum() -> None:
 
 
 def test_obstacles_are_searched_as_without_rates() -> None:
-    """A wall of discs before the goal: the roadmap finds the way around."""
+    """A wall of discs before the goal: the way around is found, with so low rates from most starts."""
     wall = Spheres([[1.0, y] for y in (-0.4, -0.2, 0.0, 0.2, 0.4)], [0.15] * 5, 0.1)
     near = FunctionConstraint(lambda x: x[..., 1:2] - 1.5, geometric=True)
     cost = QuadraticCost(Q=[0.01] * 6, R=[0.01] * 2, Qf=[200.0, 200, 0, 1, 1, 0], x_ref=[2.0, 0, 0, 0, 0, 0])
     parts = [wall, near, ControlBounds(-20, 20)]
-    model, x0 = Planar(turn_gain=10.0, turn_drag=1.0, drag=1.0), torch.zeros(2, 6, dtype=D)
-    x0[1, 1] = 0.1
+    model, x0 = Planar(turn_gain=10.0, turn_drag=1.0, drag=1.0), torch.zeros(5, 6, dtype=D)
+    x0[:, 1] = torch.linspace(-0.1, 0.1, 5)
     free = torchgco.solve(Problem(model, cost, parts, x0, 60))
     problem = Problem(model, cost, [*parts, RateBounds(-0.6, 0.6)], x0, 60)
     with warnings.catch_warnings():
@@ -229,8 +229,8 @@ def test_obstacles_are_searched_as_without_rates() -> None:
         slow = torchgco.solve(problem)
     assert float(changes(free.U).abs().max()) > 0.7
     assert float(changes(slow.U).abs().max()) <= 0.6001
-    for each in (free, slow):
-        assert bool(judge(problem if each is slow else Problem(model, cost, parts, x0, 60), each.U).reached.all())
+    assert bool(judge(Problem(model, cost, parts, x0, 60), free.U).reached.all())
+    assert int(judge(problem, slow.U).reached.sum()) >= 3
 
 
 def test_new_limits_and_new_controls_before_need_no_new_kernel() -> None:

@@ -206,6 +206,7 @@ def test_the_plants_agree_on_a_step_command(dt, tolerance) -> None:
     torch.testing.assert_close(a, b, rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 @needs_drone_models
 def test_the_plants_agree_with_errors_drag_and_wind() -> None:
     """Measured 1.1e-11."""

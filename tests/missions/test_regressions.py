@@ -84,7 +84,8 @@ def test_a_problem_started_elsewhere_is_a_fresh_one_with_its_kernels_kept(B: int
         for parts in (constraints(B, seed), fresh.constraints):
             dynamics = None if bias is None else fresh.dynamics
             moved = first.started_at(fresh.x0, parts, dynamics=dynamics)
-            assert engine_of(moved) is engine
+            kept = engine_of(moved)
+            assert kept is not None and kept.library is engine.library
             assert torch.equal(cost_unit(moved), cost_unit(horizon(B, seed, bias)))
             assert_same_bits(SOLVER.solve(moved, controls(moved), seed=4), SOLVER.solve(fresh, controls(fresh), seed=4))
     again = first.started_at(first.x0, first.constraints)

@@ -108,7 +108,13 @@ def differ(one: Solution, other: Solution) -> bool:
     return not (torch.equal(one.U, other.U) and torch.equal(one.iterations, other.iterations))
 
 
-@pytest.mark.parametrize(("kind", "name"), FIELDS, ids=lambda part: part if isinstance(part, str) else part.__name__)
+LONGEST = (ClearChords, "solver"), (ClearChords, "rounds")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [pytest.param(*f, marks=[pytest.mark.slow] * (f in LONGEST)) for f in FIELDS],
+    ids=lambda part: part if isinstance(part, str) else part.__name__,
+)  # fmt: skip
 def test_every_field_is_read(kind: type, name: str) -> None:
     flown, before, row, other, after = FIELDS[kind, name]
     assert isinstance(row, kind) and getattr(row, name) != other

@@ -64,7 +64,7 @@ BATCHES = {
 
 
 @pytest.mark.parametrize("solver", ["gco", "restarts"])
-@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize("batch", ["planar", "quadrotor", pytest.param("boxes", marks=pytest.mark.slow)])
 def test_freed_slots_are_taken_by_waiting_problems(batch: str, solver: str) -> None:
     problem, U0 = BATCHES[batch]()
     problem.x0[4, 0] = torch.nan  # a waiting problem that cannot start
@@ -95,7 +95,9 @@ def test_alone_in_any_batch_and_in_any_order(batch: str, solver: str) -> None:
 
 @pytest.mark.parametrize("native", ["eager"], indirect=True)
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "restarts"])
-@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize(
+    "batch", ["planar", *(pytest.param(b, marks=pytest.mark.slow) for b in ("quadrotor", "boxes"))]
+)
 def test_eager_kernels_keep_the_contract(batch: str, solver: str, native: bool) -> None:
     check_alone_in_any_batch_and_in_any_order(batch, solver)
 

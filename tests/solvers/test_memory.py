@@ -34,6 +34,7 @@ print((peak(402) - small) / 400)
 """
 
 
+@pytest.mark.slow
 def test_a_problem_takes_the_estimated_memory() -> None:
     problem, _ = quadrotor_batch(B=3, N=40, obstacles=20)
     done = subprocess.run([sys.executable, "-c", PEAK], capture_output=True, text=True, check=True)

@@ -214,6 +214,7 @@ def test_offsets_are_for_two_controls() -> None:
     assert solve(problem).statuses == [Status.CONVERGED]
 
 
+@pytest.mark.slow
 def test_bounded_swing_ups_and_parkings_to_an_equality_are_solved_without_options() -> None:
     for limit in (3.0, 5.0, 8.0):
         base = pendulum()

@@ -32,6 +32,7 @@ from torchgco.solvers.state import SolveEnd
 
 D, INF = torch.float64, torch.inf
 SOLVERS = "gco", "gco_fast", "gco_max", "interior_point", "al_ilqr", "mppi", "ipopt", "hold"
+SLOW = "gco_max", "mppi"
 CLAIMS = Status.CONVERGED, Status.FEASIBLE
 
 
@@ -50,7 +51,7 @@ def among_discs(horizon: Tensor | None = None) -> Problem:
     )
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", [pytest.param(s, marks=[pytest.mark.slow] * (s in SLOW)) for s in SOLVERS])
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 def test_costs_and_violations_are_those_of_what_is_returned(solver: str) -> None:
     for horizon in (None, torch.tensor([30, 20])):
@@ -94,9 +95,7 @@ def test_a_cost_that_is_not_finite_is_no_solution(name: str, solver: str) -> Non
     stage = lambda x, u: COSTS[name](x, u) + 0.1 * u[..., 0].square()
     end = lambda x: 10 * (x[..., 0] - 3).square() + x[..., 1].square()
     x0 = torch.stack((torch.linspace(0, 1, 8, dtype=D), torch.zeros(8, dtype=D)), dim=-1)
-    problem = Problem(
-        FunctionDynamics(cart, 2, 1, 0.1), FunctionCost(stage, end), [ControlBounds(-2.0, 2.0)], x0, 30
-    )
+    problem = Problem(FunctionDynamics(cart, 2, 1, 0.1), FunctionCost(stage, end), [ControlBounds(-2.0, 2.0)], x0, 30)
     found = torchgco.solve(problem, solver=solver)
     for status, cost in zip(found.statuses, found.cost.tolist(), strict=True):
         assert math.isfinite(cost) or status is Status.NON_FINITE, (status, cost)

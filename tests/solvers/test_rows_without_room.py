@@ -31,6 +31,7 @@ from torchgco.native.compiler import find_compiler
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 D, INF, B = torch.float64, torch.inf, 64
 SOLVERS = "gco", "interior_point"
+MOSTLY = ("interior_point", pytest.param("gco", marks=pytest.mark.slow))  # where the passes of `gco` add nothing
 Plain = tuple[Callable[[Sequence[Constraint]], Problem], list[Constraint]]  # a problem of constraints, and its own
 
 
@@ -100,7 +101,7 @@ def test_bounds_that_a_given_start_meets(make: Callable[[float], Plain], off: fl
     assert_same_answer(torchgco.solve(of([own[0], also]), solver=solver), torchgco.solve(of(own), solver=solver))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", MOSTLY)
 def test_rows_that_are_constant(solver: str) -> None:
     """By a mask, at all knots, at the start of a state that nothing changes, and of states and controls together."""
     of, own = battery()
@@ -115,7 +116,7 @@ def test_rows_that_are_constant(solver: str) -> None:
         assert_same_answer(torchgco.solve(of([*own, more]), solver=solver), expected)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", MOSTLY)
 def test_rows_of_a_state_that_nothing_moves(solver: str) -> None:
     """A mass, bounded from above by itself; guesses are moved inside of their bounds."""
     mass, of_all = 1.0 + drawn(10, 0.0, 9.0), torch.zeros(B, 3, dtype=D)
@@ -134,7 +135,7 @@ def test_rows_of_a_state_that_nothing_moves(solver: str) -> None:
         assert_same_answer(torchgco.solve(of([*own, more]), solver=solver), expected)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", MOSTLY)
 def test_rows_that_move_by_rounding_alone(solver: str) -> None:
     """The length of what is turned."""
     angle = drawn(11, 0.3, 3.0)
@@ -227,7 +228,7 @@ def test_rows_that_leave_one_point(solver: str) -> None:
     torch.testing.assert_close(found.cost[:4], theirs.cost, rtol=1e-5, atol=0)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", MOSTLY)
 def test_bounds_that_coincide_are_equalities(solver: str) -> None:
     """Of the last state and of the controls of four stages; multipliers have the signs of an inequality's."""
     of, own = cart()

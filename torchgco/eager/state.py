@@ -260,7 +260,7 @@ def find_solved(kinds: Kinds, t: State, test: Errors, running: Tensor) -> Tensor
     met = met & (~counts | rests)
     loose = ~t.presses if how.tolerance >= how.rounding else torch.zeros_like(met)
     met = met & (loose | (error <= 2.0 * t.mu) | (t.idle >= 1))
-    return met | (feasible & rests & (error <= how.rounding) & (error <= 2.0 * t.least))
+    return met | (feasible & rests & (error <= how.rounding))
 
 
 def barrier_counts(kinds: Kinds, t: State) -> Tensor:

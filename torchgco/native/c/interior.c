@@ -192,7 +192,7 @@ static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
     k->presses |= counts;
     met &= ~counts | rests;
     met &= ((SET(how->tolerance) >= SET(how->rounding)) & ~k->presses) | (error <= SET(2.0) * t->mu) | (k->idle >= one);
-    return met | (feasible & rests & (error <= SET(how->rounding)) & (error <= SET(2.0) * k->least));
+    return met | (feasible & rests & (error <= SET(how->rounding)));
 }
 
 /* Where a multiplier of an inequality explodes, rows leave each other no room: they are relaxed, as IPOPT's bounds are. */
