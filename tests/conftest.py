@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from functools import cache
+from pathlib import Path
 
 import omegaconf.base
 import pytest
@@ -15,6 +16,7 @@ import yaml
 from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 
+ROOT = Path(__file__).parents[1]
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
 # Most tests spend more time in the compiler than in what it has made: with -Og it takes a third of the time, and solves
 # up to twice as long, with the same bits (tests/native/test_units.py).
@@ -39,6 +41,23 @@ def _parse_once() -> None:
 
 
 _parse_once()
+# Without a C compiler PyTorch's kernels solve, many times slower: these folders, whose tests are of native kernels or
+# of many solves, are skipped then.
+COMPILED = (
+    "native", "compiled", "search", "missions", "benchmarks", "experiments", "notebooks", "golden", "fuzz", "solvers",
+    "view", "cluster",
+)  # fmt: skip
+
+
+def pytest_report_header() -> str | None:
+    return None if find_compiler() else f"no C compiler: without the tests of {', '.join(COMPILED)}"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if find_compiler() is None:
+        for item in items:
+            if not set(COMPILED).isdisjoint(item.path.relative_to(ROOT).parts):
+                item.add_marker(pytest.mark.skip(reason="no C compiler"))
 
 
 @pytest.fixture(params=["native", "eager"])
