@@ -114,6 +114,7 @@ def test_a_configured_log_gets_the_line_instead(shown, caplog, monkeypatch) -> N
     assert caplog.messages == ["working"] and shown.getvalue() == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_the_first_compilation_is_announced_in_a_terminal(tmp_path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "TORCHGCO_CACHE": str(tmp_path)}

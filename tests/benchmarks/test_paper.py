@@ -69,6 +69,7 @@ def test_the_papers_planners_have_nothing_of_the_librarys_own() -> None:
         assert (tracker.multipliers == "reset" and tracker.inner.as_printed) == (name != "gco")
 
 
+@pytest.mark.slow
 def test_figures_of_a_mission_show_samples_medians_and_names() -> None:
     (part,) = flights.fly(["gco_paper"], 0.1)
     assert part.tolerance == np.inf and (part.frame["guided"] > 0).all()

@@ -214,6 +214,7 @@ def test_a_cost_keeps_its_own_sum() -> None:
         assert BRIEF.solve(problem, U).X.shape == (5, 13, 4)
 
 
+@pytest.mark.slow
 def test_obstacles_are_searched_as_without_rates() -> None:
     """A wall of discs before the goal: the way around is found, with so low rates from most starts."""
     wall = Spheres([[1.0, y] for y in (-0.4, -0.2, 0.0, 0.2, 0.4)], [0.15] * 5, 0.1)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.experiments.commands import HOLD, ROOT, problem_line
+from tests.slow import mostly
 from torchgco import Airframe, InputError, compose, presets
 from torchgco.experiments.config.build import Setup, config_dir
 from torchgco.experiments.config.groups import FAMILIES, options_of
@@ -62,7 +63,7 @@ def test_every_scenario_has_a_model_that_the_matrix_names() -> None:
     assert set(MODEL) | {"layouts", "map"} == set(options_of("scenario")) and set(OF_MODEL) == set(options_of("model"))
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("experiment", mostly(EXPERIMENTS, *set(EXPERIMENTS[1:]) - set(EXPERIMENTS[::4])))
 def test_every_experiment_composes_with_every_scenario_model_and_solver(experiment: str) -> None:
     """As it is, and on every scenario and file; models are named or left to the scenario, solvers take turns."""
     setup = checked(f"experiment={experiment}")

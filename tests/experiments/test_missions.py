@@ -69,6 +69,7 @@ def test_the_figures_show_all_commands(run, tmp_path, monkeypatch) -> None:
         )
 
 
+@pytest.mark.slow
 def test_missions_fly_without_figures_which_are_drawn_when_asked_for(run, tmp_path) -> None:
     words = ["experiment=mission", *SHORT]
     code, out, err = run(*words, "study.figures=false")
@@ -98,6 +99,7 @@ def test_a_mission_alone_has_its_deadlines_and_both_times(missed: int, text: str
     assert f"planner 12 ms (99 %: 25 ms) and tracker 7 ms per control period, {text}. " in line
 
 
+@pytest.mark.slow
 def test_a_study_of_missions_compares_planners_and_is_cut_as_one_likes(run, tmp_path) -> None:
     words = ["experiment=mission_study", *SHORT[:3], "study.layouts=5"]
     code, out, _ = run(*words, "study.shard_size=2", "hydra.run.dir=out")

@@ -91,6 +91,7 @@ def test_missions_with_a_sensor_show_what_was_seen(run, tmp_path, capsys, monkey
         assert words in note and "sensed" not in flight and len(flight["plan"]) == len(flight["path"])
 
 
+@pytest.mark.slow
 def test_the_search_for_the_first_plan_of_a_mission_is_shown(run, tmp_path) -> None:
     words = ["experiment=mission", "scenario=mazes", "scenario.stages=120", "mission.duration=0.05", "study.layouts=2"]
     code, _, err = run(*words, "study.figures=false", "study.workers=1", "hydra.run.dir=first")

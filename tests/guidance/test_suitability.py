@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchgco
 from tests.search.rows import restarts
+from tests.slow import mostly
 from torchgco import (
     GCO,
     MPPI,
@@ -109,7 +110,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", mostly(CASES, "four dimensions", "a function for obstacles"))
 def test_available_guidance_is_used(case: str, in_pytorch: None) -> None:
     """The caught problem is guided, the other is not; each is solved as if alone. Lost parts give one warning."""
     make, why = CASES[case]

@@ -193,6 +193,7 @@ def test_the_plants_agree_on_a_hover() -> None:
     torch.testing.assert_close(*flown, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dt", "tolerance"), [(0.01, 2e-6), (0.002, 3e-9)])
 @needs_drone_models
 def test_the_plants_agree_on_a_step_command(dt, tolerance) -> None:

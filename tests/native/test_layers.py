@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from tests.native.lanes import Emitted, Model
+from tests.slow import mostly
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InteriorPoint, Problem
 from torchgco.native import kernels
 from torchgco.native.codegen.curvature import curvature_code
@@ -150,7 +151,7 @@ def shared(model: FunctionDynamics) -> Tensor:
     return numbers
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", mostly(CASES, "expressions"))
 def test_derivatives_are_those_of_autodiff(name: str) -> None:
     make, integrator = CASES[name]
     function, n, m = make()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.native.lanes import Model
+from tests.slow import mostly
 from torchgco import (
     Dynamics,
     FunctionDynamics,
@@ -85,7 +86,7 @@ def points(model: Dynamics, kind: str) -> tuple[Tensor, Tensor]:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", mostly(MODELS, "plant rk4", "rotors rk4", "quadrotor rk4"))
 def test_steps_and_derivatives(name: str) -> None:
     model = MODELS[name]
     emitted = Model(trace_dynamics(model))

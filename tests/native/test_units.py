@@ -126,6 +126,7 @@ def test_models_share_the_solvers_units() -> None:
     assert Engine(boxed, compiles=False).form.units() == forms[0].units()  # no obstacles change the code
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_bits_are_those_of_any_level_of_optimisation(monkeypatch) -> None:
     """Products and sums are fused where the code says so: no optimisation and no division into units changes a bit."""

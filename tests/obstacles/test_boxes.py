@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tests.problems import boxed_batch, planar_batch, random_trajectory
 from tests.reference import boxes as brute_force
+from tests.slow import mostly
 from torchgco import Boxes, InputError, Problem, Spheres
 from torchgco.obstacles.base import ABSENT, Solids, marked
 from torchgco.obstacles.box_geometry import Cuboids
@@ -72,7 +73,7 @@ def test_distances_by_hand(d: int) -> None:
             assert float(found[0, k, i]) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", mostly([2, 3], 3))
 def test_segments_by_hand(d: int) -> None:
     boxes, (centers, half, rotations) = bound(d)
     a, b = points(d, 25, seed=2), points(d, 25, seed=3)

@@ -183,6 +183,7 @@ def test_without_a_position_there_are_histories_alone_and_without_a_step_knots()
     assert len(axes) == 2 and axes[0].get_xlabel() == "knot"
 
 
+@pytest.mark.slow
 def test_notebooks_show_the_figure_without_pyplot() -> None:
     """In a process of its own: whoever has loaded pyplot has figures shown by its backend."""
     code = """

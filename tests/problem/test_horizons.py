@@ -55,6 +55,7 @@ def test_each_problem_costs_what_it_costs_alone(solver: str, obstacles: bool) ->
         assert bool((found.X[b, h:] == found.X[b, h]).all())
 
 
+@pytest.mark.slow
 def test_kernels_of_pytorch_agree() -> None:
     problem = cars(30, slice(0, 3), True, HORIZONS)
     native = torchgco.solve(problem, solver="al_ilqr").cost

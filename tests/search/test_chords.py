@@ -105,6 +105,7 @@ def test_more_effort_loses_no_clear_trajectory() -> None:
     assert bool((more.cost <= 1.001 * less.cost).all())
 
 
+@pytest.mark.slow
 def test_a_problem_is_cleared_alike_in_every_batch() -> None:
     problem, whole = cleared(corners)
     order = torch.tensor([5, 0, 3])
