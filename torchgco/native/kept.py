@@ -56,7 +56,7 @@ class Kept:
         self._moving = [part.numpy() for part in (self.X, self.U, *self.lam)]
         at_rows = [torch.arange(N + 1, device=like.device)[part.knots].tolist() for part in problem.constraints]
         self._knots: list[Sequence[int]] = [range(N + 1), range(N), *at_rows]
-        self._later = dict[int, list[np.ndarray]]()
+        self._later = dict[int, list[np.ndarray | None]]()
         self._rolled, self._x0 = [part.numpy() for part in self.rolled], problem.x0.numpy()
         self._flat = [part.reshape(B, -1) for part in self._rolled]
         self._gains = self.gains.numpy()
@@ -113,9 +113,12 @@ class Kept:
     def shift(self, by: int) -> None:
         """Let all trajectories and multipliers begin `by` stages later, as `Solution.shifted` does."""
         if by not in self._later:
-            self._later[by] = [np.array(later(knots, by), dtype=np.intp) for knots in self._knots]
+            self._later[by] = [_moved(knots, by) for knots in self._knots]
         for part, at in zip(self._moving, self._later[by], strict=True):
-            part[:] = part[:, at]
+            if at is None:
+                part[:, :-by], part[:, -by:] = part[:, by:], part[:, -1:]
+            else:
+                part[:] = part[:, at]
 
     @property
     def is_outdated(self) -> bool:
@@ -176,6 +179,13 @@ def _spans(rows: np.ndarray) -> list[tuple[int, int]]:
         return [(0, len(rows))]
     edges = np.diff(np.pad(rows.astype(np.int8), 1)).nonzero()[0].tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _moved(knots: Sequence[int], by: int) -> np.ndarray | None:
+    """The places that numbers at these knots come from, `by` stages later; None: each from `by` places on."""
+    at = np.array(later(knots, by), dtype=np.intp)
+    last = len(at) - 1
+    return None if by <= last and np.array_equal(at, np.minimum(np.arange(by, by + len(at)), last)) else at
 
 
 def _copy(old: list[c.Array], new: list[c.Array]) -> None:
