@@ -26,6 +26,7 @@ GUIDED = GuidedCasADi(
 )
 
 
+@pytest.mark.slow
 def test_the_trap_is_left_along_the_path() -> None:
     """From rest both problems end in the trap; with a path both reach the goal."""
     setups = [

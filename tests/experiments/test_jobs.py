@@ -36,6 +36,7 @@ def shards(folder: Path) -> list[str]:
     return sorted(path.name for path in (folder / "shards").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_study_cut_over_jobs_equals_one_in_a_single_piece(run, tmp_path) -> None:
     code, out, err = run("-m", "study.jobs=3", "study.job=range(0,3)", *STUDY)

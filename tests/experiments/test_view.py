@@ -106,6 +106,7 @@ def test_the_search_for_the_first_plan_of_a_mission_is_shown(run, tmp_path) -> N
     assert any(text.startswith("candidate 1 along path ") for text in texts)
 
 
+@pytest.mark.slow
 def test_the_search_is_shown_where_it_is_asked_for(run, tmp_path, capsys) -> None:
     words = ["study.layouts=2", "study.workers=1", "study.figures=false", "hydra.run.dir=sought"]
     code, _, err = run("scenario=planar_trap", *words, "study.baselines=[al_ilqr]")

@@ -110,7 +110,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", mostly(CASES, "four dimensions", "a function for obstacles"))
+@pytest.mark.parametrize("case", mostly(CASES, "four dimensions", "a function for obstacles", "a line"))
 def test_available_guidance_is_used(case: str, in_pytorch: None) -> None:
     """The caught problem is guided, the other is not; each is solved as if alone. Lost parts give one warning."""
     make, why = CASES[case]
@@ -169,6 +169,7 @@ class RefusesSamples(FunctionDynamics):
         return super().step(x, u)
 
 
+@pytest.mark.slow
 def test_dynamics_that_accept_no_samples_are_guided_by_paths_alone(in_pytorch: None) -> None:
     plain = vehicle(2)
     refusing = RefusesSamples(plain.function, 4, 2, 0.1, "euler", plain.position)

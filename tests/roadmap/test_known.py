@@ -7,6 +7,7 @@ import torch
 
 from tests.roadmap.test_roadmap import random_scene
 from tests.roadmap.test_trunks import trunks
+from tests.slow import mostly
 from torchgco.native.kernels import use_native
 from torchgco.roadmap import known as known_searches
 from torchgco.roadmap import roadmap as searches
@@ -30,7 +31,7 @@ def scene(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
     use_native(True)
 
 
-@pytest.mark.parametrize("room", [0, 2**26])
+@pytest.mark.parametrize("room", mostly([0, 2**26], 2**26))
 def test_further_paths_are_those_of_a_search_from_the_beginning(
     scene: Scene, room: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

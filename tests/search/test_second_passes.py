@@ -131,6 +131,7 @@ def test_the_gap_depends_on_no_other_problem(woods) -> None:
     assert torch.equal(part.U, whole.U[index]) and torch.equal(part.iterations, whole.iterations[index])
 
 
+@pytest.mark.slow
 def test_among_moving_obstacles_the_first_solve_runs_to_its_end(monkeypatch) -> None:
     """Problems that arrive have the bits of the local solve; the others are solved again, stopped and sampled."""
     setup = compose(["scenario=crossing", "scenario.num_obstacles=30", "seed=3"])
