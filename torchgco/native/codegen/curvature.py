@@ -63,7 +63,7 @@ def _step_code(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> str:
 
 
 def _rows_code(knot: Knot, name: str) -> str:
-    """`tgco_NAME_model` and `tgco_NAME_along` of a traced constraint, as interior_rows.c describes them."""
+    """`tgco_NAME_model` and `tgco_NAME_along` of a traced constraint, as curvature.c calls them."""
     import casadi as ca
 
     inputs, ahead = knot.inputs, calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
