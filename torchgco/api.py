@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from torchgco.base.html import HtmlPage
+
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
 NAMED = 5  # problems that the warning names
 
@@ -267,6 +269,17 @@ def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = N
     from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
 
     return solution_figure(problem, solution, b)
+
+
+def show(problem: Problem, solution: Solution) -> HtmlPage:
+    """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
+
+    Raises:
+        InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
+    """
+    from torchgco.view import notebook  # slow to load
+
+    return notebook.show(problem, solution)
 
 
 def _guess(problem: Problem, whole: Problem) -> Tensor:
