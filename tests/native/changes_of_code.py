@@ -224,9 +224,12 @@ def attribute_of_a_class() -> Case:
 
 
 @is_code
-def property_of_an_object() -> Case:
-    memory = Memory()
-    return lambda v: memory.hidden * v, lambda: setattr(memory, "value", MUCH)
+def property_replaced() -> Case:
+    class Own(Memory):
+        hidden = property(lambda self: LITTLE)
+
+    memory = Own()
+    return lambda v: memory.hidden * v, lambda: setattr(Own, "hidden", property(lambda self: MUCH))
 
 
 @is_code
