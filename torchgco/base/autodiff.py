@@ -24,8 +24,8 @@ class WithoutReading(TorchFunctionMode):
     """Raises ReadsMemory where a function leaves PyTorch with a tensor that is differentiated or recorded.
 
     Such a tensor has no memory of its own: reading it may crash, and what is made of the numbers is a constant. Other
-    tensors may be read; `seen` keeps by which methods. `called` is the function of PyTorch that was called last,
-    `refused` the first error, which the function itself may have caught.
+    tensors may be read; `seen` keeps by which methods, `read` which ones. `called` is the function of PyTorch that was
+    called last, `refused` the first error, which the function itself may have caught.
     """
 
     READERS = (
@@ -43,6 +43,7 @@ class WithoutReading(TorchFunctionMode):
     def __init__(self) -> None:
         super().__init__()
         self.seen: set[str] = set()
+        self.read: list[Tensor] = []
         self.called: Any = None
         self.refused: ReadsMemory | None = None
 
@@ -54,6 +55,7 @@ class WithoutReading(TorchFunctionMode):
                 found = ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
                 self.refused = self.refused or found
                 raise found
+            self.read += [value for value in args[:1] if isinstance(value, Tensor)]
         return func(*args, **(kwargs or {}))
 
 

@@ -21,6 +21,7 @@ from torchgco.native.identity import signature
 from torchgco.native.interior import InteriorEngine, begin_interior
 from torchgco.native.kernels import native
 from torchgco.native.sampler import Sampler
+from torchgco.native.store import trim
 from torchgco.obstacles.base import TOUCH, Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.border import check_eager
@@ -34,6 +35,7 @@ EXPECTED = "expected"  # marks that the interior point will be asked for
 EAGER = "eager"  # marks that PyTorch's kernels have differentiated a user's parts
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines, the most recent ones
+CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
 
 
@@ -108,9 +110,9 @@ def _engine(problem: Problem) -> Engine:
     engine, after = Engine(problem, ahead), signature(problem)
     # Code that has changed what it reads, a counter for instance, does so at every solve.
     if after is not None and after.key == before.key and after.covers(engine.captured.traces):
+        engine.forget_values()
         _engines[key] = engine, after.facts
-        if len(_engines) > KEPT:
-            del _engines[next(iter(_engines))]
+        trim(_engines, KEPT, CAPTURED, lambda kept: kept[0].captured.nbytes)
     return engine.with_shared(engine.shared.copy())  # a compiled problem writes into it
 
 
