@@ -316,6 +316,17 @@ def length_of_a_choice() -> Case:
 
 
 @is_code
+def place_of_a_cut() -> Case:
+    place = torch.tensor([1])
+
+    def drag(v: Tensor) -> Tensor:
+        first, second = torch.tensor_split(v, place, dim=-1)
+        return torch.cat((LITTLE * first, second), dim=-1)
+
+    return drag, lambda: place.fill_(0)
+
+
+@is_code
 def shape() -> Case:
     drag = torch.ones(2, dtype=D)
     return lambda v: float(drag.numel()) * v, lambda: setattr(drag, "data", torch.ones(5, dtype=D))
