@@ -32,9 +32,9 @@ from torchgco import (
     Problem,
     QuadraticCost,
     Solution,
+    kernels,
 )
 from torchgco.dynamics.rollout import open_loop
-from torchgco.native import kernels
 
 D = torch.float64
 B, N, SIZE = 3, 8, 3

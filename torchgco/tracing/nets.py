@@ -172,9 +172,7 @@ class Nets:
                 yield part, operation
             begun.add(id(part))
 
-    def call(
-        self, part: Part, known: dict[Slot, Any], first: int, precision: torch.dtype, calls: list[Call]
-    ) -> None:
+    def call(self, part: Part, known: dict[Slot, Any], first: int, precision: torch.dtype, calls: list[Call]) -> None:
         """Add a network's calls to `calls`, one a row, and its outputs, symbols, to `known`.
 
         Args:

@@ -100,9 +100,7 @@ def _rows_code(knot: Knot, name: str) -> str:
     return "\n".join(lines)
 
 
-def _curves(
-    name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | None = None, slopes: Any = None
-) -> str:
+def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | None = None, slopes: Any = None) -> str:
     """`NAME(inputs, H)`: H += the second derivatives of `total` by the first two inputs, upper triangle.
 
     Args:
