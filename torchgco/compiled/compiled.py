@@ -155,7 +155,8 @@ class Compiled:
         form, before, self._kept = current(for_solvers(problem)), self._kept, None
         if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
             kernels = interior_of(form)
-            if isinstance(kernels, InteriorEngine):
+            # What Python has read of a problem's own numbers stays in the code.
+            if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
                 self._problem, self._unit = form, cost_unit(form)
                 self._kept = Kept(kernels, form, **self._options(form))
                 if before is not None:

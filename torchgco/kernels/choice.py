@@ -16,6 +16,7 @@ from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import begin_interior
+from torchgco.native.store import trim
 from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Facts
@@ -26,6 +27,7 @@ PYTORCH = "pytorch"
 EXPECTED = "expected"  # marks that the interior point will be asked for
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines, the most recent ones
+CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
 
 
 class EagerWarning(UserWarning):
@@ -104,9 +106,9 @@ def _engine(problem: Problem) -> Engine:
     engine, after = Engine(problem, ahead), signature(problem)
     # Code that has changed what it reads, a counter for instance, does so at every solve.
     if after is not None and after.key == before.key and after.covers(engine.captured.traces):
+        engine.forget_values()
         _engines[key] = engine, after.facts
-        if len(_engines) > KEPT:
-            del _engines[next(iter(_engines))]
+        trim(_engines, KEPT, CAPTURED, lambda kept: kept[0].captured.nbytes)
     return engine.with_shared(engine.shared.copy())  # a compiled problem writes into it
 
 

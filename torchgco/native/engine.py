@@ -84,6 +84,11 @@ class Engine:
             self._libraries[name] = load(units(), STRUCTURES)
         return self._libraries[name]
 
+    def forget_values(self) -> None:
+        """Let go of the numbers of the problem that the functions were traced with: all are solved with their own."""
+        for traced in self.captured.traces:
+            traced.forget_values()
+
     def with_shared(self, shared: Shared) -> Engine:
         """The same functions with other shared numbers, such as `captured.read` gives."""
         other = copy(self)
