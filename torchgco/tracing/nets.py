@@ -28,8 +28,8 @@ SHAPES = ("view", "reshape", "_unsafe_view", "unsqueeze", "squeeze", "expand", "
 LINEAR = ("add", "sub", "rsub", "neg", "full_like", "zeros_like", "ones_like")
 CURVED = (
     "mul", "div", "reciprocal", "pow", "square", "sqrt", "rsqrt", "abs", "sign", "sin", "cos", "tan", "asin", "acos",
-    "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "erf", "sinc", "sigmoid", "elu",
-    "log_sigmoid_forward", "relu", "leaky_relu", "softplus", "gelu", "where", "clamp", "clamp_min", "clamp_max",
+    "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "erf", "sinc", "sigmoid",
+    "elu", "log_sigmoid_forward", "relu", "leaky_relu", "softplus", "gelu", "where", "clamp", "clamp_min", "clamp_max",
     "hardtanh", "maximum", "minimum", "lt", "le", "gt", "ge", "eq", "ne", "logical_and", "logical_or", "logical_not",
 )  # fmt: skip
 KEEPS = {f"aten.{name}" for name in SHAPES} | {"prims.convert_element_type"}
@@ -172,9 +172,7 @@ class Nets:
                 yield part, operation
             begun.add(id(part))
 
-    def call(
-        self, part: Part, known: dict[Slot, Any], first: int, precision: torch.dtype, calls: list[Call]
-    ) -> None:
+    def call(self, part: Part, known: dict[Slot, Any], first: int, precision: torch.dtype, calls: list[Call]) -> None:
         """Add a network's calls to `calls`, one a row, and its outputs, symbols, to `known`.
 
         Args:

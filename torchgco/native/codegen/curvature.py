@@ -100,9 +100,7 @@ def _rows_code(knot: Knot, name: str) -> str:
     return "\n".join(lines)
 
 
-def _curves(
-    name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | None = None, slopes: Any = None
-) -> str:
+def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | None = None, slopes: Any = None) -> str:
     """`NAME(inputs, H)`: H += the second derivatives of `total` by the first two inputs, upper triangle.
 
     Args:
@@ -155,8 +153,8 @@ def _hessian(total: Any, z: Any, inputs: list[Any], made: Container[int] = ()) -
 
 
 def _has_hidden_pole(function: Any, poles: Container[int] = ()) -> bool:
-    """Whether an operation whose derivatives may be infinite, or one of the inputs `poles`, is needed by a branch alone,
-    so that nothing else fails.
+    """Whether an operation whose derivatives may be infinite, or one of the inputs `poles`, is needed by a branch
+    alone, so that nothing else fails.
 
     A pole that is needed without any branch, too, makes the value itself infinite or NaN, in either mode.
     """

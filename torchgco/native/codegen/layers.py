@@ -200,7 +200,9 @@ class NetSource:
         slopes = [self._slope(i, j, "i") for j in range(len(layer.sources))]
         parts = [f"{slope}{' * ' if slope else ''}t{j}[{at}]" for slope, j in zip(slopes, layer.sources, strict=True)]
         total = " + ".join(parts)
-        return f"    for (int c = 0; c < {self.d}; c++) for (int i = 0; i < {layer.h}; i++) t{i}[{at}] = {total or '0'};"
+        return (
+            f"    for (int c = 0; c < {self.d}; c++) for (int i = 0; i < {layer.h}; i++) t{i}[{at}] = {total or '0'};"
+        )
 
     def _backward(self) -> str:
         sizes = self.net.sizes
