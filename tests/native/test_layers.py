@@ -317,6 +317,13 @@ def test_a_single_precision_network_is_rounded_as_by_pytorch() -> None:
     torch.testing.assert_close(Model(trace_dynamics(model)).step(x, u), model.step(x, u), rtol=1e-5, atol=1e-6)
 
 
+def test_sparse_weights_are_read_as_all_others() -> None:
+    W, V = torch.randn(5, 32).relu().to_sparse(), torch.randn(32, 3)
+    model = FunctionDynamics(lambda x, u: torch.tanh(together(x, u) @ W) @ V, 3, 2, 0.1, "none")
+    x, u = torch.randn(4, 3), torch.randn(4, 2)
+    torch.testing.assert_close(Model(trace_dynamics(model)).step(x, u), model.step(x, u), rtol=1e-13, atol=1e-13)
+
+
 def test_pytorch_takes_over_where_a_network_is_large() -> None:
     h = int(MOST_WEIGHTS**0.5)
     net = perceptron(3, h, h, 2)

@@ -158,7 +158,7 @@ class Nets:
         places, end = self._places(first)
         numbers = torch.zeros(end - first, dtype=torch.float64, device="cpu")
         for (slot, turned), place in places.items():
-            value = known[slot].detach()
+            value = known[slot].detach().to_dense()
             part = numbers[place - first :][: value.numel()]
             part.copy_((value.T if turned else value).reshape(-1))
         return numbers
@@ -267,7 +267,7 @@ class _Search:
         part.vectors += read
         self._add(part, operation)
 
-    def _is_of_neurons(self, slot: Slot, width: int) -> bool:
+    def _is_of_neurons(self, slot: Slot, width: int | None) -> bool:
         """Whether all rows are combined with the same weights: one, or one of each neuron, but not one of each row."""
         shape = self._shapes[slot]
         return math.prod(shape[:-1]) == 1 and shape[-1:] in ((), (1,), (width,))
