@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from torchgco import kernels as kernels
 from torchgco import presets as presets
 from torchgco.api import compare as compare
 from torchgco.api import plot as plot
@@ -62,7 +63,6 @@ from torchgco.maps import Field as Field
 from torchgco.maps import OccupancyGrid as OccupancyGrid
 from torchgco.maps import PointCloud as PointCloud
 from torchgco.missions.constraints import FirstStepRates as FirstStepRates
-from torchgco.native import kernels as kernels
 from torchgco.obstacles import Boxes as Boxes
 from torchgco.obstacles import Capsules as Capsules
 from torchgco.obstacles import OscillatingBoxes as OscillatingBoxes

@@ -19,7 +19,7 @@ from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.judging.scale import SHARE, TIGHT, dwarfed
 from torchgco.judging.worst import NONE, kind_of
-from torchgco.native.dispatch import current, engine_of, open_loop
+from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -134,7 +134,7 @@ def compare(
     made = _named_solvers(problem, solvers)
     frames = []
     for name, solver in made.items():
-        engine_of(problem)
+        kernels_of(problem)
         prepared = solver.prepare(problem)
         began = time.perf_counter()
         found = solve(problem, U0, prepared, seed, max_seconds=max_seconds, verbose=False)

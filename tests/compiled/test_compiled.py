@@ -30,9 +30,9 @@ from torchgco import (
     StateBounds,
     Status,
 )
+from torchgco.kernels import use_native
 from torchgco.native import kept
 from torchgco.native.compiler import find_compiler
-from torchgco.native.kernels import use_native
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),

@@ -9,14 +9,15 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import engine_of
 from tests.native import changes_of_code
 from tests.native.changes import INPUTS, D, Drag, number
 from tests.native.changes_of_code import CODE
 from torchgco import FunctionDynamics, Problem, QuadraticCost
 from torchgco.dynamics.rollout import open_loop as by_pytorch
-from torchgco.native import compiler, dispatch
+from torchgco.kernels import choice, current
+from torchgco.native import compiler
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import current, engine_of
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 N = 4
@@ -38,7 +39,7 @@ def after(problem: Problem) -> tuple[Tensor, bool]:
     engine = engine_of(fresh)
     assert engine is not None
     found = engine.open_loop(fresh, U)
-    return found, any(engine.captured is kept.captured for kept, _ in dispatch._engines.values())
+    return found, any(engine.captured is kept.captured for kept, _ in choice._engines.values())
 
 
 def made(drag: Drag) -> Problem:
@@ -85,7 +86,7 @@ def test_training_calls_no_compiler_and_keeps_nothing(solver: str, monkeypatch: 
     compiled = torchgco.compile(problem, solver, tolerance=1e-10)
     found = [torchgco.solve(problem, solver=solver).X]
     compiled()
-    kept = len(compiler._loaded), len(dispatch._engines)
+    kept = len(compiler._loaded), len(choice._engines)
     monkeypatch.setattr(compiler, "_start", lambda *args: pytest.fail("a compiler was called"))
     for _ in range(4):
         steps.zero_grad()
@@ -97,13 +98,13 @@ def test_training_calls_no_compiler_and_keeps_nothing(solver: str, monkeypatch: 
         torch.testing.assert_close(solution.X, model, rtol=1e-11, atol=1e-11)
         torch.testing.assert_close(answer.X, solution.X, rtol=1e-6, atol=1e-7)
         assert float((found[-1] - found[-2]).abs().max()) > 1e-5
-    assert (len(compiler._loaded), len(dispatch._engines)) == kept
+    assert (len(compiler._loaded), len(choice._engines)) == kept
 
 
 @pytest.mark.parametrize("name", ["tensor_in_place", "weight", "array_in_place", "cell", "attribute", "training_flag"])
 def test_what_stays_isnt_traced_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = made((INPUTS | CODE)[name]()[0])
     after(problem)
-    monkeypatch.setattr(dispatch, "Engine", lambda *args: pytest.fail("traced again"))
+    monkeypatch.setattr(choice, "Engine", lambda *args: pytest.fail("traced again"))
     assert after(problem)[1]
     assert after(problem.started_at(X0 + 1.0, ()))[1]

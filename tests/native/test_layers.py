@@ -12,15 +12,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.engines import engine_of
 from tests.native.lanes import Emitted, Model
 from tests.slow import mostly
-from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InteriorPoint, Problem
-from torchgco.native import kernels
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InteriorPoint, Problem, kernels
+from torchgco.kernels import EagerWarning
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource, trace_dynamics
 from torchgco.native.codegen.emit import SHARED
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.tracing import Traced
 from torchgco.tracing.nets import MOST_WEIGHTS, Call
 

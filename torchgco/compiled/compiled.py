@@ -22,9 +22,9 @@ from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_own_numbers
 from torchgco.explaining.account import Account
+from torchgco.kernels import cost_unit, current, interior_of
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import cost_unit, current, interior_of
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept

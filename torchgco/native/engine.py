@@ -55,9 +55,7 @@ class Engine:
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(
-        self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True
-    ) -> None:
+    def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MAX_VARIABLES:

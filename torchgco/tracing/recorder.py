@@ -156,7 +156,6 @@ class Recording(TorchDispatchMode):
         """Whether a tensor in `tree` depends on the function's arguments."""
         return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in _leaves(tree))
 
-
     def _is_outer(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on one from outside that isn't an argument."""
         slots = (self.slot(leaf) for leaf in _leaves(tree) if isinstance(leaf, Tensor))
