@@ -11,9 +11,11 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
+from torchgco.eager.kkt import kkt
 from torchgco.eager.loop import solve
 from torchgco.eager.model import Model
 from torchgco.eager.rows import is_function, joined
+from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.problem.border import ONE_KNOT
 from torchgco.problem.joined import scattered
 from torchgco.problem.problem import Problem
@@ -52,6 +54,12 @@ class EagerInterior:
         to what it can (`fitted`).
         """
         return solve(self.model.among(problem), X, U, multipliers, barrier, **options | fitted(options, X.dtype))
+
+    def kkt(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
+    ) -> KktSolve:
+        """As `native.interior.InteriorEngine.kkt`, in float64."""
+        return kkt(self.model.among(problem), X, U, multipliers, active, right)
 
 
 def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:

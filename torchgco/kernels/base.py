@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgco.eager.sampling import Sampling
 from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.riccati import BackwardPass
+from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.problem.problem import Problem
@@ -22,6 +23,12 @@ class InteriorKernels(Protocol):
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
     ) -> dict[str, Tensor]:
         """See `InteriorEngine.solve`."""
+        ...
+
+    def kkt(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
+    ) -> KktSolve:
+        """See `InteriorEngine.kkt`."""
         ...
 
 

@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.status import Status
+from torchgco.lagrangian.kkt import PIVOT, ROUNDS, STIFF, KktSolve, RightSides
 from torchgco.native.codegen.source import INTERIOR, LANES
 from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
-from torchgco.native.structures import Interior
+from torchgco.native.structures import Interior, Kkt
 from torchgco.problem.problem import Problem
 
 FEW = 2, 4  # lanes of libraries for few problems
@@ -71,6 +73,37 @@ class InteriorEngine:
             ),
         )  # fmt: skip
         return out | ends
+
+    def kkt(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
+    ) -> KktSolve:
+        """Solutions of linear systems with the matrix of the KKT conditions.
+
+        Args:
+            X, U: (B, N+1, n), (B, N, m), contiguous.
+            multipliers: of every constraint, (B, K, p); those of rows that aren't active count as 0.
+            active: which rows hold as equalities, (B, R) bool; all of equalities do.
+            right: the right hand sides.
+        """
+        B, n, free = problem.B, problem.n, problem.free_start
+        out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
+        out["gains"] = X.new_zeros(B, problem.N, problem.m, n + 1)
+        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
+        for row, lam in zip(rows, multipliers, strict=True):
+            row.lam = lam.contiguous()
+        packed = self.engine.packed(problem, X=X.contiguous(), U=U.contiguous(), constraint=rows, **out)
+        sides = {"a": right.a, "b": right.b, "c": right.c}
+        sides = {name: part.clone(memory_format=torch.contiguous_format) for name, part in sides.items()}
+        costates, left = X.new_zeros(B, problem.N + 1, n), X.new_zeros(right.a.shape[0], B)
+        run(
+            self.library.tgco_kkt, B, LANES,
+            Kkt.complete(
+                of=packed, active=active.double().contiguous(), y=costates, left=left, **sides, problems=B,
+                free_start=None if free is None else free.double().contiguous(), count=right.a.shape[0],
+                rounds=ROUNDS, stiff=STIFF, pivot=PIVOT,
+            ),
+        )  # fmt: skip
+        return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, out["status"] == Status.CONVERGED)
 
 
 def begin_interior(engine: Engine) -> None:

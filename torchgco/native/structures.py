@@ -169,7 +169,21 @@ class Interior(Structure):
     _fields_ = fields(declared)
 
 
-STRUCTURES = (Array, Constraint, Options, Problem, Outer, Sampling, Interior)
+class Kkt(Structure):
+    """Linear systems with the matrix of the KKT conditions (see lagrangian.kkt); R rows."""
+
+    declared = (
+        ("const Problem *", "of"),
+        ("const double *", "free_start active"),  # as in Interior; (E, R): 1 where a row holds as an equality
+        ("double *", "a b c"),  # (C, E, N+1, NX+NU), (C, E, N, NX), (C, E, R): right hand sides in, z, y, v out
+        ("double *", "y left"),  # (E, N+1, NX): costates; (C, E): largest of what active rows leave open
+        ("int64_t", "problems count rounds"),  # E, C
+        ("double", "stiff pivot"),
+    )
+    _fields_ = fields(declared)
+
+
+STRUCTURES = (Array, Constraint, Options, Problem, Outer, Sampling, Interior, Kkt)
 ENUMERATIONS = (Kind, Guide, Status, End)
 
 

@@ -67,7 +67,7 @@ class Library:
 
 BOXES = "box.h", "boxes.c", "field.c"  # left out of problems without a position
 ROWS = ("problem.c", "rows.c", "penalty.c", *BOXES)
-PHASES = "_rows", "_step", "_memory", "_fixed", "_search", ""
+PHASES = "_rows", "_step", "_memory", "_fixed", "_search", "", "_kkt"
 PASSES = "model.c", "passes.h", "cholesky.h", "passes.c"
 RICCATI = "curvature.c", "interior.h", "cholesky.h", "riccati.c"
 SOLVER = Library(PASSES, (), (*ROWS, "passes.h", "knot.c", "ilqr.c", "trajectories.c", "outer.c"))

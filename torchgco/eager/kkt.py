@@ -1,0 +1,58 @@
+"""Linear systems with the matrix of the KKT conditions in PyTorch: see `lagrangian.kkt`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.eager.model import Derivatives, Model
+from torchgco.eager.step import Factors, factor, solve
+from torchgco.lagrangian.kkt import PIVOT, ROUNDS, STIFF, KktSolve, RightSides
+
+
+def kkt(
+    model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
+) -> KktSolve:
+    """As `native.interior.InteriorEngine.kkt`."""
+    lam = torch.cat([X.new_zeros(X.shape[0], 0), *(part.flatten(1) for part in multipliers)], dim=1)
+    lam = torch.where(active, lam, 0.0)
+    y = _costates(model.slopes(X, U), lam)
+    found = model.expand(X, U, torch.ones_like(X[:, 0, 0]), y, lam)
+    sigma = STIFF * found.H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1, keepdim=True)
+    H = found.with_squares(torch.where(active, sigma, 0.0))
+    factors = factor(found.F, H, torch.zeros_like(sigma[:, 0]), PIVOT, model.problem.free_start)
+    columns = [_solved(found, factors, active, sigma, *side) for side in zip(right.a, right.b, right.c, strict=True)]
+    none = (X.new_zeros(0, *shape.shape[1:]) for shape in (right.a, right.b, right.c, right.a[..., 0, 0]))
+    z, v_of_gaps, v, left = (torch.stack(part) for part in zip(*columns, strict=True)) if columns else none
+    return KktSolve(z, v_of_gaps, v, left, y, factors.good)
+
+
+def _costates(slopes: Derivatives, lam: Tensor) -> Tensor:
+    """y (b, N+1, n) that makes the Lagrangian stationary in the states; 0 at knot 0."""
+    n = slopes.F.shape[-2]
+    g = (slopes.cost + slopes.pull(lam.unsqueeze(1)).squeeze(1))[..., :n]
+    y = [g[:, -1]]
+    for k in range(slopes.F.shape[1] - 1, 0, -1):
+        y.append(g[:, k] + (slopes.F[:, k, :, :n].mT @ y[-1].unsqueeze(-1)).squeeze(-1))
+    return torch.stack([torch.zeros_like(y[0]), *y[::-1]], dim=1)
+
+
+def _solved(
+    found: Derivatives, factors: Factors, active: Tensor, sigma: Tensor, a: Tensor, b: Tensor, c: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """z, y, v and what active rows leave open, for one right hand side; each round closes what the last one left."""
+    n, F = b.shape[-1], found.F
+    c, a = torch.where(active, c, 0.0), a.clone()
+    a[:, -1, n:] = 0.0
+    z, y, v = torch.zeros_like(a), torch.zeros_like(b), torch.zeros_like(c)
+    for _ in range(ROUNDS):
+        open_a = a + (found.H @ z.unsqueeze(-1)).squeeze(-1)
+        open_a[:, :-1] += (F.mT @ y.unsqueeze(-1)).squeeze(-1)
+        open_a[:, 1:, :n] -= y
+        open_b = b + (F @ z[:, :-1].unsqueeze(-1)).squeeze(-1) - z[:, 1:, :n]
+        pulled = found.pull((v + sigma * c).unsqueeze(1)).squeeze(1)
+        dx, du, dy = solve(factors, open_a + pulled, open_b)
+        step = torch.cat((dx, torch.nn.functional.pad(du, (0, 0, 0, 1))), dim=-1)
+        z, y, c = z + step, y + dy[:, 1:], c + torch.where(active, found.push(step, c), 0.0)
+        v = v + sigma * c
+    return z, y, v, c.abs().amax(-1) if c.shape[1] > 0 else torch.zeros_like(sigma[:, 0])

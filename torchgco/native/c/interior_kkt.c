@@ -1,0 +1,195 @@
+/* Linear systems with the matrix of the KKT conditions at given points, for derivatives of solutions: the curvature H of
+   the Lagrangian, the dynamics' slopes F and those A of the rows that hold as equalities, `active`,
+
+       [H  F' A'] [z]     [a]
+       [F       ] [y] = - [b]
+       [A       ] [v]     [c]
+
+   The interior point's factors of H + sigma A'A, and of F, give steps towards the solution: each round closes what the
+   last one has left open, of active rows all but a share of about 1 / sigma, as the method of multipliers does. */
+
+#define LEAST 1e-200 /* multiplier of an active row of an inequality, by which its stiffness is divided */
+
+/* What a solve needs beside the interior point's own memory. */
+typedef struct {
+    V *active;      /* (rows): 1 where a row holds as an equality */
+    V *H;           /* (N+1, S, S): curvatures without what holds the rows, upper triangles */
+    V *a, *b, *c;   /* (N+1, S), (N, NX), (rows): a right hand side */
+    V *z, *y, *v;   /* the same: its solution */
+    V sigma;
+} System;
+
+/* A row of inequalities that holds has this curvature sigma across; one that doesn't none. (The interior point: z / s.) */
+static void stiffen(Barrier *t, const V *active, V sigma) {
+    ROWS(t, 0, t->s[q] = tgco_choose(active[q] > SET(0.0), t->z[q] / sigma, SET(INFINITY)))
+    t->soft = SET(1.0) / sigma;
+}
+
+/* Adds the slopes of all rows, times their sigma r, to g[1], and their sigma's curvature to H. */
+static void add_all_rows(Barrier *t) {
+    const Problem *p = t->lanes.of;
+    t->objective = SET(0.0); /* else rows would add multipliers, and their own curvature once more */
+    for (int64_t k = 0; k <= p->N; k++) {
+        const V *x = t->lanes.X + k * NX, *u = k < p->N ? t->lanes.U + k * NU : 0;
+        for (int64_t i = 0; i < p->constraints; i++)
+            if (p->constraint[i].place[k] != NOWHERE) add_rows(t, i, k, x, u);
+    }
+    t->objective = SET(1.0);
+}
+
+/* Costates, then curvatures of all knots with their sigma, and the factors; where these don't exist the answer is false. */
+static I factor_kkt(Barrier *t, System *of, double stiff) {
+    const Problem *p = t->lanes.of;
+    int64_t N = p->N;
+    V largest = SET(0.0);
+    I all = largest == largest;
+    t->scale = t->objective = SET(1.0); t->mu = t->shift = SET(0.0);
+    memset(t->y, 0, (N + 1) * NX * sizeof(V));
+    memset(t->r, 0, t->rows * sizeof(V));
+    stiffen(t, of->active, SET(0.0)); /* infinite slacks: rows have no weight yet */
+    expand(t);
+    adjoin(t, all);
+    expand(t);
+    memcpy(of->H, t->H, (N + 1) * S * S * sizeof(V));
+    for (int64_t k = 0; k <= N; k++)
+        for (int i = 0; i < (k < N ? S : NX); i++) largest = most(tgco_fabs(t->H[k * S * S + i * S + i]), largest);
+    of->sigma = SET(stiff) * largest;
+    stiffen(t, of->active, of->sigma);
+    add_all_rows(t);
+    return factor(t, ~all);
+}
+
+/* A z of every row into ds, of z as dx and du. */
+static void along_rows(Barrier *t) {
+    const Problem *p = t->lanes.of;
+    V z[S];
+    for (int64_t k = 0; k <= p->N; k++) {
+        const V *x = t->lanes.X + k * NX, *u = k < p->N ? t->lanes.U + k * NU : 0;
+        for (int i = 0; i < NX; i++) z[i] = t->dx[k * NX + i];
+        for (int j = 0; j < NU; j++) z[NX + j] = u ? t->du[k * NU + j] : SET(0.0);
+        for (int64_t i = 0; i < p->constraints; i++)
+            if (p->constraint[i].place[k] != NOWHERE) along(t, i, k, x, u, z, t->ds + row_of(t, i, k));
+    }
+}
+
+/* What z, y leave open of stationarity, a + H z + F'y, into g[1], and of the gaps, b + F z, into aim. */
+static void find_open(Barrier *t, const System *of) {
+    int64_t N = t->lanes.of->N;
+    for (int64_t k = 0; k <= N; k++) {
+        const V *H = of->H + k * S * S, *z = of->z + k * S, *next = of->z + (k + 1) * S;
+        V *g = t->g[1] + k * S, ahead[NX], back[S];
+        for (int i = 0; i < S; i++) {
+            g[i] = of->a[k * S + i];
+            t->g[2][k * S + i] = back[i] = SET(0.0);
+            if (k == N && i >= NX) { g[i] = SET(0.0); continue; }
+            for (int j = 0; j < (k < N ? S : NX); j++) ADD(g[i], H[i < j ? i * S + j : j * S + i], z[j]);
+        }
+        if (k > 0) for (int i = 0; i < NX; i++) g[i] -= of->y[(k - 1) * NX + i];
+        if (k == N) break;
+        model_pull_back(of->y + k * NX, t->f + k * NJ, back);
+        for (int i = 0; i < S; i++) g[i] += back[i];
+        model_push(t->f + k * NJ, z, ahead);
+        for (int i = 0; i < NX; i++) t->aim[k * NX + i] = of->b[k * NX + i] + ahead[i] - next[i];
+    }
+}
+
+/* Steps that close what is open, from z, y, v = 0 on; returns the largest of c + A z of active rows at the end. What is
+   open of rows is counted in c itself: v, in which it is multiplied by sigma, would magnify the rounding of c + A z. */
+static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
+    int64_t N = t->lanes.of->N;
+    memset(of->z, 0, (N + 1) * S * sizeof(V));
+    memset(of->y, 0, N * NX * sizeof(V));
+    memset(of->v, 0, t->rows * sizeof(V));
+    for (int64_t round = 0; round < rounds; round++) {
+        find_open(t, of);
+        for (int64_t q = 0; q < t->rows; q++)
+            t->r[q] = tgco_if(of->active[q] > SET(0.0), of->c[q] + of->v[q] / of->sigma);
+        add_all_rows(t);
+        solve(t);
+        along_rows(t);
+        for (int64_t k = 0; k <= N; k++) {
+            for (int i = 0; i < NX; i++) of->z[k * S + i] += t->dx[k * NX + i];
+            if (k < N) for (int j = 0; j < NU; j++) of->z[k * S + NX + j] += t->du[k * NU + j];
+        }
+        for (int64_t i = 0; i < N * NX; i++) of->y[i] += t->yn[NX + i];
+        for (int64_t q = 0; q < t->rows; q++) {
+            of->c[q] += tgco_if(of->active[q] > SET(0.0), t->ds[q]);
+            ADD(of->v[q], of->sigma, of->c[q]);
+        }
+    }
+    V worst = SET(0.0);
+    for (int64_t q = 0; q < t->rows; q++) worst = most(tgco_fabs(of->c[q]), worst);
+    return worst;
+}
+
+/* Reads or writes one right hand side of a lane: (count, E, ...) each. */
+#define COLUMN(how, name, column, e, size) ((how)->name + ((column) * (how)->problems + (e)) * (size))
+
+static void enter_column(Barrier *t, System *of, const Kkt *how, int64_t column, int lane, int64_t e) {
+    int64_t N = t->lanes.of->N;
+    for (int64_t i = 0; i < (N + 1) * S; i++) of->a[i][lane] = COLUMN(how, a, column, e, (N + 1) * S)[i];
+    for (int64_t i = 0; i < N * NX; i++) of->b[i][lane] = COLUMN(how, b, column, e, N * NX)[i];
+    for (int64_t q = 0; q < t->rows; q++)
+        of->c[q][lane] = of->active[q][lane] > 0 ? COLUMN(how, c, column, e, t->rows)[q] : 0;
+}
+
+static void leave_column(Barrier *t, const System *of, const Kkt *how, int64_t column, int lane, int64_t e, V left) {
+    int64_t N = t->lanes.of->N;
+    for (int64_t i = 0; i < (N + 1) * S; i++) COLUMN(how, a, column, e, (N + 1) * S)[i] = of->z[i][lane];
+    for (int64_t i = 0; i < N * NX; i++) COLUMN(how, b, column, e, N * NX)[i] = of->y[i][lane];
+    for (int64_t q = 0; q < t->rows; q++) COLUMN(how, c, column, e, t->rows)[q] = of->v[q][lane];
+    how->left[column * how->problems + e] = left[lane];
+}
+
+/* A problem's point, its multipliers, 0 of rows that aren't active, and which these are. */
+static void enter_system(Barrier *t, System *of, const Kkt *how, int lane, int64_t e) {
+    const Problem *p = t->lanes.of;
+    enter_barrier(t, lane, e);
+    for (int64_t i = 0, q = 0; i < p->constraints; i++) {
+        const Constraint *con = p->constraint + i;
+        int64_t count = con->knots * con->rows;
+        for (int64_t j = 0; j < count; j++, q++) {
+            double lam = con->lam[e * count + j], held = how->active[e * t->rows + q];
+            of->active[q][lane] = held;
+            t->z[q][lane] = held <= 0 ? 0 : con->equality || lam > LEAST ? lam : LEAST;
+        }
+    }
+}
+
+static V *start_system(System *of, int64_t N, int64_t rows) {
+    int64_t point = (N + 1) * S, gaps = N * NX;
+    V *memory = aligned_alloc(sizeof(V), ((N + 1) * S * S + 2 * (point + gaps + rows) + rows + 1) * sizeof(V)), *m = memory;
+    if (!memory) return 0;
+    of->H = cut(&m, (N + 1) * S * S); of->active = cut(&m, rows);
+    of->a = cut(&m, point); of->b = cut(&m, gaps); of->c = cut(&m, rows);
+    of->z = cut(&m, point); of->y = cut(&m, gaps); of->v = cut(&m, rows);
+    return memory;
+}
+
+/* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
+int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
+    Interior options = {.of = how->of, .free_start = how->free_start, .pivot = how->pivot, .largest_multiplier = INFINITY};
+    Barrier barrier, *t = &barrier;
+    System system, *of = &system;
+    if (!start_barrier(t, &options)) return 0;
+    const Problem *p = t->lanes.of;
+    V *memory = start_system(of, p->N, t->rows);
+    if (!memory) { finish_barrier(t); return 0; }
+    for (int64_t at = first; at < last; at += LANES) {
+        int own = last - at < LANES ? last - at : LANES; /* lanes without a problem repeat the first one */
+        for (int l = 0; l < LANES; l++) enter_system(t, of, how, l, l < own ? at + l : at);
+        I good = factor_kkt(t, of, how->stiff);
+        for (int l = 0; l < own; l++) {
+            p->status[at + l] = good[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
+            for (int64_t i = 0; i < (p->N + 1) * NX; i++) how->y[(at + l) * (p->N + 1) * NX + i] = t->y[i][l];
+        }
+        for (int64_t column = 0; column < how->count; column++) {
+            for (int l = 0; l < LANES; l++) enter_column(t, of, how, column, l, l < own ? at + l : at);
+            V left = solve_kkt(t, of, how->rounds);
+            for (int l = 0; l < own; l++) leave_column(t, of, how, column, l, at + l, left);
+        }
+    }
+    free(memory);
+    finish_barrier(t);
+    return 1;
+}
