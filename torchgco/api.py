@@ -26,6 +26,7 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
+from torchgco.sensitivity import asks_for_gradients, attached
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.watching import Watcher
@@ -58,6 +59,9 @@ def solve(
     ScaleWarning those whose violation is tolerated but large beside the values of the constraint; a HorizonWarning,
     before the solve, the horizons that are too short for the way to a stated goal at the limits on speed.
 
+    Where tensors in the problem ask for gradients, or ones that its functions capture, X, U, cost and multipliers of
+    the solution are functions of them (`solution.differentiable`); under `torch.no_grad()` they are numbers.
+
     Args:
         problem: B problems.
         U0: initial controls (B, N, m). Default: those of `warm`, else the cost's reference, else zero; the middle of
@@ -82,6 +86,9 @@ def solve(
     check_problem(problem)
     if warm is not None and not isinstance(warm, Solution):
         raise InputError("warm", "a Solution, or None", type(warm).__name__)
+    warm = None if warm is None else warm.detach()
+    problem = asked = problem.anew()
+    differentiates = asks_for_gradients(problem)
     solver = "gco" if solver is None else solver
     name = solver if isinstance(solver, str) else None
     solver = _solver(solver, problem, check_value(record, bool, "record"))
@@ -104,7 +111,8 @@ def solve(
         found = replace(found, account=found.account.of_preset(name))
     if warm is None:  # the guess of a warm start keeps the constraints already: its values are no size
         _warn_of_scale(problem, U0, found)
-    return _warned_of_contact(problem, found)
+    found = _warned_of_contact(problem, found)
+    return attached(asked, problem, found) if differentiates else found
 
 
 def compare(

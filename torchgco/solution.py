@@ -13,8 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.differentiability import Differentiability
 from torchgco.base.errors import InputError, shown
 from torchgco.base.files import read_arrays, write_whole
+from torchgco.base.gradients import without_gradients
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import MISTAKES, check_device, check_shape
 from torchgco.base.status import Status
@@ -60,6 +62,7 @@ class Solution:
     trace: pd.DataFrame | None = None  # a row per problem and iteration, where the solver records
     search: SearchRecord | None = None  # paths, candidates and passes, where a solver with passes records
     horizon: Tensor | None = None  # (B,) int64: stages of each problem, after which its state is held; None: N
+    reason: Tensor | None = None  # (B,) int64, see Differentiability; None: not asked for
     account: Account | None = None  # the problem and the solver, for `t` and `explain`; of a loaded one the times alone
 
     @classmethod
@@ -96,6 +99,19 @@ class Solution:
         return explanation(self, b, problem)
 
     @property
+    def differentiable(self) -> Tensor:
+        """Whether X, U, cost and multipliers of each problem have derivatives, (B,) bool; elsewhere gradients are 0."""
+        if self.reason is None:
+            return torch.zeros_like(self.status, dtype=torch.bool)
+        return self.reason == Differentiability.DIFFERENTIABLE
+
+    @property
+    def why_not(self) -> list[str]:
+        """A sentence for each problem: why its solution has no derivatives, or that it has."""
+        reasons = torch.full_like(self.status, int(Differentiability.NOT_ASKED)) if self.reason is None else self.reason
+        return [Differentiability(reason).sentence for reason in reasons.tolist()]
+
+    @property
     def statuses(self) -> list[Status]:
         """The statuses by name; `.sentence` explains one."""
         return [Status(s) for s in self.status.tolist()]
@@ -108,6 +124,10 @@ class Solution:
         """
         rows = index if isinstance(index, slice) else _places(index, len(self), self.cost.device)
         return take(replace(self, trace=None, search=None), rows)
+
+    def detach(self) -> Solution:
+        """The same numbers without gradients; itself where it has none."""
+        return without_gradients(self)
 
     def shifted(self, steps: int = 1) -> Solution:
         """The guess for the same problems `steps` stages later, as `solve(problem, warm=solution.shifted())` takes it.
@@ -288,7 +308,7 @@ def _places(index: Any, B: int, device: torch.device) -> Tensor:
     return torch.where(rows < 0, rows + B, rows).long()
 
 
-_OTHERS = ("multipliers", "trace", "search", "horizon", "account")
+_OTHERS = ("multipliers", "trace", "search", "horizon", "reason", "account")
 _TENSORS = tuple(f.name for f in fields(Solution) if f.name not in _OTHERS)
 # What torch.load may make of a file of torch.save; they hold tensors, and run nothing.
 torch.serialization.add_safe_globals([Solution, Multipliers, Account, SearchRecord, Comparison, Standing])

@@ -23,6 +23,7 @@ from torch._C._dynamo.eval_frame import get_eval_frame_callback  # type: ignore[
 from torch._C._functorch import peek_interpreter_stack  # type: ignore[import]
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.gradients import is_recording
 
 # What a user's function raises where it doesn't fit the problem.
 MISTAKES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError)
@@ -65,8 +66,8 @@ def as_states(x0: Any) -> Tensor:
 def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
     """`value`, a dense tensor of float64 or float32 without gradients, of the dtype and device of `like`.
 
-    Raises InputError for all else. Converting another dtype or device silently would hide a mistake; and gradients with
-    respect to the input of a solve don't exist, so a tensor that asks for them is refused as well.
+    Raises InputError for all else. Converting another dtype or device silently would hide a mistake, and so would
+    leaving out gradients that a tensor asks for, where nothing is differentiated with respect to it.
     """
     if not isinstance(value, Tensor):
         raise InputError(field, "a tensor", type(value).__name__)
@@ -74,8 +75,8 @@ def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
         raise InputError(field, f"a {'float64 or float32' if like is None else like.dtype} tensor", describe(value))
     if value.layout != torch.strided:
         raise InputError(field, "a dense tensor", value.layout)
-    if value.requires_grad:
-        expected = "a tensor without gradients, `.detach()`, as solves aren't differentiable"
+    if value.requires_grad and not is_recording():
+        expected = "a tensor without gradients, `.detach()`: no solution is differentiated with respect to it"
         raise InputError(field, expected, describe(value))
     if like is not None and value.dtype != like.dtype:
         raise InputError(field, f"dtype {like.dtype} as in x0", value.dtype)

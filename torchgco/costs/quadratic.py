@@ -43,9 +43,10 @@ class QuadraticCost(Cost):
         Q, R = _weight(self.Q, "Q", n, B, N, dims.like), _weight(self.R, "R", m, B, N, dims.like)
         Qf = _weight(self.Qf, "Qf", n, B, None, dims.like)
         H = None if self.H is None else _cross(self.H, m, n, B, N, dims.like)
-        check_semidefinite(Q, R, Qf, H)
+        check_semidefinite(*(None if W is None else W.detach() for W in (Q, R, Qf, H)))
         x_ref = _vector(self.x_ref, "x_ref", n, B, N + 1, dims.like)
-        diagonal = H is None and all(_is_diagonal(W) for W in (Q, R, Qf))
+        weights = (self.Q, Q), (self.R, R), (self.Qf, Qf)
+        diagonal = H is None and all(_is_diagonal(given, W) for given, W in weights)
         if diagonal:
             Q, R, Qf = (W.diagonal(dim1=-2, dim2=-1).contiguous() for W in (Q, R, Qf))
         return BoundQuadratic(
@@ -207,9 +208,9 @@ def _vector(value: Any, field: str, size: int, B: int, N: int | None, like: Tens
 
 
 def _optional(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor | None:
-    """A linear term, None where it is zero throughout."""
+    """A linear term, None where it is zero throughout, and no gradient is asked for, which needn't be."""
     v = _vector(value, field, size, B, N, like)
-    return v if bool((v != 0).any()) else None
+    return v if v.requires_grad or bool((v != 0).any()) else None
 
 
 def _one_of(value: Tensor, axis: int, length: int) -> int:
@@ -217,7 +218,10 @@ def _one_of(value: Tensor, axis: int, length: int) -> int:
     return 1 if value.dim() > axis and value.shape[axis] == 1 else length
 
 
-def _is_diagonal(W: Tensor) -> bool:
+def _is_diagonal(given: Any, W: Tensor) -> bool:
+    """Whether a weight is one for good: a matrix that asks for gradients may have them off its diagonal."""
+    if W.requires_grad and isinstance(given, Tensor) and given.dim() > 1:
+        return False
     return bool((W - torch.diag_embed(W.diagonal(dim1=-2, dim2=-1)) == 0).all())
 
 

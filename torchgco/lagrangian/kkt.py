@@ -24,7 +24,7 @@ PIVOT = 1e-14  # least pivot of the factors, as a share of its entry: where one 
 
 @dataclass(frozen=True)
 class RightSides:
-    """C right hand sides of B systems; S = n + m, R rows of all constraints, constraint by constraint and knot by knot."""
+    """C right hand sides of B systems; S = n + m. R rows: constraint by constraint, and knot by knot."""
 
     a: Tensor  # (C, B, N+1, S): those of controls at the last knot, and of a given start, don't count
     b: Tensor  # (C, B, N, n)

@@ -1,4 +1,4 @@
-"""Starts of which some components are variables: the mask that says which, and a guess that keeps its bounds."""
+"""Starts of which some components are variables, and horizons per problem: the checks of both."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import MISTAKES, describe
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import StateBounds
 
@@ -46,3 +47,21 @@ def moved_inside(x0: Tensor, free: Tensor | None, constraints: Sequence[Constrai
             lower, upper = (bound[:, first if bound.shape[1] > 1 else 0] for bound in bounds.by_knot)
             x0 = torch.where(free, torch.minimum(torch.maximum(x0, lower), upper), x0)
     return x0
+
+
+def checked_horizon(horizon: Any, x0: Tensor, N: int) -> Tensor:
+    """Numbers of stages as an int64 tensor (B,) on the device of x0 (B, n).
+
+    Raises:
+        InputError: another shape, numbers that aren't whole or outside 1..N.
+    """
+    expected = f"whole numbers ({x0.shape[0]},) from 1 to N = {N}"
+    try:
+        given = torch.as_tensor(horizon, device=x0.device)
+    except MISTAKES:
+        raise InputError("horizon", expected, shown(horizon)) from None
+    if given.dtype == torch.bool or given.is_floating_point() or given.is_complex() or given.shape != x0.shape[:1]:
+        raise InputError("horizon", expected, describe(given))
+    if not bool(((given >= 1) & (given <= N)).all()):
+        raise InputError("horizon", expected, given.tolist())
+    return given.to(torch.int64)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError, shown, theirs
+from torchgco.base.errors import InputError, theirs
 from torchgco.base.mixing import foreign, why
 from torchgco.base.options import Count, Seconds, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
@@ -23,7 +23,8 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.border import check_code
-from torchgco.problem.free_start import chooses_position, moved_inside, start_mask
+from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
+from torchgco.problem.given import Given
 from torchgco.problem.goal import Goal
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
 from torchgco.problem.summary import summary
@@ -37,8 +38,8 @@ class Problem:
 
     Args:
         dynamics, cost, constraints: the parts; values given per problem have the batch of x0.
-        x0: (B, n), fixes batch, device and dtype: float64 or float32, without gradients. Lists and arrays become a
-            tensor, a single state (n,) is a batch of one.
+        x0: (B, n), fixes batch, device and dtype: float64 or float32. Lists and arrays become a tensor, a single state
+            (n,) is a batch of one.
         N: number of stages.
         goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
             terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
@@ -68,18 +69,27 @@ class Problem:
     # A cache for everything that depends only on the problems' form (native kernels, say), shared by all subsets of a
     # batch.
     form: ClassVar[dict[Any, Any]]
+    # What it was given, where tensors of that ask for gradients; the fields hold numbers alone.
+    given: ClassVar[Given | None] = None
 
     def __post_init__(self) -> None:
+        fields_given = {f.name: getattr(self, f.name) for f in fields(self)}
+        given = Given.of(fields_given)
+        if given is not None:
+            object.__setattr__(self, "given", given)
+            for name, part in given.numbers.items():
+                object.__setattr__(self, name, part)
         self._check_border()
         with computing_on(self.x0.device):
-            self._bind()
+            self._bind(*(fields_given[name] for name in ("dynamics", "cost", "constraints")))
 
-    def _bind(self) -> None:
-        dims, dynamics, cost, constraints = self._dimensions(self.x0), self.dynamics, self.cost, self.constraints
-        object.__setattr__(self, "dynamics", dynamics.bind(dims))
+    def _bind(self, dynamics: Any, cost: Any, constraints: Any) -> None:
+        """Bind the parts; the arguments are those that were given, by which checks of code know them again."""
+        dims = self._dimensions(self.x0)
+        object.__setattr__(self, "dynamics", self.dynamics.bind(dims))
         self._check_dynamics()
-        object.__setattr__(self, "cost", cost.bind(dims))
-        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in constraints))
+        object.__setattr__(self, "cost", self.cost.bind(dims))
+        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
         rows = zip(constraints, self.constraints, strict=True)
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
@@ -239,11 +249,23 @@ class Problem:
             "horizon": None if self.horizon is None else self.horizon[index],
             "free_start": None if self.free_start is None else self.free_start[index],
         }
-        return self._with(parts, form=self.form)
+        part = self._with(parts, form=self.form)
+        if self.given is not None:
+            object.__setattr__(part, "given", self.given.followed(self, lambda whole: whole.take(index)))
+        return part
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
-        return self._with({})
+        return self.anew()._with({})
+
+    def anew(self) -> Self:
+        """The same problems with their numbers as they are now, where an optimiser has changed tensors in place that
+        ask for gradients; else this one."""
+        return self.given.anew(type(self)) if self.given is not None and self.given.is_stale else self
+
+    def recorded(self) -> Self:
+        """The same problems with gradients recorded, from the tensors that were given on; itself without such."""
+        return self if self.given is None else self.given.recorded(self)
 
     def is_same(self, other: Problem) -> bool:
         """Whether both have the very same parts."""
@@ -401,24 +423,6 @@ def check_problem(problem: Any) -> None:
     """Raise InputError unless the argument is a Problem."""
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem", _named(problem))
-
-
-def checked_horizon(horizon: Any, x0: Tensor, N: int) -> Tensor:
-    """Numbers of stages as an int64 tensor (B,) on the device of x0 (B, n).
-
-    Raises:
-        InputError: another shape, numbers that aren't whole or outside 1..N.
-    """
-    expected = f"whole numbers ({x0.shape[0]},) from 1 to N = {N}"
-    try:
-        given = torch.as_tensor(horizon, device=x0.device)
-    except MISTAKES:
-        raise InputError("horizon", expected, shown(horizon)) from None
-    if given.dtype == torch.bool or given.is_floating_point() or given.is_complex() or given.shape != x0.shape[:1]:
-        raise InputError("horizon", expected, describe(given))
-    if not bool(((given >= 1) & (given <= N)).all()):
-        raise InputError("horizon", expected, given.tolist())
-    return given.to(torch.int64)
 
 
 def _check_constraints(constraints: Any) -> None:

@@ -180,6 +180,7 @@ class Solver(Brief):
         """
         check_untransformed("solve")
         check_problem(problem)
+        problem = problem.anew()
         with computing_on(problem.x0.device):
             if problem.B == 0:  # nothing to trace code with
                 Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)

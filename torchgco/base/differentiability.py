@@ -1,0 +1,34 @@
+"""Whether a solution has derivatives: one reason per problem, each with a sentence."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Differentiability(IntEnum):
+    """Why a problem's solution is differentiable or isn't; `sentence` explains each to the user."""
+
+    DIFFERENTIABLE = 0
+    NOT_ASKED = 1
+    NOT_SOLVED = 2
+    MOVED = 3
+    NOT_STATIONARY = 4
+    NOT_STRICT = 5
+    DEPENDENT_ROWS = 6
+    WEAKLY_ACTIVE = 7
+
+    @property
+    def sentence(self) -> str:
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Differentiability.DIFFERENTIABLE: "The trajectory is a strict minimum, and rows that hold there stay so nearby.",
+    Differentiability.NOT_ASKED: "Nothing that the problem depends on asked for gradients when it was solved.",
+    Differentiability.NOT_SOLVED: "The solve found no feasible trajectory; its status says why.",
+    Differentiability.MOVED: "The solver's trajectory is no minimum: iterations from there lead to another one.",
+    Differentiability.NOT_STATIONARY: "The optimality conditions can't be met to the precision that derivatives need.",
+    Differentiability.NOT_STRICT: "The minimum isn't strict: along some direction the cost is flat, or falls.",
+    Differentiability.DEPENDENT_ROWS: "Constraints that hold depend on each other, so their multipliers aren't unique.",
+    Differentiability.WEAKLY_ACTIVE: "A constraint is on the edge of holding, and derivatives differ on its two sides.",
+}

@@ -1,0 +1,4 @@
+"""Derivatives of solutions with respect to everything that a problem is made of."""
+
+from torchgco.sensitivity.attach import asks_for_gradients as asks_for_gradients
+from torchgco.sensitivity.attach import attached as attached

@@ -1,0 +1,119 @@
+"""Solutions with derivatives: the solve has run on numbers, and what follows it is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.differentiability import Differentiability as Why
+from torchgco.base.errors import InputError
+from torchgco.base.gradients import recording
+from torchgco.base.shapes import computing_on
+from torchgco.base.tree import is_users
+from torchgco.constraints.bounds import RateBounds
+from torchgco.kernels import cost_unit
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.problem.problem import Problem
+from torchgco.sensitivity.function import Solved, System
+from torchgco.sensitivity.points import Points, points_of
+from torchgco.sensitivity.residual import Residual, residual
+from torchgco.solution import Solution
+
+STATIONARY = 1e-7  # slope of the Lagrangian, in units of the cost, up to which a point is stationary
+REFUSED = "float64 problems with one horizon, a given start and no RateBounds, where gradients are asked for"
+
+
+def asks_for_gradients(problem: Problem) -> bool:
+    """Whether gradients are recorded, and a tensor asks for them in the problem, or one that its functions capture.
+
+    Raises:
+        InputError: they can't be served.
+    """
+    if not torch.is_grad_enabled() or torch.is_inference_mode_enabled() or problem.B == 0:
+        return False
+    if problem.given is None and not _captures(problem):
+        return False
+    for got, refused in (
+        (problem.x0.dtype, problem.x0.dtype != torch.float64),
+        ("horizons per problem", problem.horizon is not None),
+        ("a free start", problem.free_start is not None and bool(problem.free_start.any())),
+        ("RateBounds", any(isinstance(part, RateBounds) for part in problem.constraints)),
+    ):
+        if refused:
+            raise InputError("problem", REFUSED, got)
+    return True
+
+
+def _captures(problem: Problem) -> bool:
+    """Whether values of users' functions lead to tensors that ask for gradients, as those of the first problem show."""
+    one = problem.take(slice(0, 1))
+    X, U = (part.detach() for part in one.at_rest)
+    uses: list[tuple[object, Callable[[], Tensor]]] = [
+        (one.dynamics, lambda: one.along.step(X[:, :-1], U)),
+        (one.cost, lambda: one.cost.total(X, U)),
+        *((part, lambda part=part: part.value(X, U)) for part in one.constraints),
+    ]
+    with recording():
+        return any(is_users(part) and value().requires_grad for part, value in uses)
+
+
+def attached(asked: Problem, problem: Problem, solution: Solution) -> Solution:
+    """The solution with X, U, costs and multipliers as functions of all that asks for gradients.
+
+    Where a problem's solution has no derivatives, these are constants: their gradients are 0.
+
+    Args:
+        asked: the problems as they were made, which know what asks for gradients.
+        problem: the same, with what a solver keeps of them.
+    """
+    with computing_on(problem.x0.device):
+        points = points_of(problem, solution)
+    known = {"trace": solution.trace, "search": solution.search, "account": solution.account, "reason": points.reason}
+    found = replace(points.solution, **known)
+    rows = (points.reason == Why.DIFFERENTIABLE).nonzero().flatten()
+    if rows.numel() == 0:
+        return found
+    with recording():
+        at = points.take(rows)
+        found_at = _residual(asked, at, rows)
+        with torch.no_grad():
+            small = found_at.largest <= STATIONARY * cost_unit(at.problem)
+        if not bool(small.all()):
+            points.reason[rows[~small]] = int(Why.NOT_STATIONARY)
+            rows, at, found_at = rows[small], at.take(small.nonzero().flatten()), found_at.take(small)
+        return _with_values(found, rows, _values(at, found_at)) if rows.numel() > 0 else found
+
+
+def _residual(problem: Problem, at: Points, rows: Tensor) -> Residual:
+    """That of the problems `rows` at their points."""
+    live = problem.recorded().take(rows)
+    live = live.grown(at.growth) if bool((at.growth > 0).any()) else live
+    return residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
+
+
+def _values(at: Points, of: Residual) -> tuple[Tensor, ...]:
+    """X, U, multipliers (B, R) and costs of the points, which lead to the residual."""
+    found, multipliers = at.solution, at.solution.multipliers.lam
+    flat = torch.cat([found.X.new_zeros(len(found), 0), *(lam.flatten(1) for lam in multipliers)], dim=1)
+    system, values = System(at.problem, found.X, found.U, multipliers, at.active), (found.X, found.U, flat, found.cost)
+    X, U, lam, cost = Solved.apply(system, values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
+    return torch.cat((of.start.unsqueeze(1), X[:, 1:]), dim=1), U, lam, cost
+
+
+def _with_values(found: Solution, rows: Tensor, values: tuple[Tensor, ...]) -> Solution:
+    """The solution with these in its problems `rows`."""
+    X, U, lam, cost = values
+    held, parts = found.multipliers.lam, lam.split([old[0].numel() for old in found.multipliers.lam], dim=1)
+    multipliers = tuple(_written(old, rows, new.view(-1, *old.shape[1:])) for old, new in zip(held, parts, strict=True))
+    return replace(
+        found, X=_written(found.X, rows, X), U=_written(found.U, rows, U), cost=_written(found.cost, rows, cost),
+        multipliers=Multipliers(multipliers, found.multipliers.mu),
+    )  # fmt: skip
+
+
+def _written(values: Tensor, rows: Tensor, new: Tensor) -> Tensor:
+    """`values` (B, ...) with `new` in some rows."""
+    return new if len(rows) == len(values) else values.index_copy(0, rows, new)

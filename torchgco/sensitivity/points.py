@@ -1,0 +1,163 @@
+"""Points at which solutions are differentiated: polished, and with the reasons where there are no derivatives.
+
+A solver ends within its tolerances, derivatives need more: a few iterations of the interior point from there. Where
+they lead elsewhere, the trajectory was no minimum of the problem. Trajectories that `gco` has cleared between knots are
+ones of the same problem with larger obstacles: these are tried next, and their growth is then a constant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.differentiability import Differentiability as Why
+from torchgco.base.draws import scattered
+from torchgco.base.status import Status
+from torchgco.base.tree import copied, put
+from torchgco.kernels import cost_unit, interior_of, measured
+from torchgco.lagrangian.kkt import KktSolve, RightSides
+from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.solvers.interior import InteriorPoint
+
+# With a tolerance of 1e-13, rounding ends some polishes before they meet it.
+POLISH = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8, max_iterations=60)
+STAYS = 1e-3  # share of 1 + the largest state or control by which a polish may move one: a solver's tolerance, no more
+LEFT = 1e-6  # of rows' right hand sides of 1: what dependent rows leave open is about 1, others leave rounding
+# s z = mu at the end of a polish, 1e-13: where slack and multiplier are within this factor of each other, both about
+# sqrt(mu), which of them is 0 at the minimum isn't known.
+TOLD = 1e2
+SAME = 1e-4  # share by which derivatives with and without such rows may differ
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where B solutions are differentiated.
+
+    Attributes:
+        solution: polished where that is possible, else as the solver left it.
+        problem: that of which the solution is a minimum, with obstacles grown by `growth` (B,), m.
+        active: rows that hold as equalities, (B, R) bool, constraint by constraint and knot by knot.
+        costates: (B, N+1, n).
+        reason: (B,) int64, a `Differentiability`.
+    """
+
+    solution: Solution
+    problem: Problem
+    growth: Tensor
+    active: Tensor
+    costates: Tensor
+    reason: Tensor
+
+    @property
+    def lam(self) -> Tensor:
+        """Multipliers of the rows that hold, 0 of others, (B, R)."""
+        flat = [part.flatten(1) for part in self.solution.multipliers.lam]
+        return torch.where(self.active, torch.cat([self.growth.new_zeros(len(self.growth), 0), *flat], dim=1), 0.0)
+
+    def take(self, rows: Tensor) -> Points:
+        """Those of the problems `rows`, places (b,)."""
+        own = {name: getattr(self, name)[rows] for name in ("growth", "active", "costates", "reason")}
+        return Points(self.solution.take(rows), self.problem.take(rows), **own)
+
+
+def points_of(problem: Problem, solution: Solution) -> Points:
+    """The points of solutions, with every reason against derivatives."""
+    result = copied(_bare(solution))
+    solved = (solution.status == Status.CONVERGED) | (solution.status == Status.FEASIBLE)
+    reason = torch.full_like(solution.status, int(Why.NOT_SOLVED))
+    growth = torch.zeros_like(solution.cost)
+    _polish(problem, solved.nonzero().flatten(), growth, result, reason)
+    room = clearance(problem, solution.X)
+    grown = solved & (reason != Why.DIFFERENTIABLE) & (room > 0) & torch.isfinite(room)
+    growth = torch.where(grown, room, growth)
+    _polish(problem, grown.nonzero().flatten(), growth, result, reason)
+    growth = torch.where(reason == Why.DIFFERENTIABLE, growth, 0.0)
+    problem = problem.grown(growth) if bool((growth > 0).any()) else problem
+    active, untold = rows_that_hold(problem, result)
+    found = solve_at(problem, result, active, probe(problem, active))
+    weak = (untold.any(-1) & (reason == Why.DIFFERENTIABLE)).nonzero().flatten()
+    reason[weak] = _weakness(problem.take(weak), result.take(weak), active[weak], untold[weak])
+    for where, why in ((~(found.left.amax(0) <= LEFT), Why.DEPENDENT_ROWS), (~found.definite, Why.NOT_STRICT)):
+        reason[where & (reason == Why.DIFFERENTIABLE)] = int(why)
+    return Points(result, problem, growth, active, found.costates, reason)
+
+
+def _bare(solution: Solution) -> Solution:
+    """The solution without what isn't copied."""
+    return replace(solution, trace=None, search=None, account=None)
+
+
+def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, reason: Tensor) -> None:
+    """Polish the solutions of the problems `rows`, with obstacles grown by `growth` (B,), in place; and say why not."""
+    if rows.numel() == 0:
+        return
+    part, old, by = problem.take(rows), result.take(rows), growth[rows]
+    asked = part.grown(by) if bool((by > 0).any()) else part
+    new = POLISH.solve(asked, old.U, warm=old.multipliers, X0=old.X)
+    moved = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U))
+    ends, stays = new.status == Status.CONVERGED, moved <= STAYS
+    reason[rows] = torch.where(
+        stays, torch.where(ends, int(Why.DIFFERENTIABLE), int(Why.NOT_STATIONARY)), int(Why.MOVED)
+    )
+    kept = (ends & stays).nonzero().flatten()
+    if kept.numel() > 0:
+        better = _bare(new.take(kept))
+        worst = measured(part.take(kept), better.X, better.U)
+        more = old.iterations[kept] + better.iterations
+        same = {name: getattr(old, name)[kept] for name in ("outer_iterations", "guided", "status")}
+        put(result, rows[kept], replace(better, violation=worst, iterations=more, horizon=None, **same))
+
+
+def _moved(new: Tensor, old: Tensor) -> Tensor:
+    """The largest change (B,) of states or controls, as a share of 1 + the largest one."""
+    return ((new - old).abs() / (1.0 + old.abs().amax(dim=(1, 2), keepdim=True))).flatten(1).amax(-1)
+
+
+def clearance(problem: Problem, X: Tensor) -> Tensor:
+    """The smallest distance (B,) at the knots from obstacles, m; infinite without any."""
+    least = torch.full_like(X[:, 0, 0], torch.inf)
+    for part in problem.obstacles:
+        apart = part.signed_distance(X[:, part.knots, part.position], part.times(X))
+        if apart[0].numel() > 0:
+            least = torch.minimum(least, apart.flatten(1).amin(-1))
+    return least
+
+
+def rows_that_hold(problem: Problem, solution: Solution) -> tuple[Tensor, Tensor]:
+    """Which rows hold as equalities, and of which inequalities that isn't told, (B, R) bool."""
+    unit, none = cost_unit(problem).view(-1, 1, 1), torch.zeros_like(solution.status, dtype=torch.bool)[:, None][:, :0]
+    hold, untold = [none], [none]
+    for part, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
+        slack, pushes = -part.value(solution.X, solution.U), lam / unit
+        equal = torch.full_like(slack, part.sense == "equality", dtype=torch.bool)
+        ratio = pushes.abs() / slack.abs()
+        hold.append((equal | (pushes > slack)).flatten(1))
+        untold.append((~equal & (ratio > 1.0 / TOLD) & (ratio < TOLD)).flatten(1))
+    return torch.cat(hold, dim=1), torch.cat(untold, dim=1)
+
+
+def solve_at(problem: Problem, solution: Solution, active: Tensor, right: RightSides) -> KktSolve:
+    """The systems at solutions."""
+    return interior_of(problem).kkt(problem, solution.X, solution.U, solution.multipliers.lam, active, right)
+
+
+def probe(problem: Problem, active: Tensor) -> RightSides:
+    """A right hand side of every row, gap, state and control, none of which is special; the same for all problems."""
+    B, N, like = problem.B, problem.N, problem.x0
+    a, b, c = (
+        scattered(like.new_zeros(shape)).expand(1, B, *shape[1:])
+        for shape in ((1, N + 1, problem.n + problem.m), (1, N, problem.n), (1, active.shape[1]))
+    )
+    return RightSides(a, b, c)
+
+
+def _weakness(problem: Problem, solution: Solution, active: Tensor, untold: Tensor) -> Tensor:
+    """WEAKLY_ACTIVE (B,) where it matters for derivatives which of the rows `untold` hold, else DIFFERENTIABLE."""
+    z = []
+    for rows in (active | untold, active & ~untold):
+        z.append(solve_at(problem, solution, rows, probe(problem, rows)).z[0].flatten(1))
+    change, size = (z[0] - z[1]).abs().amax(-1), torch.maximum(z[0].abs(), z[1].abs()).amax(-1)
+    return torch.where(change <= SAME * size, int(Why.DIFFERENTIABLE), int(Why.WEAKLY_ACTIVE))
