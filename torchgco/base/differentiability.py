@@ -16,6 +16,7 @@ class Differentiability(IntEnum):
     NOT_STRICT = 5
     DEPENDENT_ROWS = 6
     WEAKLY_ACTIVE = 7
+    LEAVES_GOAL = 8
 
     @property
     def sentence(self) -> str:
@@ -27,6 +28,8 @@ _SENTENCES = {
     Differentiability.NOT_ASKED: "Nothing that the problem depends on asked for gradients when it was solved.",
     Differentiability.NOT_SOLVED: "The solve found no feasible trajectory; its status says why.",
     Differentiability.MOVED: "The solver's trajectory is no minimum: iterations from there lead to another one.",
+    Differentiability.LEAVES_GOAL: "The solver's trajectory reaches the goal, but the minimum nearby doesn't: terminal "
+    "weights are too small for it.",
     Differentiability.NOT_STATIONARY: "The optimality conditions can't be met to the precision that derivatives need.",
     Differentiability.NOT_STRICT: "The minimum isn't strict: along some direction the cost is flat, or falls.",
     Differentiability.DEPENDENT_ROWS: "Constraints that hold depend on each other, so their multipliers aren't unique.",

@@ -168,6 +168,8 @@ class BoundQuadratic(Cost):
 
     def _times(self, W: Tensor, e: Tensor) -> Tensor:
         # With products and sums, a problem's bits don't depend on the batch; with one GEMM by a shared matrix they do.
+        if W.requires_grad and e.dim() == 3 and W.dim() == 4 and W.shape[1] == 1:
+            return torch.bmm(e, W[:, 0].mT.expand(len(e), *W.shape[2:]))  # products of all knots would be kept
         return W * e if self.diagonal else (W * e.unsqueeze(-2)).sum(-1)
 
 

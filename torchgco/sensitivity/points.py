@@ -14,16 +14,20 @@ from torch import Tensor
 
 from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.draws import scattered
-from torchgco.base.status import Status
-from torchgco.base.tree import copied, put
+from torchgco.base.status import SOLVED, Status
+from torchgco.base.tree import copied, put, take
 from torchgco.kernels import cost_unit, interior_of, measured
 from torchgco.lagrangian.kkt import KktSolve, RightSides
+from torchgco.lagrangian.quality import has_arrived
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
+from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.rules import RAW
+from torchgco.solvers.session import Session
 
 # With a tolerance of 1e-13, rounding ends some polishes before they meet it.
-POLISH = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8, max_iterations=60)
+POLISH = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8, max_iterations=20)
 STAYS = 1e-3  # share of 1 + the largest state or control by which a polish may move one: a solver's tolerance, no more
 LEFT = 1e-6  # of rows' right hand sides of 1: what dependent rows leave open is about 1, others leave rounding
 # s z = mu at the end of a polish, 1e-13: where slack and multiplier are within this factor of each other, both about
@@ -72,8 +76,9 @@ def points_of(problem: Problem, solution: Solution) -> Points:
     _polish(problem, solved.nonzero().flatten(), growth, result, reason)
     room = clearance(problem, solution.X)
     grown = solved & (reason != Why.DIFFERENTIABLE) & (room > 0) & torch.isfinite(room)
-    growth = torch.where(grown, room, growth)
+    growth, first = torch.where(grown, room, growth), reason.clone()
     _polish(problem, grown.nonzero().flatten(), growth, result, reason)
+    reason = torch.where(reason == Why.DIFFERENTIABLE, reason, first)
     growth = torch.where(reason == Why.DIFFERENTIABLE, growth, 0.0)
     problem = problem.grown(growth) if bool((growth > 0).any()) else problem
     active, untold = rows_that_hold(problem, result)
@@ -96,19 +101,20 @@ def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, re
         return
     part, old, by = problem.take(rows), result.take(rows), growth[rows]
     asked = part.grown(by) if bool((by > 0).any()) else part
-    new = POLISH.solve(asked, old.U, warm=old.multipliers, X0=old.X)
-    moved = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U))
-    ends, stays = new.status == Status.CONVERGED, moved <= STAYS
-    reason[rows] = torch.where(
-        stays, torch.where(ends, int(Why.DIFFERENTIABLE), int(Why.NOT_STATIONARY)), int(Why.MOVED)
-    )
-    kept = (ends & stays).nonzero().flatten()
+    call = replace(Call.checked(asked, old.U, warm=old.multipliers), X0=old.X)
+    end = POLISH.solved(call)
+    new = Session(call, RAW).trajectories(end)
+    stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STAYS
+    leaves = (end.status == SOLVED) & has_arrived(part, old.X) & ~has_arrived(part, new.X)
+    why = torch.where(leaves, int(Why.LEAVES_GOAL), int(Why.MOVED))
+    ends = torch.where(end.status == SOLVED, int(Why.DIFFERENTIABLE), int(Why.NOT_STATIONARY))
+    reason[rows] = torch.where(stays, ends, why)
+    kept = (reason[rows] == Why.DIFFERENTIABLE).nonzero().flatten()
     if kept.numel() > 0:
-        better = _bare(new.take(kept))
-        worst = measured(part.take(kept), better.X, better.U)
-        more = old.iterations[kept] + better.iterations
-        same = {name: getattr(old, name)[kept] for name in ("outer_iterations", "guided", "status")}
-        put(result, rows[kept], replace(better, violation=worst, iterations=more, horizon=None, **same))
+        best = take(new, kept)
+        worst, more = measured(part.take(kept), best.X, best.U), old.iterations[kept] + end.iterations[kept]
+        parts = {"X": best.X, "U": best.U, "multipliers": best.multipliers, "cost": best.cost}
+        put(result, rows[kept], replace(old.take(kept), **parts, violation=worst, iterations=more))
 
 
 def _moved(new: Tensor, old: Tensor) -> Tensor:
