@@ -14,7 +14,6 @@ from torchgco.base.gradients import recording
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users
 from torchgco.constraints.bounds import RateBounds
-from torchgco.kernels import cost_unit
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.problem.problem import Problem
 from torchgco.sensitivity.function import Solved, System
@@ -22,7 +21,7 @@ from torchgco.sensitivity.points import Points, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
-STATIONARY = 1e-7  # slope of the Lagrangian, in units of the cost, up to which a point is stationary
+NEAR = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
 REFUSED = "float64 problems with one horizon, a given start and no RateBounds, where gradients are asked for"
 
 
@@ -79,11 +78,10 @@ def attached(asked: Problem, problem: Problem, solution: Solution) -> Solution:
     with recording():
         at = points.take(rows)
         found_at = _residual(asked, at, rows)
-        with torch.no_grad():
-            small = found_at.largest <= STATIONARY * cost_unit(at.problem)
-        if not bool(small.all()):
-            points.reason[rows[~small]] = int(Why.NOT_STATIONARY)
-            rows, at, found_at = rows[small], at.take(small.nonzero().flatten()), found_at.take(small)
+        near = _step_left(at, found_at) <= NEAR
+        if not bool(near.all()):
+            points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
+            rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)
         return _with_values(found, rows, _values(at, found_at)) if rows.numel() > 0 else found
 
 
@@ -94,12 +92,27 @@ def _residual(problem: Problem, at: Points, rows: Tensor) -> Residual:
     return residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
 
 
+def _step_left(at: Points, of: Residual) -> Tensor:
+    """The step (B,) from the points to where the conditions hold to first order, as a share of 1 + the largest state or
+    control; infinite where it isn't a number."""
+    with torch.no_grad():
+        x, u, _, _ = _system(at).solve(of.x[None], of.u[None], of.gaps[None], of.rows[None])
+        size = 1.0 + torch.maximum(at.solution.X.abs().flatten(1).amax(-1), at.solution.U.abs().flatten(1).amax(-1))
+        step = torch.maximum(x[0].abs().flatten(1).amax(-1), u[0].abs().flatten(1).amax(-1)) / size
+        return torch.where(torch.isfinite(step), step, torch.inf)
+
+
+def _system(at: Points) -> System:
+    found = at.solution
+    return System(at.problem, found.X, found.U, found.multipliers.lam, at.active)
+
+
 def _values(at: Points, of: Residual) -> tuple[Tensor, ...]:
     """X, U, multipliers (B, R) and costs of the points, which lead to the residual."""
     found, multipliers = at.solution, at.solution.multipliers.lam
     flat = torch.cat([found.X.new_zeros(len(found), 0), *(lam.flatten(1) for lam in multipliers)], dim=1)
-    system, values = System(at.problem, found.X, found.U, multipliers, at.active), (found.X, found.U, flat, found.cost)
-    X, U, lam, cost = Solved.apply(system, values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
+    values = found.X, found.U, flat, found.cost
+    X, U, lam, cost = Solved.apply(_system(at), values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
     return torch.cat((of.start.unsqueeze(1), X[:, 1:]), dim=1), U, lam, cost
 
 

@@ -30,11 +30,6 @@ class Residual:
         """That of the problems at `rows`, places or a mask."""
         return Residual(**{name: part[rows] for name, part in vars(self).items()})
 
-    @property
-    def largest(self) -> Tensor:
-        """The largest slope of L, (B,)."""
-        return torch.cat((self.x.detach().flatten(1), self.u.detach().flatten(1)), dim=1).abs().amax(-1)
-
 
 def residual(problem: Problem, X: Tensor, U: Tensor, y: Tensor, lam: Tensor) -> Residual:
     """The residual at X (B, N+1, n), U (B, N, m) with costates y (B, N+1, n) and multipliers lam (B, R).
