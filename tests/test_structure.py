@@ -23,6 +23,7 @@ LAYERS = [
     ["solution", "native"],
     ["kernels"],
     ["solvers", "roadmap"],
+    ["sensitivity"],
     ["guidance", "missions", "scenarios"],
     ["search", "plotting"],
     ["view"],

@@ -147,7 +147,8 @@ def compare(
         kernels_of(problem)
         prepared = solver.prepare(problem)
         began = time.perf_counter()
-        found = solve(problem, U0, prepared, seed, max_seconds=max_seconds, verbose=False)
+        with torch.no_grad():
+            found = solve(problem, U0, prepared, seed, max_seconds=max_seconds, verbose=False)
         if problem.x0.device.type == "cuda":
             torch.cuda.synchronize(problem.x0.device)
         seconds = (time.perf_counter() - began) / max(1, problem.B)
@@ -276,7 +277,7 @@ def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = N
     """
     from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
 
-    return solution_figure(problem, solution, b)
+    return solution_figure(problem, solution.detach(), b)
 
 
 def show(problem: Problem, solution: Solution) -> HtmlPage:
@@ -287,7 +288,7 @@ def show(problem: Problem, solution: Solution) -> HtmlPage:
     """
     from torchgco.view import notebook  # slow to load
 
-    return notebook.show(problem, solution)
+    return notebook.show(problem, solution.detach())
 
 
 def _guess(problem: Problem, whole: Problem) -> Tensor:

@@ -96,7 +96,7 @@ class Solution:
         Raises:
             InputError: no such place, or a problem of another form.
         """
-        return explanation(self, b, problem)
+        return explanation(self.detach(), b, problem)
 
     @property
     def differentiable(self) -> Tensor:
@@ -127,7 +127,9 @@ class Solution:
 
     def detach(self) -> Solution:
         """The same numbers without gradients; itself where it has none."""
-        return without_gradients(self)
+        live = {"X": self.X, "U": self.U, "cost": self.cost, "multipliers": self.multipliers}
+        parts = {name: without_gradients(part) for name, part in live.items()}
+        return self if all(parts[name] is part for name, part in live.items()) else replace(self, **parts)
 
     def shifted(self, steps: int = 1) -> Solution:
         """The guess for the same problems `steps` stages later, as `solve(problem, warm=solution.shifted())` takes it.
@@ -184,7 +186,7 @@ class Solution:
 
     def to_dict(self) -> dict[str, Any]:
         """X, U and the numbers of each problem as NumPy arrays, by name; `status` as names, t where it is known."""
-        held: dict[str, Any] = {name: getattr(self, name).cpu().numpy() for name in _TENSORS}
+        held: dict[str, Any] = {name: getattr(self, name).detach().cpu().numpy() for name in _TENSORS}
         held["status"] = [status.name for status in self.statuses]
         if self.horizon is not None:
             held["horizon"] = self.horizon.cpu().numpy()
@@ -223,13 +225,13 @@ class Solution:
 
         columns: dict[str, Any] = {"status": [s.name for s in self.statuses]}
         for name in ("cost", "violation", "iterations", "outer_iterations", "guided"):
-            columns[name] = getattr(self, name).cpu().numpy()
+            columns[name] = getattr(self, name).detach().cpu().numpy()
         if self.horizon is not None:
             columns["horizon"] = self.horizon.cpu().numpy()
         if self.account is not None and self.account.kernels is not None:
             columns["kernels"] = self.account.kernels
         if problem is not None:
-            columns |= judged(problem, self.U, None if problem.free_start is None else self.X[:, 0])
+            columns |= judged(problem, self.U.detach(), None if problem.free_start is None else self.X[:, 0].detach())
         return pd.DataFrame(columns).rename_axis("element")
 
     def worst_rows(self, problem: Problem) -> pd.DataFrame:
@@ -247,7 +249,7 @@ class Solution:
 
         check_shape(self.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
         check_shape(self.U, (problem.B, problem.N, problem.m), "problem: solution.U")
-        return pd.DataFrame(worst_rows(problem, self.X, self.U)).rename_axis("element")
+        return pd.DataFrame(worst_rows(problem, self.X.detach(), self.U.detach())).rename_axis("element")
 
     if TYPE_CHECKING:  # pages know solutions: `torchgco` adds the method
 
@@ -255,7 +257,7 @@ class Solution:
 
     def save(self, path: str | Path) -> None:
         """Write an npz: all of it or, if interrupted, nothing."""
-        arrays = {f.name: getattr(self, f.name).cpu().numpy() for f in fields(self) if f.name in _TENSORS}
+        arrays = {f.name: getattr(self, f.name).detach().cpu().numpy() for f in fields(self) if f.name in _TENSORS}
         arrays["mu"] = self.multipliers.mu.cpu().numpy()
         if self.horizon is not None:
             arrays["horizon"] = self.horizon.cpu().numpy()
@@ -264,7 +266,7 @@ class Solution:
         if self.account is not None and self.account.kernels is not None:
             arrays["kernels"] = np.array(self.account.kernels)
         for i, lam in enumerate(self.multipliers.lam):
-            arrays[f"lam{i}"] = lam.cpu().numpy()
+            arrays[f"lam{i}"] = lam.detach().cpu().numpy()
         write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
     @classmethod

@@ -32,9 +32,16 @@ def is_recording() -> bool:
 
 def asking(tree: Any) -> list[Tensor]:
     """The tensors in nested sequences, mappings and dataclasses that ask for gradients."""
-    if isinstance(tree, Tensor):
-        return [tree] if tree.requires_grad else []
-    return [tensor for _, part in _parts(tree) for tensor in asking(part)]
+    found: list[Tensor] = []
+    waiting, seen = [tree], set[int]()
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, Tensor):
+            found += [part] if part.requires_grad else []
+        elif id(part) not in seen:  # parts may hold each other
+            seen.add(id(part))
+            waiting += [held for _, held in _parts(part)]
+    return found
 
 
 def without_gradients(tree: Any) -> Any:

@@ -16,19 +16,22 @@ from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.draws import scattered
 from torchgco.base.status import SOLVED, Status
 from torchgco.base.tree import copied, put, take
-from torchgco.kernels import cost_unit, interior_of, measured
+from torchgco.kernels import chord_clearance, cost_unit, interior_of, measured
 from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
+from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 
 # With a tolerance of 1e-13, rounding ends some polishes before they meet it.
-POLISH = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8, max_iterations=20)
-STAYS = 1e-3  # share of 1 + the largest state or control by which a polish may move one: a solver's tolerance, no more
+POLISH = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8, max_iterations=40)
+# Share of 1 + the largest state or control by which a polish may move one. A solver ends where a share STATIONARY of
+# the cost may be left to save, which is of second order in what moves.
+STAYS = STATIONARY**0.5
 LEFT = 1e-6  # of rows' right hand sides of 1: what dependent rows leave open is about 1, others leave rounding
 # s z = mu at the end of a polish, 1e-13: where slack and multiplier are within this factor of each other, both about
 # sqrt(mu), which of them is 0 at the minimum isn't known.
@@ -105,10 +108,10 @@ def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, re
     end = POLISH.solved(call)
     new = Session(call, RAW).trajectories(end)
     stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STAYS
-    leaves = (end.status == SOLVED) & has_arrived(part, old.X) & ~has_arrived(part, new.X)
-    why = torch.where(leaves, int(Why.LEAVES_GOAL), int(Why.MOVED))
-    ends = torch.where(end.status == SOLVED, int(Why.DIFFERENTIABLE), int(Why.NOT_STATIONARY))
-    reason[rows] = torch.where(stays, ends, why)
+    stays &= ~(chord_clearance(part, new.X) < chord_clearance(part, old.X).clamp(max=0.0))
+    leaves = (stays | (end.status == SOLVED)) & has_arrived(part, old.X) & ~has_arrived(part, new.X)
+    why = torch.where(stays, int(Why.DIFFERENTIABLE), int(Why.MOVED))
+    reason[rows] = torch.where(leaves, int(Why.LEAVES_GOAL), why)
     kept = (reason[rows] == Why.DIFFERENTIABLE).nonzero().flatten()
     if kept.numel() > 0:
         best = take(new, kept)
