@@ -7,11 +7,11 @@ autodiff takes through the residual.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch._C._functorch import is_legacy_batchedtensor  # type: ignore[import]
 
 from torchgco.kernels import interior_of
 from torchgco.lagrangian.kkt import RightSides
@@ -50,12 +50,11 @@ class Solved(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.system = inputs[0]
+        ctx.save_for_backward(*inputs[2:])
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, X: Tensor, U: Tensor, lam: Tensor, cost: Tensor) -> tuple[Any, ...]:
-        x, u, gaps, rows = Adjoint.apply(ctx.system, X, U, lam)
-        return None, None, x, u, gaps, rows, cost
+        return None, None, *Adjoint.apply(ctx.system, X, U, lam, cost, *ctx.saved_tensors)
 
     @staticmethod
     def jvp(ctx: Any, _: None, __: None, *tangents: Tensor) -> tuple[Tensor, ...]:
@@ -65,21 +64,32 @@ class Solved(torch.autograd.Function):
 
 
 class Adjoint(torch.autograd.Function):
-    """-K^-1 of upstream gradients of X, U and multipliers; a function of its own for the sake of its vmap rule."""
+    """Gradients by the residual's parts, from upstream ones of X, U, multipliers and costs.
+
+    It is a function of its own, of the parts too, for two reasons: a rule for many right hand sides at once, and that a
+    second derivative is refused. Autodiff would take it at a fixed solution, without an error.
+    """
 
     @staticmethod
-    def forward(system: System, X: Tensor, U: Tensor, lam: Tensor) -> tuple[Tensor, ...]:
-        return tuple(part[0] for part in system.solve(X[None], U[None], None, lam[None]))
+    def forward(system: System, X: Tensor, U: Tensor, lam: Tensor, cost: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
+        if is_legacy_batchedtensor(X) or is_legacy_batchedtensor(cost):
+            raise RuntimeError(
+                "solutions: no `vectorize` or `is_grads_batched`; torch.func.vmap over autograd.grad serves"
+            )
+        return *(part[0] for part in system.solve(X[None], U[None], None, lam[None])), cost.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         pass
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], system: System, *upstream: Tensor) -> tuple[Any, Any]:
-        many = (
+    def backward(ctx: Any, *upstream: Tensor) -> NoReturn:
+        raise RuntimeError("solutions have no second derivatives: their gradients can't be differentiated again")
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], system: System, *given: Tensor) -> tuple[Any, Any]:
+        X, U, lam, cost = (
             part.expand(info.batch_size, *part.shape) if dim is None else part.movedim(dim, 0)
-            for part, dim in zip(upstream, in_dims[1:], strict=True)
+            for part, dim in zip(given[:4], in_dims[1:5], strict=True)
         )
-        X, U, lam = many
-        return system.solve(X, U, None, lam), (0, 0, 0, 0)
+        return (*system.solve(X, U, None, lam), cost.clone()), (0,) * 5
