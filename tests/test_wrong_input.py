@@ -122,7 +122,11 @@ def test_tensors_that_are_not_plain_are_refused(kind: str) -> None:
         "state_bounds.lower": lambda: held(StateBounds(value, 1)),
         "goal.radius": lambda: make(goal=Goal([0.0, 0.0], diagonal)),
     }
+    served = ("x0", "cost.Q", "state_bounds.lower") if value.requires_grad else ()
     for field, use in uses.items():
+        if field in served:
+            use()
+            continue
         with pytest.raises(InputError) as caught:
             use()
         assert caught.value.field == field

@@ -84,18 +84,13 @@ def solve(
     """
     check_untransformed("solve")
     check_problem(problem)
-    if warm is not None and not isinstance(warm, Solution):
-        raise InputError("warm", "a Solution, or None", type(warm).__name__)
-    warm = None if warm is None else warm.detach()
+    warm = _checked(warm)
     problem = asked = problem.anew()
     differentiates = asks_for_gradients(problem)
     solver = "gco" if solver is None else solver
     name = solver if isinstance(solver, str) else None
     solver = _solver(solver, problem, check_value(record, bool, "record"))
-    if U0 is None:
-        problem, U0 = _start(problem, warm, solver)
-    elif for_solvers(problem) is problem:
-        problem = current(problem)  # traced once, for the solve and for the warnings after it
+    problem, U0 = _start(problem, warm, solver, U0)
     multipliers = None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
     if warm is None and (told := short_horizons(problem)) is not None:
@@ -109,9 +104,7 @@ def solve(
         watcher.close()
     if name is not None and found.account is not None:
         found = replace(found, account=found.account.of_preset(name))
-    if warm is None:  # the guess of a warm start keeps the constraints already: its values are no size
-        _warn_of_scale(problem, U0, found)
-    found = _warned_of_contact(problem, found)
+    found = _warned_of_contact(problem, found, None if warm is not None else U0)
     return attached(asked, problem, found) if differentiates else found
 
 
@@ -191,8 +184,19 @@ def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
     return made.recording() if record else made
 
 
-def _start(problem: Problem, warm: Solution | None, solver: Solver) -> tuple[Problem, Tensor]:
-    """Controls (B, N, m) to begin with where none are given, and the problem with the guess of its free starts."""
+def _checked(warm: Any) -> Solution | None:
+    """The guess of a warm start without gradients: it takes no part in derivatives."""
+    if warm is None:
+        return None
+    if not isinstance(warm, Solution):
+        raise InputError("warm", "a Solution, or None", type(warm).__name__)
+    return warm.detach()
+
+
+def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor | None) -> tuple[Problem, Tensor]:
+    """Controls (B, N, m) to begin with, where none are given, and the problem with the guess of its free starts."""
+    if U0 is not None:  # traced once, for the solve and for the warnings after it
+        return (current(problem) if for_solvers(problem) is problem else problem), U0
     if warm is not None:
         if problem.free_start is not None:
             check_shape(warm.X, (problem.B, problem.N + 1, problem.n), "warm.X")
@@ -207,11 +211,17 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver) -> tuple[Pro
     return problem, _guess(problem, traced)
 
 
-def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
+def _warned_of_contact(problem: Problem, solution: Solution, U0: Tensor | None) -> Solution:
     """The solution, with a ContactWarning at the caller's caller where trajectories touch obstacles between knots.
 
     Only trajectories with a status of CLAIMS count; obstacles of a kind that the judge doesn't know are left out.
+
+    Args:
+        U0: the guess, by which `_warn_of_scale` measures; None: that of a warm start, which keeps the constraints
+            already, so that its values are no size.
     """
+    if U0 is not None:
+        _warn_of_scale(problem, U0, solution)
     touching = touches(problem, solution).nonzero().flatten().tolist()
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
@@ -242,7 +252,7 @@ def _warn_of_scale(problem: Problem, U0: Tensor, solution: Solution) -> None:
             f"{float(solution.violation[b]):.2g}; choose units in which the constraint is larger, or a smaller "
             "violation_tolerance of the solver",
             ScaleWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

@@ -71,7 +71,7 @@ def test_jacobians_of_all_outputs_at_once_are_those_one_by_one() -> None:
     basis = torch.eye(len(U)).to(D)
     one, many = torch.stack([slope(v) for v in basis]), torch.func.vmap(slope)(basis)
     assert torch.equal(one, many) and float(one.abs().amax(dim=(1, 2)).min()) > 1e-3
-    with pytest.raises(RuntimeError, match="torch.func.vmap over"):
+    with pytest.raises(RuntimeError, match=r"torch\.func\.vmap over"):
         torch.autograd.grad(U, x0, basis, is_grads_batched=True)
 
 
