@@ -191,7 +191,7 @@ def text(count: int, seed: int) -> str:
     return "\n\n".join([
         markdown(["problems", "differentiable", "others"], shares),
         markdown(["problems", "by", "median error", "largest", "below 1e-6", "below 1e-4", "of"], kinds),
-        markdown(["problems", "solve, ms", "more with gradients", "backward", "backward / solve", "all / solve"], costs),
+        markdown(["problems", "solve, ms", "more, ms", "backward, ms", "backward / solve", "all / solve"], costs),
     ])  # fmt: skip
 
 
