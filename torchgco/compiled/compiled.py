@@ -292,11 +292,11 @@ class Compiled:
         """The problem with its numbers as they are, and nothing that was computed from others."""
         problem = self._problem
         constraints = tuple(_renewed(part) for part in problem.constraints)
-        form = {key: value for key, value in problem.form.items() if key not in ("packed", "rows")}
-        now = problem._with({"constraints": constraints}, form)
+        known = replace(problem.known, row_shapes=None, packed=(None, None))
+        now = problem._with({"constraints": constraints}, known)
         if now.goal is None or now.goal.assumed:
             dims = now._dimensions(now.x0)
-            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, form)
+            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, known)
         return now
 
     def _solved(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
