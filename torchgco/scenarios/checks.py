@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, shown
 from torchgco.base.options import INCREASING, Above, AtMost, Within, check_value
 from torchgco.obstacles.boxes import UNIT_WITHIN
 
@@ -39,6 +39,18 @@ Region2 = tuple[Range, Range]
 Region3 = tuple[Range, Range, Range]
 # Numbers that layouts share, by field.
 SCALARS: dict[str, Any] = {"vehicle_radius": Length, "goal_radius": Size, "dt": TimeStep, "stages": Stages}
+
+
+def stages(value: Any, count: int) -> int | np.ndarray | None:
+    """The number of stages, or where layouts differ (count,) int64 of them."""
+    if value is None or np.ndim(value) == 0:
+        held = scalar("stages", value)
+        return None if held is None else int(held)
+    numbers = array(value, "layouts.stages")
+    whole = numbers.shape == (count,) and bool((numbers == np.round(numbers)).all())
+    if not whole or not ((numbers >= 1) & (numbers <= MOST_STAGES)).all():
+        raise InputError("layouts.stages", f"one whole number above 0, or {count} of them", shown(value))
+    return int(numbers[0]) if (numbers == numbers[0]).all() else numbers.astype(np.int64)
 
 
 def scalar(name: str, value: Any) -> float | int | None:
