@@ -123,7 +123,8 @@ def test_layouts_keep_their_map_in_a_file(name: str, tmp_path: Path) -> None:
 
 def test_maps_are_of_the_layouts_space_and_shared(tmp_path: Path) -> None:
     layouts = MapFile(rooms(tmp_path)).draw([0, 1], 0)
-    small = samples.write(tmp_path, "small.npz", samples.npz(occupied=ROOMS[:, :9], origin=[-1.0, 2.0], resolution=0.25))
+    raw = samples.npz(occupied=ROOMS[:, :9], origin=[-1.0, 2.0], resolution=0.25)
+    small = samples.write(tmp_path, "small.npz", raw)
     other = MapFile(small).draw([2], 0)
     with pytest.raises(InputError, match=r"layouts\.map: expected the same in all parts, or grids of the same size"):
         concatenate([layouts, other])

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchgco.dynamics.base import Dynamics, WrappedDynamics
+from torchgco.dynamics.base import WrappedDynamics
 from torchgco.dynamics.unicycle import Unicycle
 from torchgco.problem.problem import Problem
 
@@ -88,7 +88,7 @@ def drive_unicycle(problem: Problem, track: Track) -> tuple[Array, Array]:
 
 
 def push_of(problem: Problem) -> Array | None:
-    """How the controls of a few stages push the position of the first problem at its start, (d, m); None if not a point.
+    """How far controls of a few stages push the position of the first problem at its start, (d, m); None: no point.
 
     A point can be pushed in every direction about equally well.
     """

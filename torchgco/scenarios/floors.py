@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -21,10 +20,8 @@ from torchgco.scenarios.plans import Canvas, rooms, track
 PLANS = 50  # that are drawn for one layout, at most, until one has ends that are far enough apart
 SURE = 1.1  # radii that the way from start to goal is free for
 CLEAR = 1.5  # radii that start and goal are away from all walls
-TENS = 10  # stages are a multiple of this, so that many layouts have as many
 
 Lanes = Annotated[tuple[Annotated[int, Within(2, 1000)], Annotated[int, Within(2, 1000)]], INCREASING]
-Pace = Annotated[float, Within(1e-3, checks.LARGEST, "m/s")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +47,8 @@ class Floors(Scenario):
         lane: [least, largest] width of a track's lanes, m.
         lanes: [least, largest] number of them; fewer where they don't fit.
         apart: length of the way from start to goal, m, at least.
-        pace: the horizon is as long as the way takes at this mean speed, m/s.
-        stages: N, the same for all layouts; None: by the way and `pace`, in tens.
+        pace: horizons are as long as the way takes at this mean speed, m/s.
+        stages: N, the same for all layouts; None: by the way and `pace`, in tens, and 5 s at least.
         vehicle_radius, goal_radius: m.
         dt: s.
 
@@ -75,7 +72,7 @@ class Floors(Scenario):
     lane: checks.Sizes = (1.1, 2.0)
     lanes: Lanes = (3, 5)
     apart: checks.Length = 10.0
-    pace: Pace = 0.7
+    pace: checks.Pace = 0.7
     stages: checks.Stages | None = None
     vehicle_radius: checks.Length = 0.25
     goal_radius: checks.Size = 0.3
@@ -111,7 +108,7 @@ class Floors(Scenario):
         raise InputError("scenario.apart", expected, f"{self.apart:g} m, which none of {PLANS} plans has")
 
     def _layout(self, field: DistanceField, ends: np.ndarray, far: float) -> Layouts:
-        stages = math.ceil(far / (self.pace * self.dt) / TENS) * TENS if self.stages is None else self.stages
+        stages = self.stages or checks.stages_for(far, self.pace, self.dt)
         none = np.empty((1, 0, 2))
         return Layouts(
             centers=none, radii=none[..., 0], start=ends[:1], goal=ends[1:], vehicle_radius=self.vehicle_radius,
@@ -124,9 +121,7 @@ class Floors(Scenario):
         if rng.uniform() < self.tracks:
             ends = np.array(track(rng, canvas, self.thickness, self.lane, self.lanes))
         else:
-            rooms(
-                rng, canvas, self.thickness, self.room, self.door, self.loops, self.furniture, self.piece
-            )
+            rooms(rng, canvas, self.thickness, self.room, self.door, self.loops, self.furniture, self.piece)
         field = DistanceField.of(OccupancyGrid(canvas.occupied, np.zeros(2), self.resolution))
         ways = Ways.through(field, 0, SURE * self.vehicle_radius)
         free = np.flatnonzero(ways.distance.ravel() > CLEAR * self.vehicle_radius)

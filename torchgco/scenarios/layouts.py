@@ -196,9 +196,7 @@ class Layouts:
         write_whole(path, lambda file: np.savez_compressed(file, **self.arrays()))  # type: ignore[arg-type]
 
     @classmethod
-    def load(
-        cls, path: str | os.PathLike[str], room: float = math.inf, limit: str = "of free memory"
-    ) -> Layouts:
+    def load(cls, path: str | os.PathLike[str], room: float = math.inf, limit: str = "of free memory") -> Layouts:
         """The layouts of a file, named by its stem.
 
         Args:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,9 +111,7 @@ def _wall(
     return None
 
 
-def _door(
-    rng: np.random.Generator, axis: int, begin: Array, end: Array, door: Sequence[float]
-) -> tuple[Array, Array]:
+def _door(rng: np.random.Generator, axis: int, begin: Array, end: Array, door: Sequence[float]) -> tuple[Array, Array]:
     """The corners of an opening in a wall."""
     low, high, across = begin.copy(), end.copy(), 1 - axis
     wide = rng.uniform(door[0], door[1])
@@ -155,7 +154,7 @@ def track(
     corners[:, 1 - along] = across.repeat(2)
     corners[0::2, along], corners[1::2, along] = ends[:-1], ends[1:]
     norm = np.inf if rng.uniform() < 0.5 else 2  # square corners, or round ones
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in pairwise(corners):
         near = np.clip(canvas.centers, np.minimum(a, b), np.maximum(a, b))
         canvas.occupied[np.linalg.norm(canvas.centers - near, norm, axis=-1) <= 0.5 * wide] = False
     return corners[0], corners[-1]

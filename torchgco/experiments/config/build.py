@@ -63,7 +63,10 @@ class Setup:
         count = count if count is not None else self.scenario.available or DEFAULT_LAYOUTS
         check_value(count, Count, "study.layouts")
         self._refuse_beyond_memory(self.scenario.draw(range(1), self.seed), count)
-        return self.vehicle.at_rest(self.scenario.draw(range(count), self.seed))
+        drawn = self.vehicle.at_rest(self.scenario.draw(range(count), self.seed))
+        if self.mission is not None and drawn.stages is not None:  # a planner plans over one number of stages
+            return replace(drawn, stages=int(np.max(drawn.stages)))
+        return drawn
 
     def _refuse_beyond_memory(self, first: Layouts, count: int) -> None:
         """Raise where one problem, or all layouts and controls, exceed the free memory: the system would kill us."""

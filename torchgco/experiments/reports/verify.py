@@ -95,9 +95,7 @@ class Verification:
         return any(len(table.differences) for table in self.tables)
 
 
-def verify(
-    folders: Iterable[str | os.PathLike[str]], trust: bool = False
-) -> tuple[list[Verification], list[str]]:
+def verify(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> tuple[list[Verification], list[str]]:
     """Confirm every finished study in and below some folders; also names the studies that aren't finished.
 
     Args:

@@ -109,9 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def write_view(
-    folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False
-) -> Path:
+def write_view(folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False) -> Path:
     """Write the page of a finished study; returns where it lies. Raises InputError as `study_page` does."""
     path = folder / NAME if output is None else output
     if path.is_dir():
