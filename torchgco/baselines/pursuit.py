@@ -82,7 +82,7 @@ class PathPursuit(Solver):
         held = session.call
         X, U, found = self.guess(held.problem, held.U0)
         held = replace(held, U0=U)
-        end = self._cleared(held, self.solver.solved(held, X))
+        end = self._cleared(held, self.solver.no_worse(held, self.solver.solved(held, X)))
         solution = session.finished(least_violated(held, end, admitted), admitted)
         return replace(solution, guided=found.long())
 

@@ -161,7 +161,7 @@ class Layouts:
         return (
             self.name == other.name
             and mine.keys() == theirs.keys()
-            and all(np.array_equal(mine[name], theirs[name], equal_nan=True) for name in mine)
+            and all(_equal(mine[name], theirs[name]) for name in mine)
         )
 
     def take(self, indices: Sequence[int] | np.ndarray) -> Layouts:
@@ -220,6 +220,11 @@ class Layouts:
         ids = held.pop(IDS, np.empty(0, np.int64))
         there = {name: held.pop(name) for name in stored_maps.NAMES if name in held}
         return cls(**held, map=map_of(there), name=path.stem, ids=ids)  # type: ignore[arg-type]
+
+
+def _equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two arrays hold the same; NaN equals NaN."""
+    return np.array_equal(a, b, equal_nan=a.dtype.kind == b.dtype.kind == "f")
 
 
 def _without_spheres(held: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
