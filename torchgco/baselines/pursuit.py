@@ -123,8 +123,9 @@ class PathPursuit(Solver):
 
     def _track(self, problem: Problem, scene: Scene | None) -> Track | None:
         """What to pursue in a batch of one; None where there is no way, or nowhere to go."""
-        R = radius_of(problem)
-        start, goal = (p[0].double().cpu().numpy() for p in self._ends(problem))
+        assert problem.goal is not None
+        R, ends = radius_of(problem), (problem.x0[:, problem.position], problem.goal.position)
+        start, goal = (p[0].double().cpu().numpy() for p in ends)
         way = np.stack((start, goal)) if scene is None else self._way(problem, scene, start, goal, R)
         if way is None or length(way) <= 0.0:
             return None
@@ -135,10 +136,6 @@ class PathPursuit(Solver):
         speed = length(points) / (self.share * duration)
         braking = speed / (BRAKING * duration)
         return Track(points, step, max(1, round(self.lookahead * unit / step)), speed, braking)
-
-    def _ends(self, problem: Problem) -> tuple[Tensor, Tensor]:
-        assert problem.goal is not None
-        return problem.x0[:, problem.position], problem.goal.position
 
     def _way(self, problem: Problem, scene: Scene, start: Array, goal: Array, R: float) -> Array | None:
         """The cheapest way (P, d) over a grid, first by steps that are free for the vehicle, then by nodes that are."""
