@@ -13,7 +13,7 @@ import pytest
 import torch
 import yaml
 
-from torchgco.native import kernels
+from torchgco import kernels
 from torchgco.native.compiler import find_compiler
 
 ROOT = Path(__file__).parents[1]

@@ -38,10 +38,10 @@ from torchgco import (
 )
 from torchgco.base.shapes import computing_on
 from torchgco.experiments.config.build import compose
+from torchgco.kernels import use_native
 from torchgco.maps import Field, OccupancyGrid
 from torchgco.maps.distance import DistanceField
 from torchgco.missions import RotorPlant
-from torchgco.native.kernels import use_native
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.reach import longest_step

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost
+from tests.engines import engine_of
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost, kernels
 from torchgco.base.values import NONE
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of, measured
+from torchgco.kernels import EagerWarning, measured
 
 D = torch.float64
 B, N = 3, 20

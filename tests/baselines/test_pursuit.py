@@ -32,7 +32,7 @@ from torchgco.baselines.pursuit import evenly, smoothed
 from torchgco.dynamics import Dynamics
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import compose
-from torchgco.native.dispatch import chord_clearance
+from torchgco.kernels import chord_clearance
 from torchgco.scenarios import Floors
 from torchgco.solvers.interior import InteriorPoint
 
@@ -169,6 +169,12 @@ def test_other_problems_are_refused_in_one_line(make: Any, said: str) -> None:
     with pytest.raises(InputError) as caught:
         torchgco.solve(problem, solver="path_pursuit")
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [{"share": 0.0}, {"share": 1.1}, {"lookahead": 0.0}, {"rounds": -1}, {"weight": -1.0}])
+def test_wrong_options_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=f"solver.{next(iter(wrong))}: expected"):
+        PathPursuit(**wrong)
 
 
 def test_a_unicycle_turns_before_it_drives() -> None:

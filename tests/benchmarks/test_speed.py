@@ -77,7 +77,10 @@ def numbers(bench: Bench, quantity: str) -> list[float]:
 @pytest.mark.parametrize(
     "section",
     [
-        latency, loop, own_model, targets,
+        latency,
+        loop,
+        own_model,
+        targets,
         *(pytest.param(section, marks=pytest.mark.slow) for section in SLOW),
     ],
 )

@@ -22,12 +22,12 @@ from torchgco import (
     Problem,
     StateBounds,
     Status,
+    kernels,
 )
 from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, current
+from torchgco.kernels import EagerWarning, current
 
 D = torch.float64
 STEPS = 20

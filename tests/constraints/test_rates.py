@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, inf
 
 import torchgco
+from tests.engines import engine_of
 from tests.native.test_engine import DAMPED, eager, natively, running_state
 from tests.native.users import Each, GaussNewton, Smooth, Tube, user_problem
 from torchgco import (
@@ -29,13 +30,13 @@ from torchgco import (
     Spheres,
     StateBounds,
     Status,
+    kernels,
 )
 from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of
+from torchgco.kernels import EagerWarning
 from torchgco.problem.rates import with_controls_before
 
 D = torch.float64

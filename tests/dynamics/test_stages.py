@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import engine_of
 from tests.native.users import N, with_stages
-from torchgco import ILQR, AugmentedLagrangian, FunctionCost, FunctionDynamics, InputError, Problem, Status
+from torchgco import ILQR, AugmentedLagrangian, FunctionCost, FunctionDynamics, InputError, Problem, Status, kernels
 from torchgco.baselines import CasADiSolver
 from torchgco.dynamics import rollout
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of, open_loop
+from torchgco.kernels import EagerWarning, open_loop
 
 D = torch.float64
 BRIEF = AugmentedLagrangian(inner=ILQR(max_iterations=2), max_outer_iterations=2)

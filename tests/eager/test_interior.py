@@ -32,9 +32,8 @@ from torchgco import (
 )
 from torchgco.base.shapes import Dimensions
 from torchgco.eager.curvature import by_forward, by_reverse, expansion_of, flat
+from torchgco.kernels import EagerWarning, use_native
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning
-from torchgco.native.kernels import use_native
 
 D = torch.float64
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -23,9 +23,9 @@ from torchgco import (
     Solution,
     StateBounds,
     Status,
+    kernels,
     presets,
 )
-from torchgco.native import kernels
 from torchgco.search import Converge, Finish, Starts
 
 D, INF = torch.float64, math.inf

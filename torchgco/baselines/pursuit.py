@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -10,12 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Natural, NonNegative, Positive, Share, check_options
+from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of
+from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps.ways import Ways, length
-from torchgco.native.dispatch import chord_clearance, measured
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Scene
@@ -27,7 +29,6 @@ from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
-from torchgco.solvers.state import SolveEnd
 
 Array = NDArray[np.float64]
 
@@ -65,7 +66,7 @@ class PathPursuit(Solver):
     weight: NonNegative = 2.0
     smoothing: NonNegative = 2.0
     lookahead: Positive = 2.4
-    share: Share = 0.75
+    share: Annotated[float, Above(0), AtMost(1)] = 0.75
     solver: InteriorPoint = InteriorPoint(initial_barrier=1e-3, warm_barrier=1e-4)
     rounds: Natural = 4
 

@@ -22,9 +22,9 @@ from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_own_numbers
 from torchgco.explaining.account import Account
+from torchgco.kernels import cost_unit, current, interior_of
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import cost_unit, current, interior_of
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
@@ -155,7 +155,8 @@ class Compiled:
         form, before, self._kept = current(for_solvers(problem)), self._kept, None
         if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
             kernels = interior_of(form)
-            if isinstance(kernels, InteriorEngine):
+            # What Python has read of a problem's own numbers stays in the code.
+            if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
                 self._problem, self._unit = form, cost_unit(form)
                 self._kept = Kept(kernels, form, **self._options(form))
                 if before is not None:

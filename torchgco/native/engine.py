@@ -55,9 +55,7 @@ class Engine:
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(
-        self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True
-    ) -> None:
+    def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MAX_VARIABLES:
@@ -85,6 +83,11 @@ class Engine:
         if name not in self._libraries:
             self._libraries[name] = load(units(), STRUCTURES)
         return self._libraries[name]
+
+    def forget_values(self) -> None:
+        """Let go of the numbers of the problem that the functions were traced with: all are solved with their own."""
+        for traced in self.captured.traces:
+            traced.forget_values()
 
     def with_shared(self, shared: Shared) -> Engine:
         """The same functions with other shared numbers, such as `captured.read` gives."""

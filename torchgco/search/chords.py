@@ -14,12 +14,12 @@ from torch import Tensor
 from torchgco.base.options import Count, check_options
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
+from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import has_arrived
-from torchgco.native.dispatch import chord_clearance, measured
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import SolveEnd
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much

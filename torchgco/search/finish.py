@@ -13,13 +13,13 @@ from torchgco.base.options import Positive, check_options
 from torchgco.base.status import STALLED
 from torchgco.base.tree import take
 from torchgco.constraints.bounds import ControlBounds
+from torchgco.kernels import open_loop, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import open_loop, value
+from torchgco.lagrangian.state import Iterate
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX, AugmentedLagrangian
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import Iterate
 
 KNOTS = 10  # of the noise that changes stalled controls
 SURE = 10.0  # times what outweighs the cost

@@ -13,13 +13,13 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import is_preferred
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.search.attempts import Search
 from torchgco.search.converge import Converge
 from torchgco.search.finish import STREAM, half_ranges
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import Iterate, SolveEnd
 
 KNOTS = 4  # of the noise: with 8, guesses are bent more often than optima are, and lead to fewer of them
 NEXT_STREAM = 2 * STREAM  # outer iteration that keys the noise, after that of `Finish`

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from torchgco.guidance.suitability import check_form, failure
+from torchgco.kernels import kernels_of
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.passes import Pass
@@ -34,7 +34,7 @@ def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[Sequence[Pas
         return others, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
     if not has_paths(problem):
         return others, None
-    why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
+    why = None if kernels_of(problem).compiled else failure(_expand, problem, problem.x0.dtype)
     if why is not None:
         return others, f"no path can be followed ({why})"
     return [_with_fitting_offsets(one, problem.m) if isinstance(one, PathProposals) else one for one in passes], None
