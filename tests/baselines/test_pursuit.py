@@ -171,7 +171,9 @@ def test_other_problems_are_refused_in_one_line(make: Any, said: str) -> None:
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("wrong", [{"share": 0.0}, {"share": 1.1}, {"lookahead": 0.0}, {"rounds": -1}, {"weight": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"share": 0.0}, {"share": 1.1}, {"lookahead": 0.0}, {"rounds": -1}, {"weight": -1.0}]
+)
 def test_wrong_options_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=f"solver.{next(iter(wrong))}: expected"):
         PathPursuit(**wrong)
