@@ -109,6 +109,19 @@ def test_changes_of_controls_may_be_bounded(model: Dynamics) -> None:
     assert bool(judge(problem, solution.U).sound.all())
 
 
+def test_a_bad_start_affects_its_own_problem_alone() -> None:
+    good = task(FORCE)
+    x0 = good.x0.repeat(2, 1)
+    x0[0, 0], x0[3, :2] = torch.nan, torch.tensor([3.0, 4.0])  # in the wall
+    bad = Problem(FORCE, QuadraticCost([1.0] * 4, [0.5] * 2, [9.0] * 4, [5.0, 4.0, 0.0, 0.0]),
+                  [two_rooms(), ControlBounds([-2.0] * 2, [2.0] * 2)], x0, 120, Goal([5.0, 4.0], 0.2))  # fmt: skip
+    solution = PathPursuit().solve(bad, rest(bad))
+    assert solution.guided.tolist() == [0, 1, 1, 0]
+    assert [status.name for status in solution.statuses][::3] == ["NON_FINITE", "INVALID_START"]
+    index = torch.tensor([1, 2])
+    assert torch.equal(PathPursuit().solve(bad.take(index), rest(bad)[index]).U, solution.U[index])
+
+
 def test_horizons_may_differ() -> None:
     problem = task(horizon=[120, 90])
     solution = PathPursuit().solve(problem, rest(problem))

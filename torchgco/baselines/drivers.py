@@ -77,11 +77,12 @@ def is_point(problem: Problem) -> bool:
     """
     one = problem.take(torch.arange(1, device=problem.x0.device))
     model = own_model(one.dynamics.at(0))
-    x, u = one.x0[:, : model.n], one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
+    x = one.x0[:, : model.n].nan_to_num(0.0, 0.0, 0.0)  # a bad start says nothing about the model
+    u = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
     integrated = getattr(model, "integrator", "none") != "none"
     A, B = jacobian(model.field if integrated else model.step, x, u)
     at = one.position
-    orders = [part[0, at].double().cpu().numpy() for part in (B, A @ B)]
+    orders = [_numbers(part[0, at]) for part in (B, A @ B)]
     first = next((push for push in orders if push.any()), orders[0])
     if not np.isfinite(first).all() or min(first.shape) < len(first):
         return False
@@ -117,7 +118,7 @@ def push_of(problem: Problem) -> Array:
         model = one.dynamics.at(k)
         fx, fu = model.jacobians(x, u)
         total, x = fx @ total + fu, model.step(x, u)
-    return total[0, one.position].double().cpu().numpy()
+    return _numbers(total[0, one.position])
 
 
 def drive_point(problem: Problem, track: Track) -> Array:
@@ -131,15 +132,14 @@ def drive_point(problem: Problem, track: Track) -> Array:
     inverse, time = np.linalg.pinv(push), AHEAD * float(problem.dynamics.dt)
     x, U, nearest = problem.x0, rest.clone(), 0
     for k in range(stages):
-        nearest, aim, wanted = track.target(x[0, at].numpy(), nearest)
-        away = aim - x[0, at].numpy()
-        far = float(np.linalg.norm(away))
-        goal = x[0, at].numpy() + away * min(1.0, wanted * time / max(far, 1e-12))
-        change = inverse @ (goal - _after(problem, x, rest, k)[0, at].numpy())
-        u = np.clip(rest[0, k].numpy() + change, low[k], high[k])
-        U[0, k] = torch.from_numpy(u)
+        p = _numbers(x[0, at])
+        nearest, aim, wanted = track.target(p, nearest)
+        far = float(np.linalg.norm(aim - p))
+        goal = p + (aim - p) * min(1.0, wanted * time / max(far, 1e-12))
+        change = inverse @ (goal - _numbers(_after(problem, x, rest, k)[0, at]))
+        U[0, k] = U.new_tensor(np.clip(_numbers(rest[0, k]) + change, low[k], high[k]))
         x = problem.dynamics.at(k).step(x, U[:, k])
-    return U[0].numpy()
+    return _numbers(U[0])
 
 
 def _after(problem: Problem, x: Tensor, rest: Tensor, k: int) -> Tensor:
@@ -155,7 +155,11 @@ def bounds_of(problem: Problem) -> tuple[Array, Array]:
     if bounds is None:
         wide = np.full((problem.N, problem.m), np.inf)
         return -wide, wide
-    lower, upper = (part[0].double().cpu().numpy() for part in bounds.over(problem.N))
+    lower, upper = (_numbers(part[0]) for part in bounds.over(problem.N))
     slack = np.where(np.isfinite(upper - lower), 0.5 * (1.0 - WITHIN) * (upper - lower), 0.0)
     wide = np.ones((problem.N, 1))
     return (lower + slack) * wide, (upper - slack) * wide
+
+
+def _numbers(value: Tensor) -> Array:
+    return value.double().cpu().numpy()

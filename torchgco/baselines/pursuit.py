@@ -67,7 +67,7 @@ class PathPursuit(Solver):
     smoothing: NonNegative = 2.0
     lookahead: Positive = 2.4
     share: Annotated[float, Above(0), AtMost(1)] = 0.75
-    solver: InteriorPoint = InteriorPoint(initial_barrier=1e-3, warm_barrier=1e-4)
+    solver: InteriorPoint = InteriorPoint(max_iterations=3000, initial_barrier=1e-3, warm_barrier=1e-4)
     rounds: Natural = 4
 
     def __post_init__(self) -> None:
@@ -95,7 +95,8 @@ class PathPursuit(Solver):
         """
         driver, scene = self._checked(problem)
         U, found = U0.clone(), torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
-        for b in range(problem.B):
+        sound = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
+        for b in sound.nonzero().flatten().tolist():
             row = torch.tensor([b], device=problem.x0.device)
             one = problem.take(row)
             track = self._track(one, None if scene is None else scene.take(row))
