@@ -41,11 +41,11 @@ def _parse_once() -> None:
 
 
 _parse_once()
-# Without a C compiler PyTorch's kernels solve, many times slower: these folders, whose tests are of native kernels or
-# of many solves, are skipped then.
+# Without a C compiler PyTorch's kernels solve, many times slower: these folders and files, whose tests are of native
+# kernels or of many solves, are skipped then.
 COMPILED = (
     "native", "compiled", "search", "missions", "benchmarks", "experiments", "notebooks", "golden", "fuzz", "solvers",
-    "view", "cluster",
+    "view", "cluster", "test_horizons.py", "test_scale.py",
 )  # fmt: skip
 
 
