@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, inf
 
 import torchgco
+from tests.engines import compiled
 from tests.native.users import N, with_bounds_by_knot
 from torchgco import (
     ILQR,
@@ -47,6 +48,7 @@ def fading(B: int = 2) -> Tensor:
     return each * torch.linspace(1.0, 1.5, B, dtype=D).view(B, 1, 1)
 
 
+@compiled
 def test_controls_follow_their_bounds_natively() -> None:
     problem = point(ControlBounds(-1.0, fading()), goal=50.0)
     with warnings.catch_warnings():

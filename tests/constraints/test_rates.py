@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, inf
 
 import torchgco
-from tests.engines import engine_of
+from tests.engines import compiled, engine_of
 from tests.native.test_engine import DAMPED, eager, natively, running_state
 from tests.native.users import Each, GaussNewton, Smooth, Tube, user_problem
 from torchgco import (
@@ -57,6 +57,7 @@ def changes(U: Tensor, previous: Tensor | None = None) -> Tensor:
     return (U if previous is None else torch.cat((previous.unsqueeze(1), U), 1)).diff(dim=1)
 
 
+@compiled
 @pytest.mark.parametrize("previous", [None, [0.5, -0.25]])
 def test_controls_change_no_faster_natively_and_as_ipopt_finds(previous: list[float] | None) -> None:
     """IPOPT gets the rows of two knots as they are, and FATROP the further states."""
@@ -153,6 +154,7 @@ def wide() -> dict[str, Problem]:
     }
 
 
+@compiled
 @pytest.mark.parametrize("name", ["quadratic", "diagonal", "per problem", "own expansion"])
 def test_native_iterations_are_pytorchs(name: str) -> None:
     problem = wide()[name]
@@ -222,8 +224,8 @@ def test_obstacles_are_searched_as_without_rates() -> None:
     near = FunctionConstraint(lambda x: x[..., 1:2] - 1.5, geometric=True)
     cost = QuadraticCost(Q=[0.01] * 6, R=[0.01] * 2, Qf=[200.0, 200, 0, 1, 1, 0], x_ref=[2.0, 0, 0, 0, 0, 0])
     parts = [wall, near, ControlBounds(-20, 20)]
-    model, x0 = Planar(turn_gain=10.0, turn_drag=1.0, drag=1.0), torch.zeros(5, 6, dtype=D)
-    x0[:, 1] = torch.linspace(-0.1, 0.1, 5)
+    model, x0 = Planar(turn_gain=10.0, turn_drag=1.0, drag=1.0), torch.zeros(16, 6, dtype=D)
+    x0[:, 1] = torch.linspace(-0.1, 0.1, 16)
     free = torchgco.solve(Problem(model, cost, parts, x0, 60))
     problem = Problem(model, cost, [*parts, RateBounds(-0.6, 0.6)], x0, 60)
     with warnings.catch_warnings():
@@ -232,9 +234,10 @@ def test_obstacles_are_searched_as_without_rates() -> None:
     assert float(changes(free.U).abs().max()) > 0.7
     assert float(changes(slow.U).abs().max()) <= 0.6001
     assert bool(judge(Problem(model, cost, parts, x0, 60), free.U).reached.all())
-    assert int(judge(problem, slow.U).reached.sum()) >= 3
+    assert int(judge(problem, slow.U).reached.sum()) >= 11  # 42 of 48 by three seeds: below this once in a hundred
 
 
+@compiled
 def test_new_limits_and_new_controls_before_need_no_new_kernel() -> None:
     problem = carts(RateBounds(-0.3, 0.3, previous=[0.0, 0.0]))
     moved = problem.started_at(problem.x0 + 0.1, [RateBounds(-0.2, 0.4, previous=[1.0, 0.5])])

@@ -292,11 +292,11 @@ class Compiled:
         """The problem with its numbers as they are, and nothing that was computed from others."""
         problem = self._problem
         constraints = tuple(_renewed(part) for part in problem.constraints)
-        form = {key: value for key, value in problem.form.items() if key not in ("packed", "rows")}
-        now = problem._with({"constraints": constraints}, form)
+        known = replace(problem.known, row_shapes=None, packed=(None, None))
+        now = problem._with({"constraints": constraints}, known)
         if now.goal is None or now.goal.assumed:
             dims = now._dimensions(now.x0)
-            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, form)
+            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, known)
         return now
 
     def _solved(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
@@ -349,11 +349,11 @@ class Compiled:
         ended = kept.statuses
         status = np.where(good | (ended == TIME_LIMIT), ended, Status.MAX_ITERATIONS)
         multipliers = Multipliers(tuple(lam.clone() for lam in kept.lam), PENALTY * self._unit)
-        X, U = (part.clone() for part in kept.rolled)
-        none, cost = torch.zeros_like(kept.iterations), X.new_full((X.shape[0],), torch.nan)
+        X, U, K, _, iterations = kept.copies()
+        none, cost = torch.zeros_like(iterations), X.new_full((X.shape[0],), torch.nan)
         return Solution(
-            X, U, kept.feedback.clone(), torch.zeros_like(U), multipliers, cost, self._violation().clone(),
-            torch.from_numpy(status.astype(np.int64)), kept.iterations.clone(), none, none.clone(),
+            X, U, K, torch.zeros_like(U), multipliers, cost, self._violation().clone(),
+            torch.from_numpy(status.astype(np.int64)), iterations, none, none.clone(),
         )  # fmt: skip
 
     def _again(self, found: Solution, rows: Tensor, until: float) -> None:
@@ -384,8 +384,8 @@ class Compiled:
             )
         else:
             assert kept is not None
-            (X, U), K, status = (part.clone() for part in kept.rolled), kept.feedback.clone(), kept.status.long()
-            worst, iterations = self._violation().clone(), kept.iterations.clone()
+            X, U, K, status, iterations = kept.copies()
+            worst = torch.from_numpy(kept.violations.copy()) if kept.engine.measures else self._violation()
         # The next call may begin with solutions, and with what only the time was over for.
         ended = status.numpy()
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)

@@ -21,11 +21,6 @@ from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Facts
 
-CURRENT = "current"  # marks the form of problems that a solve works on
-CHOSEN = "kernels"  # of a form: those in C, or None where they can't serve; "pytorch": PyTorch's
-PYTORCH = "pytorch"
-EXPECTED = "expected"  # marks that the interior point will be asked for
-WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines, the most recent ones
 CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
 
@@ -40,11 +35,10 @@ def current(problem: Problem) -> Problem:
     Every solve begins with this call: the tensors, numbers and modules that a user's code captures may have changed.
     Within a solve, subsets and other forms of the problem share the kernels of its beginning.
     """
-    if CURRENT in problem.form:
+    if problem.known.current:
         return problem
     fresh = problem.renewed()
-    fresh.form[CURRENT] = True
-    fresh.form[WARNED] = problem.form.setdefault(WARNED, set())
+    fresh.known.current, fresh.known.warned = True, problem.known.warned
     return fresh
 
 
@@ -54,19 +48,20 @@ def kernels_of(problem: Problem) -> Kernels:
     PyTorch's are used on a GPU, in single precision, where the process has chosen them (`use_native`), and where a part
     can't be traced or nothing compiles, which an EagerWarning explains.
     """
+    known = problem.known
     if native() and problem.x0.dtype == torch.float64 and problem.x0.device.type == "cpu":
-        if CHOSEN not in problem.form:
-            problem.form[CHOSEN] = _natively(problem)
-        if problem.form[CHOSEN] is not None:
-            return problem.form[CHOSEN]
-    if PYTORCH not in problem.form:
+        if known.in_c is None:
+            known.in_c = _natively(problem) or False
+        if known.in_c:
+            return known.in_c
+    if known.in_pytorch is None:
         check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
-        problem.form[PYTORCH] = TorchKernels()
-    return problem.form[PYTORCH]
+        known.in_pytorch = TorchKernels()
+    return known.in_pytorch
 
 
 def _natively(problem: Problem) -> NativeKernels | None:
-    warned = problem.form.setdefault(WARNED, set())
+    warned = problem.known.warned
     try:
         return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
     except (InputError, NativeError) as error:
@@ -85,17 +80,17 @@ def _warn(warned: set[str], error: Exception) -> None:
 
 def used(problem: Problem) -> str:
     """The name of the kernels that have worked on problems of this form."""
-    return PYTORCH if problem.form.get(CHOSEN) is None or not native() else NativeKernels.name
+    return NativeKernels.name if problem.known.in_c and native() else TorchKernels.name
 
 
 def expect_interior(problem: Problem) -> None:
     """Have the interior point's library compiled beside the first one, where that isn't made yet."""
-    problem.form[EXPECTED] = True
+    problem.known.expects_interior = True
 
 
 def _engine(problem: Problem) -> Engine:
     """The engine of an earlier solve where nothing that its code depends on has changed, else a new one."""
-    before, ahead = signature(problem), begin_interior if EXPECTED in problem.form else None
+    before, ahead = signature(problem), begin_interior if problem.known.expects_interior else None
     if before is None:
         return Engine(problem, ahead)
     key = before.key, find_compiler()

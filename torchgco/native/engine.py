@@ -39,7 +39,6 @@ from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.problem.problem import Problem
 
-PACKED = "packed"  # marks the constraints that were packed last, among what a form keeps
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -273,13 +272,13 @@ class Engine:
 
     def _constraints(self, problem: Problem) -> list[c.Constraint]:
         """The rows without multipliers; those of the last problem where this one differs in its cost alone."""
-        known, rows = problem.form.get(PACKED, (None, []))
+        known, rows = problem.known.packed
         if known is problem.constraints:
             return rows
         rows = []
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
             rows.append(constraint_of(constraint, shape, self.row_numbers(problem, i), problem))
-        problem.form[PACKED] = problem.constraints, rows
+        problem.known.packed = problem.constraints, rows
         return rows
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:

@@ -22,14 +22,14 @@ from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.obstacles.base import Obstacles, warn_of_small
+from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
 from torchgco.problem.given import Given
 from torchgco.problem.goal import Goal
+from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
 from torchgco.problem.summary import summary
-
-ROWS = "rows"  # marks the shapes of the constraints' rows among what a form keeps
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,7 @@ class Problem:
     horizon: Any = None
     free_start: Any = None
 
-    # A cache for everything that depends only on the problems' form (native kernels, say), shared by all subsets of a
-    # batch.
-    form: ClassVar[dict[Any, Any]]
+    known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
     # What it was given, where tensors of that ask for gradients; the fields hold numbers alone.
     given: ClassVar[Given | None] = None
 
@@ -86,10 +84,10 @@ class Problem:
     def _bind(self, dynamics: Any, cost: Any, constraints: Any) -> None:
         """Bind the parts; the arguments are those that were given, by which checks of code know them again."""
         dims = self._dimensions(self.x0)
-        object.__setattr__(self, "dynamics", self.dynamics.bind(dims))
+        object.__setattr__(self, "dynamics", bound(self.dynamics, dims, "dynamics", Dynamics))
         self._check_dynamics()
-        object.__setattr__(self, "cost", self.cost.bind(dims))
-        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+        object.__setattr__(self, "cost", bound(self.cost, dims, "cost", Cost))
+        object.__setattr__(self, "constraints", _all_bound(self.constraints, dims))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
         rows = zip(constraints, self.constraints, strict=True)
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
@@ -99,7 +97,7 @@ class Problem:
         given = self.goal if self.goal is not None and not self.goal.assumed else None
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
-        object.__setattr__(self, "form", {})
+        object.__setattr__(self, "known", Known())
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
@@ -200,12 +198,14 @@ class Problem:
     @property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
         """Knots and rows of every constraint; the same for all problems of a form."""
-        if ROWS not in self.form:
+        shapes = self.known.row_shapes
+        if shapes is None:
             # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
             one = self.take(slice(0, 1))
             X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-            self.form[ROWS] = tuple(tuple(c.value(X, U).shape[1:]) for c in one.constraints)
-        return self.form[ROWS]
+            found = [c.value(X, U).shape for c in one.constraints]
+            shapes = self.known.row_shapes = tuple((knots, rows) for _, knots, rows in found)
+        return shapes
 
     @property
     def cost_unit(self) -> Tensor:
@@ -227,11 +227,11 @@ class Problem:
         cost = self.cost.scaled(1.0 / unit)
         if bool((constant != 0).any()):
             cost = ShiftedCost(cost, constant / (unit * self.N))
-        return self._with({"cost": cost}, form=self.form)
+        return self._with({"cost": cost}, known=self.known)
 
     def __getstate__(self) -> dict[str, Any]:
         """The parts alone: native kernels stay in their process."""
-        return {f.name: getattr(self, f.name) for f in fields(self)} | {"form": {}}
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"known": Known()}
 
     def take(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a slice); a row may occur more than once.
@@ -249,7 +249,7 @@ class Problem:
             "horizon": None if self.horizon is None else self.horizon[index],
             "free_start": None if self.free_start is None else self.free_start[index],
         }
-        part = self._with(parts, form=self.form)
+        part = self._with(parts, known=self.known)
         if self.given is not None:
             object.__setattr__(part, "given", self.given.followed(self, lambda whole: whole.take(index)))
         return part
@@ -277,15 +277,15 @@ class Problem:
 
     def guessing(self, x: Tensor) -> Self:
         """The same problems with other guesses of their free starts, `start_in` x (B, n)."""
-        return self._with({"x0": self.start_in(x)}, self.form)
+        return self._with({"x0": self.start_in(x)}, self.known)
 
     def held_at(self, x: Tensor) -> Self:
         """The same problems with starts that are given, `start_in` x (B, n); themselves where no start is free."""
-        return self if self.free_start is None else self._with({"x0": self.start_in(x), "free_start": None}, self.form)
+        return self if self.free_start is None else self._with({"x0": self.start_in(x), "free_start": None}, self.known)
 
     def grown(self, by: Tensor) -> Self:
         """The same problems with their obstacles grown by `by` (B,), m."""
-        return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, form=self.form)
+        return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, known=self.known)
 
     def started_at(
         self,
@@ -313,28 +313,30 @@ class Problem:
         if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
             raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
         with computing_on(x0.device):
-            model = self.dynamics if dynamics is None else dynamics.bind(self._dimensions(x0, dynamics))
+            model = self.dynamics
+            if dynamics is not None:
+                model = bound(dynamics, self._dimensions(x0, dynamics), "dynamics", Dynamics)
             dims = self._dimensions(x0, model)
-            bound = tuple(constraint.bind(dims) for constraint in constraints)
-            for i, part in enumerate(bound):
+            rows = _all_bound(constraints, dims)
+            for i, part in enumerate(rows):
                 if not isinstance(part, Obstacles):
                     continue
                 if part.position != dims.position or (part.moving and part.dt != dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
                     raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
-            if [type(part) for part in bound] != [type(part) for part in self.constraints]:
+            if [type(part) for part in rows] != [type(part) for part in self.constraints]:
                 kinds = ", ".join(type(part).__name__ for part in self.constraints)
-                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
-            parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, bound), "constraints": bound}
+                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in rows))
+            parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, rows), "constraints": rows}
             if dynamics is not None:
                 parts["dynamics"] = model
             if cost is not None:
-                parts["cost"] = cost.bind(dims)
+                parts["cost"] = bound(cost, dims, "cost", Cost)
                 if self.goal is None or self.goal.assumed:
                     parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
             known = set(map(id, self.constraints))
-            new = [pair for pair in zip(constraints, bound, strict=True) if id(pair[0]) not in known]
+            new = [pair for pair in zip(constraints, rows, strict=True) if id(pair[0]) not in known]
             model = None if dynamics is None else (dynamics, parts["dynamics"])
             check_code(dims, started.x0, model, None if cost is None else (cost, parts["cost"]), new)
         return started
@@ -344,12 +346,12 @@ class Problem:
         parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0", "goal")}
         return self._with(parts)
 
-    def _with(self, parts: dict[str, object], form: dict[Any, Any] | None = None) -> Self:
+    def _with(self, parts: dict[str, object], known: Known | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
         copy = object.__new__(type(self))
         for f in fields(self):
             object.__setattr__(copy, f.name, parts.get(f.name, getattr(self, f.name)))
-        object.__setattr__(copy, "form", {} if form is None else form)
+        object.__setattr__(copy, "known", Known() if known is None else known)
         return copy
 
     def check_controls(self, U: Tensor, field: str = "U0") -> None:
@@ -435,6 +437,10 @@ def _check_constraints(constraints: Any) -> None:
     rates = sum(isinstance(constraint, RateBounds) for constraint in constraints)
     if rates > 1:
         raise InputError("constraints", "one RateBounds at most", rates)
+
+
+def _all_bound(constraints: Sequence[Constraint], dims: Dimensions) -> tuple[Constraint, ...]:
+    return tuple(bound(part, dims, f"constraints[{i}]", Constraint) for i, part in enumerate(constraints))
 
 
 def _named(part: object) -> str:

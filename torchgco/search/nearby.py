@@ -19,7 +19,7 @@ from torchgco.kernels import chord_clearance, kernels_of, measured
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.obstacles.base import Obstacles, Solids
-from torchgco.problem.problem import ROWS, Problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 
@@ -100,8 +100,7 @@ def without_obstacles(problem: Problem) -> Problem | None:
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
     kernels_of(problem)  # which both then share: two forms would trace the problem twice
-    other = problem._with({"constraints": constraints}, form=dict(problem.form))
-    other.form.pop(ROWS, None)
+    other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None))
     return other
 
 

@@ -211,7 +211,7 @@ def _trajectories(
         for first in range(0, layouts.count, BATCH):
             some = layouts.take(range(first, min(first + BATCH, layouts.count)))
             task = vehicle.task(some)
-            U = controls[[place[number] for number in some.ids.tolist()]]
+            U = controls[[place[number] for number in some.ids.tolist()], : task.problem.N]
             verdict = judge(task.problem, U, task.goal, task.goal_radius)
             columns = {"solver": name, "layout": some.ids, **frame_columns(verdict), "sound": verdict.sound.numpy()}
             parts.append(pd.DataFrame(columns))
