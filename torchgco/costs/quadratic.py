@@ -43,7 +43,7 @@ class QuadraticCost(Cost):
         Q, R = _weight(self.Q, "Q", n, B, N, dims.like), _weight(self.R, "R", m, B, N, dims.like)
         Qf = _weight(self.Qf, "Qf", n, B, None, dims.like)
         H = None if self.H is None else _cross(self.H, m, n, B, N, dims.like)
-        check_semidefinite(*(None if W is None else W.detach() for W in (Q, R, Qf, H)))
+        check_semidefinite(Q.detach(), R.detach(), Qf.detach(), None if H is None else H.detach())
         x_ref = _vector(self.x_ref, "x_ref", n, B, N + 1, dims.like)
         weights = (self.Q, Q), (self.R, R), (self.Qf, Qf)
         diagonal = H is None and all(_is_diagonal(given, W) for given, W in weights)
