@@ -83,6 +83,7 @@ def problem(model: FunctionDynamics, B: int = 1, stages: int = STAGES) -> Proble
     return Problem(model, cost, parts, x0, stages)
 
 
+@torch.no_grad()
 def solved(of: Problem) -> torchgco.Solution:
     return torchgco.solve(of, solver="interior_point", verbose=False)
 
@@ -199,7 +200,8 @@ def by_pytorch(bench: Bench, name: str, model: Callable[[], FunctionDynamics]) -
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         began = time.process_time()
-        found = torchgco.solve(whole, verbose=False)
+        with torch.no_grad():
+            found = torchgco.solve(whole, verbose=False)
         bench.row(SECTION, f"{name}, N = 60", "gco", "first solve", time.process_time() - began, "s")
     row = found.to_frame().iloc[0]
     bench.row(SECTION, f"{name}, N = 60", "gco", "status, kernels", f"{row['status']}, {row['kernels']}")
@@ -228,4 +230,5 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     others = {"line": lambda: _line(None), "line in the plane": lambda: _line(slice(0, 2))}
     first = problem((MODELS | others)[sys.argv[1]]())
-    print(*_took(lambda: torchgco.solve(first, verbose=False)))
+    with torch.no_grad():
+        print(*_took(lambda: torchgco.solve(first, verbose=False)))

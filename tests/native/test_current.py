@@ -388,7 +388,8 @@ def test_a_module_with_trainable_parameters_is_a_model(native: bool) -> None:
     problem = boat(lambda x, u: field(x, u) + 0.1 * network(torch.cat((x, u), dim=-1)))
     torchgco.kernels.use_native(native)
     try:
-        solution = torchgco.solve(problem, solver=torchgco.presets.al_ilqr(problem))
+        with torch.no_grad():
+            solution = torchgco.solve(problem, solver=torchgco.presets.al_ilqr(problem))
     finally:
         torchgco.kernels.use_native(True)
     assert not solution.X.requires_grad and not solution.cost.requires_grad

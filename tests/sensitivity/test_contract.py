@@ -11,7 +11,16 @@ from torch import Tensor
 
 import torchgco
 from tests.sensitivity.problems import B, D, along, asking, box_numbers, boxed, discs, numbers, solved, weights
-from torchgco import ControlBounds, FunctionDynamics, Goal, InputError, Problem, QuadraticCost, RateBounds, Solution
+from torchgco import (
+    ControlBounds,
+    FunctionDynamics,
+    Goal,
+    InputError,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+    Solution,
+)
 
 PER_PROBLEM = "x0", "centers", "radii", "vehicle", "velocities", "x_ref", "lower", "upper", "drag"
 MODEL = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1, "rk4")
