@@ -269,6 +269,7 @@ def test_what_a_function_captures_is_read_at_each_call() -> None:
     mpc = torchgco.compile(make(), "interior_point", tolerance=1e-10)
     before = mpc()
 
+    @torch.no_grad()
     def now() -> None:
         nonlocal before
         answer, fresh = mpc(), torchgco.solve(make(), solver=replace(InteriorPoint(), tolerance=1e-10))
