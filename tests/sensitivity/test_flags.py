@@ -107,6 +107,14 @@ def test_gradients_of_others_are_those_without_them() -> None:
     assert torch.equal(slope[[0, 3]], want) and not slope[1:3].any()
 
 
+def test_where_nothing_has_derivatives_a_loss_can_be_differentiated() -> None:
+    ends, x0 = FunctionConstraint(lambda x: x[..., :1] - 0.2, "equality", knots=[N]), start((1.0, 0.0))
+    solution = torchgco.solve(Problem(MODEL, COST, [ends, ends], x0, N), verbose=False)
+    assert not solution.differentiable.any()
+    (solution.X.sum() + solution.U.sum() + solution.cost.sum() + solution.multipliers.lam[0].sum()).backward()
+    assert x0.grad is None  # as of any tensor that a loss doesn't depend on: an optimiser leaves it alone
+
+
 def test_solved_without_gradients() -> None:
     x0 = torch.tensor([[1.0, 0.0]], dtype=D)
     solution = torchgco.solve(Problem(MODEL, COST, [ControlBounds(-5, 5)], x0, N), verbose=False)

@@ -27,15 +27,18 @@ def steered() -> FunctionDynamics:
     return FunctionDynamics(lambda x, u: u, 2, 2, 0.1, position=slice(0, 2))
 
 
-def test_a_training_step_calls_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # of the interior point alone
+@pytest.mark.parametrize(("solver", "warm"), [("gco", False), ("interior_point", True)])
+def test_a_training_step_calls_no_compiler(solver: str, warm: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     net = torch.nn.Sequential(torch.nn.Linear(4, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2)).double()
     model = FunctionDynamics(lambda x, u: u + 0.3 * net(torch.cat((x, u), -1)), 2, 2, 0.1, "rk4", slice(0, 2))
     problem = point(torch.zeros(2, 2, dtype=D), model, torch.tensor([0.3], dtype=D))
     optimizer = torch.optim.SGD(net.parameters(), lr=1e-2)
-    losses = []
+    losses, solution = [], None
     for step in range(4):
-        solution = torchgco.solve(problem, verbose=False)
+        solution = torchgco.solve(problem, solver=solver, warm=solution if warm else None, verbose=False)
+        assert bool(solution.differentiable.all())  # of the weights as they are now, in C as in PyTorch
         loss = torch.where(solution.differentiable, solution.cost, 0.0).sum()
         optimizer.zero_grad()
         loss.backward()

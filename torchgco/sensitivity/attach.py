@@ -14,6 +14,7 @@ from torchgco.base.gradients import recording
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users
 from torchgco.constraints.bounds import RateBounds
+from torchgco.kernels import current
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.problem.problem import Problem
 from torchgco.sensitivity.function import Solved, System
@@ -69,12 +70,12 @@ def attached(asked: Problem, problem: Problem, solution: Solution) -> Solution:
         problem: the same, with what a solver keeps of them.
     """
     with computing_on(problem.x0.device):
-        points = points_of(problem, solution)
+        points = points_of(current(problem), solution)
     known = {"trace": solution.trace, "search": solution.search, "account": solution.account, "reason": points.reason}
     found = replace(points.solution, **known)
     rows = (points.reason == Why.DIFFERENTIABLE).nonzero().flatten()
     if rows.numel() == 0:
-        return found
+        return _constant(found)
     with recording():
         at = points.take(rows)
         found_at = _residual(asked, at, rows)
@@ -82,7 +83,15 @@ def attached(asked: Problem, problem: Problem, solution: Solution) -> Solution:
         if not bool(near.all()):
             points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
             rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)
-        return _with_values(found, rows, _values(at, found_at)) if rows.numel() > 0 else found
+        return _with_values(found, rows, _values(at, found_at)) if rows.numel() > 0 else _constant(found)
+
+
+def _constant(found: Solution) -> Solution:
+    """The solution where nothing has derivatives: losses of it can be differentiated, and depend on no other tensor."""
+    lam = tuple(part.requires_grad_() for part in found.multipliers.lam)
+    for part in (found.X, found.U, found.cost):
+        part.requires_grad_()
+    return replace(found, multipliers=Multipliers(lam, found.multipliers.mu))
 
 
 def _residual(problem: Problem, at: Points, rows: Tensor) -> Residual:
