@@ -44,7 +44,7 @@ BATCHES = {
     "planar": lambda: planar_batch(B=4, N=30, obstacles=5, seed=4),
     "quadrotor": lambda: quadrotor_batch(B=3, N=30, obstacles=6, seed=0),
 }
-OTHERS = ("multipliers", "trace", "search", "horizon", "account")
+OTHERS = ("multipliers", "trace", "search", "horizon", "reason", "account")
 FIELDS = tuple(f.name for f in fields(Solution) if f.name not in OTHERS)
 
 

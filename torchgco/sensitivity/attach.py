@@ -23,7 +23,10 @@ from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
 NEAR = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
-REFUSED = "float64 problems with one horizon, a given start and no RateBounds, where gradients are asked for"
+REFUSED = (
+    "a problem in float64 with one horizon, a given start and no RateBounds, as tensors in it ask for gradients, "
+    "or torch.no_grad()"
+)
 
 
 def asks_for_gradients(problem: Problem) -> bool:
