@@ -84,8 +84,13 @@ def test_jacobians_of_all_outputs_at_once_are_those_one_by_one() -> None:
         torch.autograd.grad(U, x0, basis, is_grads_batched=True)
 
 
-def test_forward_mode_is_the_transpose() -> None:
-    """A tangent of what the residual depends on, as `torch.func.jvp` of a part of the graph would send it."""
+def test_forward_mode_is_refused() -> None:
+    x0 = torch.tensor([[1.0, 0.0]], dtype=D)
+    with torch.autograd.forward_ad.dual_level(), pytest.raises(InputError, match="dual_level"):
+        small(torch.autograd.forward_ad.make_dual(x0, torch.ones_like(x0)))
+
+
+def test_the_systems_are_symmetric() -> None:
     _, solution = solved(discs, numbers)
     node = solution.U.grad_fn
     assert node is not None

@@ -56,12 +56,6 @@ class Solved(torch.autograd.Function):
     def backward(ctx: Any, X: Tensor, U: Tensor, lam: Tensor, cost: Tensor) -> tuple[Any, ...]:
         return None, None, *Adjoint.apply(ctx.system, X, U, lam, cost, *ctx.saved_tensors)
 
-    @staticmethod
-    def jvp(ctx: Any, _: None, __: None, *tangents: Tensor) -> tuple[Tensor, ...]:
-        *sides, lagrangian = tangents
-        x, u, _, rows = ctx.system.solve(*(side.unsqueeze(0) for side in sides))
-        return x[0], u[0], rows[0], lagrangian
-
 
 class Adjoint(torch.autograd.Function):
     """Gradients by the residual's parts, from upstream ones of X, U, multipliers and costs.
