@@ -13,3 +13,4 @@ from torchgco.search.passes import Solve as Solve
 from torchgco.search.proposals import PathProposals as PathProposals
 from torchgco.search.restarts import Restarts as Restarts
 from torchgco.search.starts import Starts as Starts
+from torchgco.search.tube import Tube as Tube

@@ -176,6 +176,7 @@ class Search:
         self._best: Best | None = None
         self._caught: SolveEnd | None = None
         self._round: tuple[Tensor, Round] | None = None
+        self.waiting: list[tuple[Tensor, SolveEnd]] = []  # rows and results that compete at the end
         self.proposed = torch.zeros_like(call.ids, dtype=torch.bool)  # (B,): whether there was ever a proposal
         self.rejected = torch.full_like(call.U0[:, 0, 0], torch.nan)  # (B,): mu of the proposals rejected so far
 
@@ -236,6 +237,12 @@ class Search:
         self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
         self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
         return self.record.in_costs(unit, constant)
+
+    def join(self) -> None:
+        """Let the results that wait compete with the best trajectories."""
+        for rows, end in self.waiting:
+            self.best.keep(rows, end)
+        self.waiting.clear()
 
     def rows(self, when: str) -> Tensor:
         """The problems (b,) that a word describes, all among those that were caught.

@@ -53,7 +53,7 @@ class Converge:
         if self.when == "last":
             self._tighten(search)
         elif self.when == "mapped":
-            if _mapped(problem):
+            if mapped(problem):
                 self._continue(search, search.best.limited)
         elif self.begins(problem) and not search.begun:
             search.begin(self.solver.solved(search.call))
@@ -101,7 +101,7 @@ class Converge:
         search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
 
 
-def _mapped(problem: Problem) -> bool:
+def mapped(problem: Problem) -> bool:
     """Whether there are maps among the obstacles."""
     return any(isinstance(part, BoundField) for part in problem.geometric)
 
@@ -113,12 +113,16 @@ def _unsolved(search: Search) -> Tensor:
 
 def continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:
     """Solves of a call from trajectories, with their multipliers, among the obstacles near these."""
-    call = replace(call, U0=start.U, warm=start.multipliers)
-    near = Nearby.along(call, start.X)
+    return solved_nearby(solver, replace(call, U0=start.U, warm=start.multipliers), start.X)
+
+
+def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor) -> SolveEnd:
+    """Solves of a call from states X (B, N+1, n), among the obstacles near these."""
+    near = Nearby.along(call, X)
     if near is None:
-        return solver.solved(call, start.X)
-    found = solver.solved(near.call, start.X)
+        return solver.solved(call, X)
+    found = solver.solved(near.call, X)
     wrong, end = near.wrong(found.best), near.end(found)
     if wrong.numel() > 0:
-        put(end, wrong, solver.solved(call.take(wrong), start.X[wrong]))
+        put(end, wrong, solver.solved(call.take(wrong), X[wrong]))
     return end

@@ -21,9 +21,11 @@ from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.chords import ClearChords
 from torchgco.search.converge import Converge
+from torchgco.search.direct import Direct
 from torchgco.search.finish import Finish
 from torchgco.search.proposals import PathProposals
 from torchgco.search.starts import Starts
+from torchgco.search.tube import Tube
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.state import SolveEnd
 
@@ -154,8 +156,17 @@ class FromSamples:
         search.best.improve(rows, call, guidance=search.guidance, guide_first=True)
 
 
+@dataclass(frozen=True)
+class Join:
+    """Join."""
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        search.join()
+
+
 Pass: TypeAlias = (
-    Solve | PathProposals | FromProposal | IntoGoal | FromSamples | Converge | Finish | ClearChords | Starts
+    Solve | PathProposals | FromProposal | IntoGoal | FromSamples | Converge | Finish | ClearChords | Starts | Tube | Direct | Join
 )
 
 

@@ -145,7 +145,7 @@ class PathProposals:
             return
         every = rows.numel() == whole.problem.B
         problem, rest = (whole.problem, whole.rest) if every else (whole.problem.take(rows), whole.rest[rows])
-        paths = self._paths(whole, rows) if self.roadmaps else take(whole.paths, rows)
+        paths = whole.seek(rows, self.roadmaps, self.num_paths) if self.roadmaps else take(whole.paths, rows)
         if not self.continues:
             whole.paths = paths
         note = None if whole.record is None else partial(whole.note, rows, paths, self.refine)
@@ -156,25 +156,6 @@ class PathProposals:
             better = (~old.found | (new.found & (new.cost < old.cost))).nonzero().flatten()
             put(whole.proposal, rows[better], take(new, better))
             whole.proposal.iterations[rows] = old.iterations + new.iterations
-
-    def _paths(self, whole: Part, rows: Tensor) -> Paths:
-        """The paths of all searches, one per homotopy class, of the problems in `rows`."""
-        assert whole.scene is not None
-        R, unit = (scale[rows] for scale in whole.scales)
-        usable, known = torch.isfinite(unit) & (unit > 0), []
-        found = torch.zeros_like(usable)
-        for number, roadmap in enumerate(self.roadmaps):
-            if any(roadmap.repeats(other, whole.scene) for other in self.roadmaps[:number]):
-                continue
-            corners, arrives = roadmap.paths(whole.scene, self.num_paths, rows, whole.known)
-            known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, self.num_paths)))
-            found = found | (arrives & usable)
-        corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
-        obstacles = whole.scene.obstacles
-        obstacles = obstacles if rows.numel() == whole.problem.B else take(obstacles, rows)
-        label = classes(corners, obstacles)
-        first = label == torch.arange(label.shape[1], device=label.device)
-        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def _along(
         self,
@@ -238,6 +219,25 @@ class Part:
         """R and q0 / R^4 (B,); see `scene.scales`."""
         assert self.scene is not None
         return seen.scales(self.problem, self.scene, self.rest)
+
+    def seek(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
+        """The paths of some searches, `count` each and one per homotopy class, of the problems in `rows`."""
+        assert self.scene is not None
+        R, unit = (scale[rows] for scale in self.scales)
+        usable, known = torch.isfinite(unit) & (unit > 0), []
+        found = torch.zeros_like(usable)
+        for number, roadmap in enumerate(roadmaps):
+            if any(roadmap.repeats(other, self.scene) for other in roadmaps[:number]):
+                continue
+            corners, arrives = roadmap.paths(self.scene, count, rows, self.known)
+            known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, count)))
+            found = found | (arrives & usable)
+        corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
+        obstacles = self.scene.obstacles
+        obstacles = obstacles if rows.numel() == self.problem.B else take(obstacles, rows)
+        label = classes(corners, obstacles)
+        first = label == torch.arange(label.shape[1], device=label.device)
+        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
         """Record a comparison for the problems in `rows`; see `record.comparison`."""
