@@ -18,10 +18,12 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.candidates import unwatched
 from torchgco.search.proposals import PathProposals, Round
+from torchgco.search.row import Row
 from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress, RowEnd
 from torchgco.solvers.history import Recorder
+from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.state import Iterate, SolveEnd
 
 CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
@@ -156,6 +158,7 @@ class Search:
     Args:
         call: in the units that the solver works in.
         passes: None for those that can't serve.
+        interior: the interior point of the table.
         guidance: of attempts from samples; None: none can serve.
         recorder: of every iteration; None: nothing is recorded.
     """
@@ -164,13 +167,15 @@ class Search:
         self,
         call: Call,
         solver: AugmentedLagrangian,
-        passes: Sequence[object],
+        passes: Sequence[Row | None],
         guidance: Guidance | None,
+        interior: InteriorPoint,
         recorder: Recorder | None = None,
     ) -> None:
         self.call, self.solver, self.guidance, self.recorder = call, solver, guidance, recorder
+        self.interior = interior
         # Whether there is anything to do where a trajectory is caught, and whether that includes paths.
-        self.guided = guidance is not None or any(isinstance(one, PathProposals) for one in passes)
+        self.guided = guidance is not None or any(row.seeks_paths for row in passes if row is not None)
         self.has_paths = self.guided and has_paths(call.problem)
         self.record = None if recorder is None else SearchRecord()
         self._best: Best | None = None

@@ -18,7 +18,7 @@ from torchgco.lagrangian.quality import has_arrived
 from torchgco.native.dispatch import chord_clearance, measured
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.search.row import Row
 from torchgco.solvers.state import SolveEnd
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
@@ -26,7 +26,7 @@ MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves dif
 
 
 @dataclass(frozen=True)
-class ClearChords:
+class ClearChords(Row):
     """Replaces feasible trajectories that touch an obstacle between two knots by ones that keep clear of it.
 
     Obstacles grow by 1.1 times the clearance that the last solve missed, or a little more, and the solve continues from
@@ -36,17 +36,23 @@ class ClearChords:
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before.
-        solver: ends each of them.
 
     Raises:
         InputError: a field out of its range.
     """
 
     rounds: Count = 4
-    solver: InteriorPoint = InteriorPoint()
 
     def __post_init__(self) -> None:
         check_options(self, "chords")
+
+    @property
+    def problems(self) -> str:
+        return "touching an obstacle between two knots"
+
+    @property
+    def does(self) -> str:
+        return f"AL-iLQR and interior point among larger obstacles, {self.rounds} rounds; accepted with more clearance"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -64,7 +70,7 @@ class ClearChords:
             call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
             new = best.attempt(call)
             serves, now[rows] = self._kept(search, rows, new, clearance[rows])
-            tight = continued(self.solver, replace(call, callback=None), new.best)
+            tight = continued(search.interior, replace(call, callback=None), new.best)
             least = torch.where(serves & is_over(tight.status), now[rows].clamp(max=0.0), torch.inf)
             too, clear = self._kept(search, rows, tight, least)
             now[rows] = torch.where(too, clear, now[rows])

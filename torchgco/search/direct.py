@@ -8,6 +8,7 @@ search takes. Its results compete with the search's by cost, at the end; they sp
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.nearby import without_obstacles
+from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.state import SolveEnd
@@ -29,7 +31,7 @@ FREE = InteriorPoint(tolerance=1e-4, max_iterations=LIMIT)  # of the trajectory 
 
 
 @dataclass(frozen=True)
-class Direct:
+class Direct(Row):
     """Solves caught problems by the interior point too; the results are compared with the search's at its end.
 
     Where one arrives and costs little more than the trajectory without obstacles, which keeps all other constraints,
@@ -44,10 +46,23 @@ class Direct:
     """
 
     gap: NonNegative = 0.02
-    most: Natural = 8
+    most: Natural = 5
+
+    seeks_paths: ClassVar[bool] = True
+    last: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_options(self, "direct")
+
+    @property
+    def problems(self) -> str:
+        return f"caught, in the plane among at most {self.most} obstacles"
+
+    @property
+    def does(self) -> str:
+        return (
+            f"interior point from the guess and from there; over {self.gap:.0%} dearer than without obstacles, search"
+        )
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -81,3 +96,17 @@ class Direct:
         search.best.keep(rows[enough], take(end, enough))
         search.waiting.append((rows[left], take(end, left)))
         return left
+
+
+@dataclass(frozen=True)
+class Join(Row):
+    """Lets the results of `Direct` that wait compete with the best trajectories."""
+
+    seeks_paths: ClassVar[bool] = True
+    last: ClassVar[bool] = True
+    problems: ClassVar[str] = "with results that wait"  # type: ignore[misc]
+    does: ClassVar[str] = "the cheaper counts"  # type: ignore[misc]
+
+    def run(self, search: Search) -> None:
+        """Compare; see the class."""
+        search.join()

@@ -118,6 +118,18 @@ class Follow:
         if not self.stiffness:
             raise InputError("follow.stiffness", "one or more numbers above 0", self.stiffness)
 
+    def __str__(self) -> str:
+        guide = "spring" if self.tube is None else "tube"
+        stiffness = ", ".join(f"{value:g}" for value in self.stiffness)
+        count = (1 + len(self.initial_offsets)) * len(self.paces)
+        several = f", {count} candidates" if count > 1 else ""
+        bare = ", without obstacles" if self.obstacles == 0 else ""
+        return f"{guide} {stiffness}, {self.iterations} iterations, corners over {self.smoothing:g} N{several}{bare}"
+
+    def fitting(self, m: int) -> Follow:
+        """Without initial offsets where these have another number of controls than m."""
+        return self if all(len(offset) == m for offset in self.initial_offsets) else replace(self, initial_offsets=())
+
     @property
     def paces(self) -> tuple[float, ...]:
         """The values of `arrive`, as a tuple."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -32,8 +32,18 @@ from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
 from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
 from torchgco.search.record import comparison
+from torchgco.search.row import Row
 from torchgco.solution import SearchRecord
 
+if TYPE_CHECKING:
+    from torchgco.search.attempts import Search
+
+WHEN = {
+    "caught": "caught",
+    "unarrived": "caught, not arrived",
+    "far": "caught, not even close to the goal",
+    "unproposed": "caught, without a proposal",
+}
 PATHS_AT_ONCE = 1536  # paths of all problems that are compared and tracked together: bounds the memory
 ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
 
@@ -55,15 +65,9 @@ class Proposal(NamedTuple):
         return cls(rest.clone(), count.bool(), Multipliers.zero(problem, torch.nan), count, cost)
 
 
-class Rounds(Protocol):
-    """A search that keeps the round of proposals from pass to pass."""
-
-    def propose(self, proposals: PathProposals) -> None: ...
-
-
 @dataclass(frozen=True)
-class PathProposals:
-    """A pass that follows short paths between static obstacles, and proposes the candidate that is cheapest to fly.
+class PathProposals(Row):
+    """A step that follows short paths between static obstacles, and proposes the candidate that is cheapest to fly.
 
     Args:
         when: the problems that it looks at. Among those that were caught: all ("caught"), those that have not arrived
@@ -94,6 +98,8 @@ class PathProposals:
     max_penetration: Positive = 0.1
     max_gap: Positive | None = None
 
+    seeks_paths: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_options(self, "proposals")
         for name in ("roadmaps", "follow"):
@@ -108,9 +114,30 @@ class PathProposals:
         """Whether this pass improves the proposals of the one before."""
         return self.when in ("unproposed", "costly")
 
-    def run(self, search: Rounds) -> None:
-        """A pass of a search; see the class."""
+    @property
+    def problems(self) -> str:
+        if self.when == "costly":
+            return f"with a proposal over {self.max_gap or 0.0:.0%} dearer than without obstacles"
+        return WHEN[self.when]
+
+    @property
+    def does(self) -> str:
+        points = " and ".join(str(roadmap.num_halton) for roadmap in self.roadmaps)
+        paths = f"{self.num_paths} paths over {points} points" if self.roadmaps else "the same paths"
+        relax = "all" if self.relax_top is None else f"the best {self.relax_top}"
+        relaxed = f"{relax} relaxed, {self.relax_iterations} iterations" if self.relax_iterations else "not relaxed"
+        refined = f"; the best {self.refine.top} refined, {self.refine.rounds} rounds" if self.refine.top > 1 else ""
+        least = ", as refined" if self.refine.needed else ""
+        ways = "; then ".join(str(follow) for follow in self.follow)
+        return f"{paths}: {ways}; {relaxed}{refined}; accepted up to {self.max_penetration:g} R deep{least}"
+
+    def run(self, search: Search) -> None:
+        """Propose; see the class."""
         search.propose(self)
+
+    def fitting(self, m: int) -> Self:
+        """Without initial offsets that have another number of controls than m."""
+        return replace(self, follow=tuple(follow.fitting(m) for follow in self.follow))
 
     @property
     def at_once(self) -> int:

@@ -9,7 +9,7 @@ pace that it was given: several of both are tried, and the cheapest counts.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from torchgco.search.candidates import Candidates, Refine, Refined
 from torchgco.search.converge import mapped, solved_nearby
 from torchgco.search.following import Follow, Free, Paths
 from torchgco.search.proposals import Part
+from torchgco.search.row import Row
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.state import SolveEnd
 
@@ -38,46 +39,57 @@ TURN = 0.5  # share of a control's range by which a vehicle is turned on the spo
 STILL = 1e-9  # share of the distance to the goal by which it may move then
 DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all others
 LATEST_FIRST = 0.55  # share of the horizon: the slowest that the first pace is
+ROADMAP = Roadmap()
+PACES = 4  # at which each path is tracked
+TOP = 6  # candidates of a problem that are solved: those of least cost as tracked
+# From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
+SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
 BOTH = Refine(top=2)  # marks candidates as solved in the record
 
 
 @dataclass(frozen=True)
-class Tube:
+class Tube(Row):
     """Tracks paths closely at several paces, solves the cheapest by the interior point, and keeps the best.
 
     Among the paths is one that keeps clear of a map's obstacles, with its corners averaged. A vehicle that can turn on
-    the spot follows each from rest and after either turn: else it reverses along much of a way behind it. The first pace is that of
-    the trajectory without obstacles, the last takes the whole horizon; the others lie evenly between. Candidates count
-    where they end feasible and at the goal.
+    the spot follows each from rest and after either turn: else it reverses along much of a way behind it. The first
+    pace is that of the trajectory without obstacles, the last takes the whole horizon; the others lie evenly between.
+    Candidates count where they end feasible and at the goal.
 
     Args:
         among: "maps": in problems with a map among their obstacles; "bodies": in those without.
-        roadmap: finds the paths.
         num_paths: of the roadmap, before those of one homotopy class are merged.
-        paces: at which each path is tracked.
-        top: tracked candidates of a problem that are solved, those of least cost.
-        solver: of each. From a trajectory that is clear, a barrier of 0.1 leads into other classes.
 
     Raises:
         InputError: a field out of its range.
     """
 
     among: Literal["maps", "bodies"] = "bodies"
-    roadmap: Roadmap = Roadmap()
     num_paths: Count = 6
-    paces: Count = 4
-    top: Count = 6
-    solver: InteriorPoint = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
+
+    seeks_paths: ClassVar[bool] = True
+    last: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_options(self, "tube")
+
+    @property
+    def problems(self) -> str:
+        return f"{'in maps' if self.among == 'maps' else 'among spheres and boxes'}: caught, not arrived"
+
+    @property
+    def does(self) -> str:
+        return (
+            f"{self.num_paths} paths and one that keeps clear: {FOLLOW}, {PACES} paces; not relaxed; interior point "
+            f"from the {TOP} cheapest"
+        )
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         rows = search.rows("unarrived")
         if rows.numel() == 0 or not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
             return
-        each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * self.paces
+        each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
         for some in rows.split(max(1, AT_ONCE // each)):
             if search.call.late:
                 return
@@ -91,13 +103,13 @@ class Tube:
         if part.scene is None:
             return
         every = torch.arange(problem.B, device=rows.device)
-        paths = part.seek(every, (self.roadmap,), self.num_paths).joined(*self.roadmap.clear_path(part.scene))
+        paths = part.seek(every, (ROADMAP,), self.num_paths).joined(*ROADMAP.clear_path(part.scene))
         starts, usable = _starts(problem, rest)
-        live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(self.paces, dim=1)
-        starts = starts.repeat_interleave(self.paces, dim=1).repeat(1, paths.corners.shape[1], 1, 1)
+        live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(PACES, dim=1)
+        starts = starts.repeat_interleave(PACES, dim=1).repeat(1, paths.corners.shape[1], 1, 1)
         candidates = Candidates.begin(part.problem, starts, paths.R, paths.unit, live)
-        tracked = FOLLOW.along(candidates, paths, self._arrivals(paths, part.free(FOLLOW.iterations)), self.paces)
-        chosen = tracked.pick(self._order(tracked)[:, : self.top])
+        tracked = FOLLOW.along(candidates, paths, self._arrivals(paths, part.free(FOLLOW.iterations)), PACES)
+        chosen = tracked.pick(self._order(tracked)[:, :TOP])
         solved = self._solved(search, rows, chosen)
         if search.record is not None:
             found = solved.cost[solved.best].isfinite()
@@ -112,28 +124,28 @@ class Tube:
         for rows in tracked.parts():
             merit[rows] = tracked.of(rows).cost.total(tracked.X[rows], tracked.U[rows])
         order = merit.nan_to_num(torch.inf).view(-1, tracked.count).argsort(dim=-1, stable=True)
-        last = (tracked.penetration() > DEEP * tracked.R).view(-1, tracked.count) | ~tracked.live.view(-1, tracked.count)
-        last = last.to(torch.int8) + (~tracked.live.view(-1, tracked.count)).to(torch.int8)
+        deep, dead = tracked.penetration() > DEEP * tracked.R, ~tracked.live
+        last = torch.where(dead, 2, deep.to(torch.int8)).view(-1, tracked.count)
         return order.gather(1, last.gather(1, order).argsort(dim=-1, stable=True))
 
     def _arrivals(self, paths: Paths, free: Free) -> Tensor:
         """Shares (B * K * paces,) of the horizon at which each candidate arrives."""
         own = (free.share * free.slower).unsqueeze(-1) * paths.stretch()
         first = own.nan_to_num(torch.inf).clamp(min=2.0 * torch.finfo(own.dtype).eps, max=LATEST_FIRST)
-        later = torch.linspace(0.0, 1.0, self.paces, dtype=first.dtype, device=first.device)
+        later = torch.linspace(0.0, 1.0, PACES, dtype=first.dtype, device=first.device)
         return (first.unsqueeze(-1) + (1.0 - first.unsqueeze(-1)) * later).flatten()
 
     def _solved(self, search: Search, rows: Tensor, tracked: Candidates) -> Refined:
         """Every tracked candidate solved; the best of each problem in `rows` is kept."""
         problem, limit = tracked.problem, search.solver.violation_tolerance
-        sound = tracked.live & torch.isfinite(tracked.X).flatten(1).all(-1) & torch.isfinite(tracked.U).flatten(1).all(-1)
-        some = sound.nonzero().flatten()
+        finite = [torch.isfinite(part).flatten(1).all(-1) for part in (tracked.X, tracked.U)]
+        some = (tracked.live & finite[0] & finite[1]).nonzero().flatten()
         cost, made = torch.full_like(tracked.unit, torch.inf), tracked.iterations
         multipliers = Multipliers(tuple(tracked.U.new_zeros(0, *s) for s in problem.row_shapes), tracked.unit)
         if some.numel() == 0:
             return Refined(tracked, multipliers, some.new_zeros(problem.B), cost)
         call = replace(search.call.take(rows[some // tracked.count]), U0=tracked.U[some], warm=None, callback=None)
-        end = solved_nearby(self.solver, call, tracked.X[some])
+        end = solved_nearby(SOLVER, call, tracked.X[some])
         good = (end.best.violation <= limit) & has_arrived(call.problem, end.best.X)
         cost[some] = torch.where(good, end.best.cost, torch.inf)
         made = made.index_add(0, some // tracked.count, end.iterations)
