@@ -24,7 +24,7 @@ def test_an_option_is_changed_wherever_it_stands_and_nothing_else(space: int) ->
 
 
 def test_a_value_that_cannot_be_doubled_comes_nearer_to_one() -> None:
-    assert with_option(presets.gco(3), "Follow.arrive", "doubled").passes[3].follow[0].arrive == 0.95
+    assert with_option(presets.gco(3), "Follow.arrive", "doubled").passes.paths.follow.arrive == 0.95
 
 
 def test_a_constant_is_changed_where_it_is_read(monkeypatch) -> None:

@@ -90,7 +90,7 @@ def test_guesses_differ_by_seed_and_id() -> None:
 def test_nothing_is_done_where_the_first_solve_succeeds() -> None:
     """`gco` has starts for the others alone."""
     problem = bryson_denham()
-    assert presets.gco(problem).passes[-1] == Starts()
+    assert presets.gco(problem).passes.steps[-1] == Starts()
     assert same(torchgco.solve(problem), solved(problem))
     assert not same(torchgco.solve(problem, solver="gco_max"), solved(problem))
 
@@ -109,7 +109,7 @@ def test_a_saddle_at_rest_is_left() -> None:
     problem = parking()
     assert not bool((torchgco.solve(problem, solver="interior_point").status == Status.CONVERGED).any())
     local = presets.gco(problem).local
-    passes = (Converge(when="first"), Solve(), Starts())
+    passes = (Converge("free"), Solve(), Starts())
     found = torchgco.solve(problem, solver=Restarts(replace(local, max_outer_iterations=1), passes))
     assert found.status.tolist() == [Status.CONVERGED] * problem.B
 

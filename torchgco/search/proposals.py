@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -34,9 +34,6 @@ from torchgco.search.following import Follow, Free, Paths, limits_states, plain,
 from torchgco.search.record import comparison
 from torchgco.search.row import Row
 from torchgco.solution import SearchRecord
-
-if TYPE_CHECKING:
-    from torchgco.search.attempts import Search
 
 WHEN = {
     "caught": "caught",
@@ -63,6 +60,12 @@ class Proposal(NamedTuple):
         count = torch.zeros(problem.B, dtype=torch.int64, device=rest.device)
         cost = torch.full_like(problem.x0[:, 0], torch.inf)
         return cls(rest.clone(), count.bool(), Multipliers.zero(problem, torch.nan), count, cost)
+
+
+class Rounds(Protocol):
+    """A search that keeps the round of proposals from step to step."""
+
+    def propose(self, proposals: PathProposals) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ class PathProposals(Row):
         ways = "; then ".join(str(follow) for follow in self.follow)
         return f"{paths}: {ways}; {relaxed}{refined}; accepted up to {self.max_penetration:g} R deep{least}"
 
-    def run(self, search: Search) -> None:
+    def run(self, search: Rounds) -> None:
         """Propose; see the class."""
         search.propose(self)
 

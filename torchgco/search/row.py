@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
+from typing import Any, ClassVar, Self, overload
 
 from torchgco.base.errors import InputError, shown
-
-if TYPE_CHECKING:
-    from torchgco.search.attempts import Search
 
 
 class Row:
@@ -41,8 +38,8 @@ class Row:
     def does(self) -> str:
         raise NotImplementedError
 
-    def run(self, search: Search) -> None:
-        """All steps."""
+    def run(self, search: Any) -> None:
+        """All steps, on the state of a search (`attempts.Search`)."""
         for number, step in enumerate(self.steps):
             if number > 0 and search.begun:
                 if search.call.late:
