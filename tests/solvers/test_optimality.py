@@ -69,9 +69,9 @@ def test_the_scale_of_the_cost_changes_no_iterate(factor: float) -> None:
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
-@pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
-def test_the_scale_of_the_cost_changes_no_iterate_with_guidance(batch, factor: float) -> None:
-    problem = batch(B=2, N=25, obstacles=6, seed=4)[0]
+@pytest.mark.parametrize(("batch", "seed"), [(planar_batch, 4), (quadrotor_batch, 2)])
+def test_the_scale_of_the_cost_changes_no_iterate_with_guidance(batch, seed: int, factor: float) -> None:
+    problem = batch(B=2, N=25, obstacles=6, seed=seed)[0]
     one, other = (solve(p, solver=quick_gco(p)) for p in (problem, scaled(problem, factor)))
     assert torch.equal(one.iterations, other.iterations) and one.statuses == other.statuses
     assert torch.equal(one.guided, other.guided) and int(one.guided.sum()) > 0

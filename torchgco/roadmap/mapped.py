@@ -31,7 +31,7 @@ from torchgco.roadmap.search import DIVERSITY, HOPS
 # may fit between its knots.
 SEARCHES = ((2**18, 0.5, True), (2**18, 0.5, False), (2**18, 0.0, False), (2**21, 0.0, False))
 MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
-WIDE = 2.0  # the same of a path that keeps clear: a door of four units is still kept to its middle
+WIDE = 4.0  # the same of a path that keeps clear, which takes the middle of doors up to eight units wide
 AVERAGED = 0.8  # units: the standard deviation over which the corners of such a path are averaged
 LEAST = 1e-6  # of the price: no edge may cost nothing
 LONGEST = 2.0  # times as dear as the cheapest one other paths may be

@@ -73,7 +73,9 @@ class Direct(Row):
         bare = without_obstacles(call.problem)
         bound = torch.full_like(call.problem.x0[:, 0], -torch.inf)
         if bare is not None:
-            bound = FREE.solved(replace(call, problem=bare)).best.cost
+            free = FREE.solved(replace(call, problem=bare))
+            bound = free.best.cost
+            search.best.end.iterations[rows] += free.iterations
         solver = InteriorPoint(max_iterations=LIMIT)
         left = self._compared(search, rows, call, solver.solved(call), bound)
         if left.numel() > 0:
@@ -94,7 +96,10 @@ class Direct(Row):
         quick = arrives & (end.best.cost <= bound + self.gap * bound.abs())
         enough, left = quick.nonzero().flatten(), (~quick).nonzero().flatten()
         search.best.keep(rows[enough], take(end, enough))
-        search.waiting.append((rows[left], take(end, left)))
+        search.best.end.iterations[rows[left]] += end.iterations[left]  # now, and not once more at the end
+        search.best.worked[rows] = True
+        waits = take(end, left)
+        search.waiting.append((rows[left], replace(waits, iterations=torch.zeros_like(waits.iterations))))
         return left
 
 

@@ -41,7 +41,7 @@ DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all othe
 LATEST_FIRST = 0.55  # share of the horizon: the slowest that the first pace is
 ROADMAP = Roadmap()
 PACES = 4  # at which each path is tracked
-TOP = 6  # candidates of a problem that are solved: those of least cost as tracked
+TOP = 8  # candidates of a problem that are solved, those of least cost as tracked: the lanes of a vector in C
 # From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
 SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
 BOTH = Refine(top=2)  # marks candidates as solved in the record
@@ -110,6 +110,7 @@ class Tube(Row):
         candidates = Candidates.begin(part.problem, starts, paths.R, paths.unit, live)
         tracked = FOLLOW.along(candidates, paths, self._arrivals(paths, part.free(FOLLOW.iterations)), PACES)
         chosen = tracked.pick(self._order(tracked)[:, :TOP])
+        search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
         solved = self._solved(search, rows, chosen)
         if search.record is not None:
             found = solved.cost[solved.best].isfinite()
