@@ -7,6 +7,7 @@
 # make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)
 # make maps   drawn worlds as occupancy grids, and missions in worlds that are seen on the way: benchmarks/results/maps.md (under
 #             forty minutes on two cores); maps-long: the same with 100 and more missions of a kind (a day)
+# make floors   drawn floor plans, gco against a grid path that is pursued (ARGS="--maps DIR": real maps, too): some minutes
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
@@ -39,7 +40,7 @@ FIND := import sys; from torchgco.native.compiler import find_compiler; sys.exit
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps maps-known maps-seen maps-long \
+.PHONY: floors study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps maps-known maps-seen maps-long \
     benchmark benchmark-gpu ladder docs figures paper
 
 study: $(RUNTIME)
@@ -84,6 +85,9 @@ maps-known: $(RUNTIME)
 
 maps-seen: $(RUNTIME)
 	$(BIN)/python -m benchmarks.families.unknown --write
+
+floors: $(RUNTIME)
+	$(BIN)/python -m benchmarks.families.floors --write $(ARGS)
 
 maps-long: $(RUNTIME)
 	$(BIN)/python -m benchmarks.families.unknown --long --write

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from torchgco.base.errors import InputError, shown
-from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI
+from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI, PathPursuit
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
 from torchgco.problem.problem import Problem
@@ -142,6 +142,11 @@ def interior_point(space: Space) -> InteriorPoint:
     return InteriorPoint()
 
 
+def path_pursuit(space: Space) -> PathPursuit:
+    """A grid path, pursued by a simple controller, then the interior point: for unicycles and points."""
+    return PathPursuit()
+
+
 def multistart(space: Space) -> MultiStart:
     """AL-iLQR from random guesses, with as many iterations as `gco` makes in the family where it makes the most."""
     if _in_the_plane(space):
@@ -189,6 +194,7 @@ PRESETS: dict[str, Callable[[Space], Solver]] = {
         ilqr,
         mppi,
         interior_point,
+        path_pursuit,
         multistart,
         hold,
         ipopt,

@@ -217,9 +217,9 @@ def test_segments_are_measured_where_they_come_near() -> None:
     due = brute_clearance(grid, *p)
     for e in range(20):  # alone: none is left out
         found = float(part.segment_clearance(p[:1, e : e + 1], p[1:, e : e + 1])) + 0.1
-        assert found <= due[e] + 1e-3 and (due[e] - found < 0.1 or due[e] == 0)
+        assert found <= due[e] + 1e-9 and (due[e] - found < 0.1 or due[e] == 0)
     together = part.segment_clearance(p[:1], p[1:])
-    assert float(together.amin()) + 0.1 <= due.min() + 1e-3
+    assert float(together.amin()) + 0.1 <= due.min() + 1e-9
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def test_a_solver_keeps_its_colour_among_any_others() -> None:
 
 def test_each_solver_of_the_library_has_a_look_of_its_own() -> None:
     names = sorted(PRESETS)
-    assert len(set(solver_colours(names).values())) == len(names) == 14
+    assert len(set(solver_colours(names).values())) == len(names) == 15
     assert all(solver_colours([name])[name] == colour for name, colour in solver_colours(names).items())
     common = ("gco", "al_ilqr", "gco_paper", "mppi")
     assert len({solver_dash(name) for name in common}) == len(common) and solver_dash("gco") == "-"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -122,9 +123,13 @@ def test_layouts_keep_their_map_in_a_file(name: str, tmp_path: Path) -> None:
 
 def test_maps_are_of_the_layouts_space_and_shared(tmp_path: Path) -> None:
     layouts = MapFile(rooms(tmp_path)).draw([0, 1], 0)
-    other = MapFile(rooms(tmp_path)).draw([2], 0)
-    with pytest.raises(InputError, match=r"layouts\.map: expected the same"):
+    raw = samples.npz(occupied=ROOMS[:, :9], origin=[-1.0, 2.0], resolution=0.25)
+    small = samples.write(tmp_path, "small.npz", raw)
+    other = MapFile(small).draw([2], 0)
+    with pytest.raises(InputError, match=r"layouts\.map: expected the same in all parts, or grids of the same size"):
         concatenate([layouts, other])
+    with pytest.raises(InputError, match=r"layouts\.map: expected the same in all parts, got none in some"):
+        concatenate([replace(layouts, map=None), layouts])
     with pytest.raises(InputError, match=r"layouts\.map: expected one map for all, 3-D"):
         Layouts(np.empty((1, 0, 3)), np.empty((1, 0)), map=layouts.map)
     arrays = layouts.arrays()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -108,6 +109,34 @@ class DistanceField:
         here = slice(which, which + 1)
         source = self.source.single(which)
         return DistanceField(self.values[here], self.origin[here], self.spacing, source, self.unknown)
+
+    def take(self, index: np.ndarray) -> DistanceField:
+        """The fields of the maps in `index`, one per problem; the same field where all problems share a map.
+
+        The maps are a grid's: clouds of different size stay together.
+        """
+        source = self.source
+        if self.batch is None or not isinstance(source, OccupancyGrid):
+            return self
+        origins = source.origin if source.origin.ndim == 1 else source.origin[index]
+        grid = OccupancyGrid(source.occupied[index], origins, source.resolution)
+        return DistanceField(self.values[index], self.origin[index], self.spacing, grid, self.unknown)
+
+    @classmethod
+    def joined(cls, fields: Sequence[DistanceField]) -> DistanceField:
+        """One field with the maps of grids in order, each for one problem or, in a field of several, for as many.
+
+        Raises:
+            InputError: fields of clouds, or of grids with other sizes, resolutions or meanings of unknown cells.
+        """
+        forms = {(type(f.source), f.values.shape[1:], f.spacing, f.unknown) for f in fields}
+        if len(forms) > 1 or not all(isinstance(f.source, OccupancyGrid) for f in fields):
+            raise InputError("layouts.map", "the same in all parts, or grids of the same size", "others")
+        grids = [f.source for f in fields]
+        cells = np.concatenate([g.occupied if g.batch is not None else g.occupied[None] for g in grids])  # type: ignore
+        origin = np.concatenate([f.origin for f in fields])
+        grid = OccupancyGrid(cells, origin, grids[0].resolution)  # type: ignore[union-attr]
+        return cls(np.concatenate([f.values for f in fields]), origin, fields[0].spacing, grid, fields[0].unknown)
 
     def nodes(self, device: torch.device) -> Tensor:
         """`values` as a tensor; on a CPU it shares their memory."""

@@ -171,7 +171,18 @@ class BoundField(Obstacles):
             rows, segments = i[first : first + most], e[first : first + most]
             ends = a[rows, segments], b[rows, segments]
             gap[rows, segments] = self._between(rows, *ends, steps[rows, segments])
+        gap = self._along(gap, 0.5 * along / steps.clamp(min=1.0))
         return torch.where(near | self.absent, gap, bound).unsqueeze(-1)
+
+    def _along(self, gap: Tensor, half: Tensor) -> Tensor:
+        """Lower bounds (B, E) along segments whose pieces, twice `half` (B, E) long, have ends with clearances `gap`.
+
+        What is at least r away from both ends of a piece is at least sqrt(r^2 - half^2) away from all of it.
+        """
+        limits = self.limits.unsqueeze(-1)
+        r = gap + limits
+        between = (r.square() - half.square()).clamp(min=0.0).sqrt()
+        return torch.where(r > half, between, r - half) - limits
 
     def _between(self, rows: Tensor, a: Tensor, b: Tensor, steps: Tensor) -> Tensor:
         """Smallest distances (E,) at points in equal steps along segments from a to b (E, d) of problems `rows`."""

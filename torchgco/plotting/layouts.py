@@ -99,8 +99,8 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     leads = {solver_colours(flights)[next(iter(flights), "")] if flights else EDGE: passes(scene, i, path)}
     for plane, ax in axes.items():
         drawn |= draw_obstacles(ax, scene, i, leads, plane)
-        if scene.map is not None:
-            drawn |= draw_map(ax, scene.map, flown(path), plane, scene.margin, (STONE, EDGE))
+        if (own := scene.map_of(i)) is not None:
+            drawn |= draw_map(ax, own, flown(path), plane, scene.margin, (STONE, EDGE))
         drawn |= _paths(ax, scene, i, here, plane)
         draw_targets(ax, scene, i, plane)
     return drawn

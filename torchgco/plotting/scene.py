@@ -31,7 +31,7 @@ class Scene:
         goal_radius: nan where unknown.
         dt: s, 0 where unknown: moving obstacles are then drawn where they start.
         ids: (L,) index of each layout in its file or generator.
-        map: of all layouts, or None.
+        map: of all layouts, or one of each, or None.
     """
 
     bodies: tuple[tuple[Body, ...], ...]
@@ -46,6 +46,10 @@ class Scene:
     @property
     def dimension(self) -> int:
         return self.start.shape[1]
+
+    def map_of(self, i: int) -> DistanceField | None:
+        """The map of layout i; None where there is none."""
+        return None if self.map is None else self.map.single(i)
 
 
 class Pass(NamedTuple):
@@ -118,8 +122,8 @@ def contacts(scene: Scene, i: int, path: np.ndarray) -> np.ndarray:
     for body in scene.bodies[i]:
         reach = CONTACT_FACTOR * (body.radius + scene.margin)
         depth = np.maximum(depth, reach - body.along(places, scene.dt * knots, reach))
-    if scene.map is not None:
-        depth = np.maximum(depth, map_depth(scene.map, places, scene.margin))
+    if (own := scene.map_of(i)) is not None:
+        depth = np.maximum(depth, map_depth(own, places, scene.margin))
     return deepest(places, depth)
 
 
@@ -135,7 +139,7 @@ def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: li
     ends = [scene.start[shown], scene.goal[shown] - ring, scene.goal[shown] + ring]
     edges = [_extent(body, scene.margin) for i in shown for body in scene.bodies[i] if not body.moving]
     if scene.map is not None:
-        edges.append(np.stack([scene.map.origin[0], scene.map.upper[0]]))
+        edges += [np.stack([low, high]) for low, high in zip(scene.map.origin, scene.map.upper, strict=True)]
     corners = _corners([*whole, *ends])
     if corners is None:
         corners = _corners(edges)
@@ -146,7 +150,8 @@ def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: li
     size = float(max(corners[1] - corners[0])) or 1.0
     widest = corners + STRAY * size * np.array([[-1.0], [1.0]])
     if scene.map is not None:
-        widest = np.stack([np.minimum(widest[0], scene.map.origin[0]), np.maximum(widest[1], scene.map.upper[0])])
+        low, high = scene.map.origin.min(0), scene.map.upper.max(0)
+        widest = np.stack([np.minimum(widest[0], low), np.maximum(widest[1], high)])
     near = [path for path in others if bool(((path >= widest[0]) & (path <= widest[1])).all())]
     corners = _corners([*near, corners])
     assert corners is not None

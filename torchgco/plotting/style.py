@@ -37,6 +37,7 @@ KNOWN: dict[str, tuple[str, Dash]] = {
     "hold": ("#7F7F7F", DASHES[4]), "ipopt": ("#882255", DASHES[5]), "gco_fast": ("#44AA99", DASHES[1]),
     "interior_point": ("#AA4499", DASHES[1]), "gco_exact": ("#88CCEE", DASHES[2]),
     "gco_max": ("#332288", DASHES[2]), "multistart": ("#999933", DASHES[5]), "fatrop_guided": ("#117733", DASHES[2]),
+    "path_pursuit": ("#CC6677", DASHES[3]),
 }  # fmt: skip
 INK, FAINT = "#333333", "#BBBBBB"
 SMALL, TEXT, TITLE = 8, 9, 10  # points

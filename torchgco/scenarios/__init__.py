@@ -4,6 +4,7 @@ from torchgco.scenarios.base import Scenario
 from torchgco.scenarios.crossing import Crossing
 from torchgco.scenarios.cylinders import Cylinders
 from torchgco.scenarios.files import LayoutFile
+from torchgco.scenarios.floors import Floors
 from torchgco.scenarios.layouts import Layouts, concatenate
 from torchgco.scenarios.maps import MapFile
 from torchgco.scenarios.mazes import Mazes
@@ -18,6 +19,7 @@ from torchgco.scenarios.yard import Yard
 __all__ = [
     "Crossing",
     "Cylinders",
+    "Floors",
     "Forest",
     "ForestMoving",
     "LayoutFile",

@@ -26,6 +26,8 @@ class Scenario(ABC):
 
     name: str
 
+    shares_map = True  # whether all layouts have one map, where they have any
+
     @property
     @abstractmethod
     def dimension(self) -> int:

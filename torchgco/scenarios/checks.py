@@ -6,18 +6,21 @@ M spheres, K boxes, d the dimension of space, n states, m controls.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, shown
 from torchgco.base.options import INCREASING, Above, AtMost, Within, check_value
 from torchgco.obstacles.boxes import UNIT_WITHIN
 
 LARGEST = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
 MOST_OBSTACLES = 100_000  # in a layout that is drawn
+SHORTEST = 5.0  # s of a horizon, at least: to turn, to speed up and to stop
+TENS = 10
 MOST_STAGES = 10**9  # beyond any memory, and few enough for arithmetic on bytes
 
 
@@ -27,6 +30,7 @@ Size = Annotated[float, Above(0, "m"), AtMost(LARGEST, "m")]
 Duration = Annotated[float, Within(0, LARGEST, "s")]
 TimeStep = Annotated[float, Above(0, "s"), AtMost(LARGEST, "s")]
 Speed = Annotated[float, Within(0, LARGEST, "m/s")]
+Pace = Annotated[float, Within(1e-3, LARGEST, "m/s")]
 Stages = Annotated[int, Within(1, MOST_STAGES)]
 Number = Annotated[int, Within(0, MOST_OBSTACLES)]
 Density = Annotated[float, Within(0, LARGEST)]
@@ -39,6 +43,23 @@ Region2 = tuple[Range, Range]
 Region3 = tuple[Range, Range, Range]
 # Numbers that layouts share, by field.
 SCALARS: dict[str, Any] = {"vehicle_radius": Length, "goal_radius": Size, "dt": TimeStep, "stages": Stages}
+
+
+def stages_for(way: float, pace: float, dt: float) -> int:
+    """Stages of `dt`, s, for a way, m, at a mean speed, m/s: in tens, so that many layouts have as many."""
+    return max(1, math.ceil(max(way / pace, SHORTEST) / (TENS * dt)) * TENS)
+
+
+def stages(value: Any, count: int) -> int | np.ndarray | None:
+    """The number of stages, or where layouts differ (count,) int64 of them."""
+    if value is None or np.ndim(value) == 0:
+        held = scalar("stages", value)
+        return None if held is None else int(held)
+    numbers = array(value, "layouts.stages")
+    whole = numbers.shape == (count,) and bool((numbers == np.round(numbers)).all())
+    if not whole or not ((numbers >= 1) & (numbers <= MOST_STAGES)).all():
+        raise InputError("layouts.stages", f"one whole number above 0, or {count} of them", shown(value))
+    return int(numbers[0]) if (numbers == numbers[0]).all() else numbers.astype(np.int64)
 
 
 def scalar(name: str, value: Any) -> float | int | None:

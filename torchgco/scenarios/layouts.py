@@ -20,6 +20,7 @@ from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.memory import free_memory
 from torchgco.base.options import Natural, check_value
 from torchgco.maps.distance import DistanceField
+from torchgco.maps.grid import OccupancyGrid
 from torchgco.scenarios import checks, stored_maps
 from torchgco.scenarios.stored_maps import map_arrays, map_of
 
@@ -30,6 +31,7 @@ BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 SINES = ("box_amplitudes", "box_rates", "box_phases")
 NAMED = (*REQUIRED, "velocities", *BOXES, *SINES, "start", "goal", *checks.SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
+SHARED = tuple(name for name in checks.SCALARS if name != "stages")  # numbers that all layouts share
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,8 @@ class Layouts:
         velocities: (L, M, d) m/s, constant, or None if nothing moves.
         start, goal: (L, n) states, given as (n,) or (L, n), positions first; or positions alone, (d,) or (L, d), where
             the vehicle rests; or None.
-        vehicle_radius, goal_radius, dt, stages: m, m, s, N; each one number for all layouts, or None.
+        vehicle_radius, goal_radius, dt: m, m, s; each one number for all layouts, or None.
+        stages: N, one number for all layouts, or (L,) where they differ, or None.
         control_lower, control_upper: (m,) in the units of the inputs, infinite where unbounded, or None.
         best_cost: (L,) J_var of the best solution known, NaN where none is, or None.
         box_centers, box_half_sizes: (L, K, d) m, rows of NaN where a box is absent, or None if there are none; half the
@@ -53,8 +56,9 @@ class Layouts:
             half sides may be 0: a capsule has one side above 0.
         box_amplitudes, box_rates, box_phases: (L, K, S, d) m, rad/s and rad of S sines along each axis: at time t a box
             is at box_centers + sum_s amplitudes sin(rates t + phases). NaN where absent, or None if all boxes rest.
-        map: the distance field of a map that all layouts share, or None. In a file: the arrays `map_occupied`,
-            `map_origin` and `map_resolution`, or `map_points` and `map_radius`, and `map_unknown`.
+        map: the distance field of a map that all layouts share, or of L grids of the same size, one for each; or None.
+            In a file: the arrays `map_occupied`, `map_origin` and `map_resolution`, or `map_points` and `map_radius`,
+            and `map_unknown`.
         name: of the family, or the stem of the file.
         ids: (L,) int64, index of each layout in its file or generator; 0..L-1 unless given.
 
@@ -69,7 +73,7 @@ class Layouts:
     vehicle_radius: float | None = None
     goal_radius: float | None = None
     dt: float | None = None
-    stages: int | None = None
+    stages: int | np.ndarray | None = None
     control_lower: np.ndarray | None = None
     control_upper: np.ndarray | None = None
     best_cost: np.ndarray | None = None
@@ -104,15 +108,32 @@ class Layouts:
         if self.start is not None and self.goal is not None and len(lengths) > 1:
             raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
         for name in checks.SCALARS:
-            put(name, checks.scalar(name, getattr(self, name)))
+            if name != "stages":
+                put(name, checks.scalar(name, getattr(self, name)))
+        put("stages", checks.stages(self.stages, len(centers)))
         lower, upper = checks.control_bounds(self.control_lower, self.control_upper)
         put("control_lower", lower)
         put("control_upper", upper)
         put("best_cost", checks.best_cost(self.best_cost, len(centers)))
         put("ids", checks.ids(self.ids, len(centers)))
-        if self.map is not None and (self.map.d != self.dimension or self.map.batch is not None):
-            raise InputError("layouts.map", f"one map for all, {self.dimension}-D as centers", f"a {self.map.d}-D one")
+        put("map", self._checked_map())
         check_value(self.name, str, "layouts.name")
+
+    def _checked_map(self) -> DistanceField | None:
+        field, count = self.map, len(self.centers)
+        if field is None:
+            return None
+        of_each = field.batch is not None and isinstance(field.source, OccupancyGrid) and field.batch == count
+        if field.d != self.dimension or not (of_each or field.batch is None):
+            expected = f"one map for all, {self.dimension}-D as centers, or a grid for each of the {count} layouts"
+            raise InputError("layouts.map", expected, f"{'a' if field.batch is None else field.batch} {field.d}-D")
+        return field.single(0) if count == 1 else field
+
+    def alike(self) -> list[np.ndarray]:
+        """The places of layouts that have as many stages, (L',) each: they can be solved together as one batch."""
+        if not isinstance(self.stages, np.ndarray):
+            return [np.arange(self.count)]
+        return [np.flatnonzero(self.stages == number) for number in np.unique(self.stages)]
 
     @property
     def count(self) -> int:
@@ -140,7 +161,7 @@ class Layouts:
         return (
             self.name == other.name
             and mine.keys() == theirs.keys()
-            and all(np.array_equal(mine[name], theirs[name], equal_nan=True) for name in mine)
+            and all(_equal(mine[name], theirs[name]) for name in mine)
         )
 
     def take(self, indices: Sequence[int] | np.ndarray) -> Layouts:
@@ -150,7 +171,10 @@ class Layouts:
             raise InputError("layouts.take", f"positions in 0..{self.count - 1}", int(index.max()))
         rows = ("centers", "radii", "velocities", *BOXES, *SINES, "start", "goal", "best_cost", "ids")
         held = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
-        return replace(self, **{name: value[index] for name, value in held.items()})
+        held = {name: value[index] for name, value in held.items()}
+        if isinstance(self.stages, np.ndarray):
+            held["stages"] = self.stages[index]
+        return replace(self, map=None if self.map is None else self.map.take(index), **held)
 
     def pad(self, obstacles: int) -> Layouts:
         """The same layouts with M = `obstacles` spheres, absent ones added last; InputError if there are more."""
@@ -172,9 +196,7 @@ class Layouts:
         write_whole(path, lambda file: np.savez_compressed(file, **self.arrays()))  # type: ignore[arg-type]
 
     @classmethod
-    def load(
-        cls, path: str | os.PathLike[str], room: float = math.inf, limit: str = "of free memory"
-    ) -> Layouts:
+    def load(cls, path: str | os.PathLike[str], room: float = math.inf, limit: str = "of free memory") -> Layouts:
         """The layouts of a file, named by its stem.
 
         Args:
@@ -200,6 +222,11 @@ class Layouts:
         return cls(**held, map=map_of(there), name=path.stem, ids=ids)  # type: ignore[arg-type]
 
 
+def _equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two arrays hold the same; NaN equals NaN."""
+    return np.array_equal(a, b, equal_nan=a.dtype.kind == b.dtype.kind == "f")
+
+
 def _without_spheres(held: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Arrays of no spheres for a file that holds boxes alone; none for other files."""
     shape = held["box_centers"].shape if "box_centers" in held else ()
@@ -219,7 +246,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
     if not parts:
         raise InputError("layouts", "at least one part to concatenate", "none")
     _same("dimension", [part.dimension for part in parts])
-    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*checks.SCALARS, *CONTROLS)}
+    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SHARED, *CONTROLS)}
     width = max(part.radii.shape[1] for part in parts)
     parts = [part.pad(width) for part in parts]
     joined = ("start", "goal", "velocities", "best_cost")
@@ -240,17 +267,31 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
         radii=np.concatenate([part.radii for part in parts]),
         **{name: None if column[0] is None else np.concatenate(column) for name, column in columns.items()},
         **shared,
-        map=_shared_map(parts),
+        stages=_joined_stages(parts),
+        map=_joined_map(parts),
         name="+".join(dict.fromkeys(part.name for part in parts)),
         ids=np.concatenate([part.ids for part in parts]),
     )
 
 
-def _shared_map(parts: Sequence[Layouts]) -> DistanceField | None:
-    first = parts[0].map
-    if any(part.map is not first for part in parts):
-        raise InputError("layouts.map", "the same in all parts", "others")
-    return first
+def _joined_stages(parts: Sequence[Layouts]) -> np.ndarray | None:
+    """The stages of all layouts, (L,); None where no part has any."""
+    if any(part.stages is None for part in parts):
+        return _same("stages", [part.stages for part in parts])
+    return np.concatenate([np.broadcast_to(np.asarray(part.stages), part.count) for part in parts])
+
+
+def _joined_map(parts: Sequence[Layouts]) -> DistanceField | None:
+    """The map that all parts share, or the maps of all layouts."""
+    maps: list[Any] = [part.map for part in parts]
+    if all(one is maps[0] for one in maps):
+        shared = maps[0] is None or maps[0].batch is None or len(parts) == 1
+        return maps[0] if shared else DistanceField.joined(maps)
+    maps = [one for one in maps if one is not None]
+    if len(maps) < len(parts):
+        raise InputError("layouts.map", "the same in all parts", "none in some")
+    every = [[one] if one.batch is not None else [one] * part.count for one, part in zip(maps, parts, strict=True)]
+    return DistanceField.joined([one for some in every for one in some])
 
 
 def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:

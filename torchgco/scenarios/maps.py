@@ -17,12 +17,14 @@ from torchgco.base.options import Seed, check_options, check_value
 from torchgco.maps.distance import DistanceField, Unknown
 from torchgco.maps.files import read, read_task
 from torchgco.maps.grid import OccupancyGrid, coordinates
+from torchgco.roadmap.shortest import shortest_way
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import MAX_DRAWS, Scenario, generator
 from torchgco.scenarios.layouts import Layouts
 
 VEHICLE_RADIUS, GOAL_RADIUS = 0.25, 0.3  # m, where neither the command nor the file says them
 CLEAR = 1.2  # drawn places are as free as for a vehicle of this many radii
+PACES = {2: 0.7, 3: 2.0}  # m/s, by the dimension of space
 APART = 0.4  # share of the free space's diagonal that drawn starts and goals are apart, at least
 
 
@@ -39,7 +41,9 @@ class MapFile(Scenario):
         outside: what lies around a map's cells: "free", or "occupied", a rim of one cell.
         start, goal: positions (d,), m.
         vehicle_radius, goal_radius: m; None: the file's, or 0.25 and 0.3.
-        stages: N.
+        pace: mean speed for which horizons have room, m/s; None: 0.7 in the plane, 2 in space.
+        stages: N, the same for all layouts; None: as long as the way takes at `pace`, in tens, and 5 s at least. Where
+            no way leads through the map, the straight line counts.
         dt: s.
 
     Named by the file's stem; the dimension is the map's. Raises InputError where the file is missing or malformed
@@ -59,7 +63,8 @@ class MapFile(Scenario):
     goal: Any = None
     vehicle_radius: checks.Length | None = None
     goal_radius: checks.Size | None = None
-    stages: checks.Stages = 200
+    pace: checks.Pace | None = None
+    stages: checks.Stages | None = None
     dt: checks.TimeStep = 0.1
     name: str = field(init=False)
     map: DistanceField = field(init=False, repr=False, compare=False)
@@ -107,10 +112,11 @@ class MapFile(Scenario):
         """
         numbers, seed = checks.indices(ids, "ids"), check_value(seed, Seed, "seed")
         ends = np.array([self._ends(generator(seed, int(number))) for number in numbers])
+        stages = self.stages or np.array([self._stages_between(*pair) for pair in ends])
         none = np.empty((len(numbers), 0, self.dimension))
         return Layouts(
             centers=none, radii=none[..., 0], start=ends[:, 0], goal=ends[:, 1], vehicle_radius=self.vehicle_radius,
-            goal_radius=self.goal_radius, dt=self.dt, stages=self.stages, map=self.map, name=self.name, ids=numbers,
+            goal_radius=self.goal_radius, dt=self.dt, stages=stages, map=self.map, name=self.name, ids=numbers,
         )  # fmt: skip
 
     def _position(self, value: Any, name: str) -> np.ndarray:
@@ -135,6 +141,12 @@ class MapFile(Scenario):
         else:
             second = places[np.linalg.norm(places - first, axis=1).argmax()]
         return (second, first) if self.start is None and given is not None else (first, second)
+
+    def _stages_between(self, start: np.ndarray, goal: np.ndarray) -> int:
+        assert self.vehicle_radius is not None
+        way = shortest_way(self.map, self.vehicle_radius, start, goal)
+        pace = PACES[self.dimension] if self.pace is None else self.pace
+        return checks.stages_for(math.dist(start, goal) if way is None else way, pace, self.dt)
 
     def _free(self, near: np.ndarray | None) -> np.ndarray:
         """Places (P, d) of the connected free space around `near`; of the largest one where that is None."""

@@ -37,7 +37,7 @@ class Task:
     """A batch of planning problems, with initial guess, goal and layouts."""
 
     problem: Problem
-    U0: Tensor  # (B, N, m), the vehicle at rest
+    U0: Tensor  # (B, N, m), the vehicle at rest; N is the most stages of a layout
     goal: Tensor  # (B, d), m
     goal_radius: float  # m
     layouts: Layouts
@@ -133,6 +133,8 @@ class Vehicle:
 
         dynamics = self.dynamics if layouts.dt is None else replace(self.dynamics, dt=layouts.dt)  # type: ignore
         stages = _given(layouts.stages, self.stages)
+        longest = int(np.max(stages))
+        horizon = torch.as_tensor(stages, device=device) if np.ndim(stages) else None
         constraints: list[Constraint] = [
             Spheres(
                 tensor(layouts.centers),
@@ -162,8 +164,8 @@ class Vehicle:
         )  # fmt: skip
         goal_radius = _given(layouts.goal_radius, self.goal_radius)
         center = tensor(goal)[:, dynamics.position]
-        problem = Problem(dynamics, cost, constraints, tensor(start), stages, Goal(center, goal_radius))
-        U0 = tensor(list(self.control_reference)).expand(layouts.count, stages, -1).contiguous()
+        problem = Problem(dynamics, cost, constraints, tensor(start), longest, Goal(center, goal_radius), horizon)
+        U0 = tensor(list(self.control_reference)).expand(layouts.count, longest, -1).contiguous()
         return Task(problem, U0, center, goal_radius, layouts)
 
     def at_rest(self, layouts: Layouts) -> Layouts:

@@ -96,7 +96,7 @@ class InteriorPoint(Solver):
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         session, admitted = Session(call, RAW), self.admitted(call.problem)
-        end = self._no_worse(session.call, self.solved(session.call))
+        end = self.no_worse(session.call, self.solved(session.call))
         return session.finished(least_violated(session.call, end, admitted), admitted)
 
     def admitted(self, problem: Problem) -> float:
@@ -161,7 +161,7 @@ class InteriorPoint(Solver):
                 call.callback(Progress(1, call.rows[part], done, problem.B))
         return end
 
-    def _no_worse(self, call: Call, end: SolveEnd) -> SolveEnd:
+    def no_worse(self, call: Call, end: SolveEnd) -> SolveEnd:
         """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
         problem, found = call.problem, end.best
         X = open_loop(problem, call.U0)

@@ -8,6 +8,7 @@ from functools import cache, partial
 from typing import Annotated, Any, Literal
 
 import hydra
+import numpy as np
 import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, InstantiationException
@@ -62,20 +63,24 @@ class Setup:
         count = count if count is not None else self.scenario.available or DEFAULT_LAYOUTS
         check_value(count, Count, "study.layouts")
         self._refuse_beyond_memory(self.scenario.draw(range(1), self.seed), count)
-        return self.vehicle.at_rest(self.scenario.draw(range(count), self.seed))
+        drawn = self.vehicle.at_rest(self.scenario.draw(range(count), self.seed))
+        if self.mission is not None and drawn.stages is not None:  # a planner plans over one number of stages
+            return replace(drawn, stages=int(np.max(drawn.stages)))
+        return drawn
 
     def _refuse_beyond_memory(self, first: Layouts, count: int) -> None:
         """Raise where one problem, or all layouts and controls, exceed the free memory: the system would kill us."""
         dynamics, free = self.vehicle.dynamics, free_memory()
-        N = self.vehicle.stages if first.stages is None else first.stages
+        N = self.vehicle.stages if first.stages is None else int(np.max(first.stages))
         bodies = first.radii.shape[1] + (0 if first.box_centers is None else first.box_centers.shape[1])
         problem = least_bytes(N, dynamics.n, dynamics.m, N * (bodies + 2 * dynamics.m))
         if problem > free:
             field = "model.vehicle.stages" if first.stages is None else "scenario.stages"
             got = f"{N} stages with {bodies} obstacles, {_gigabytes(problem)} or more"
             raise InputError(field, f"a problem that fits into the free memory, {_gigabytes(free)}", got)
-        own = replace(first, map=None).arrays()  # all layouts share a map
-        flights = count * (sum(held.nbytes for held in own.values()) + 8 * N * dynamics.m)
+        own = replace(first, map=None).arrays()
+        of_map = first.map.values.nbytes if first.map is not None and not self.scenario.shares_map else 0
+        flights = count * (sum(held.nbytes for held in own.values()) + of_map + 8 * N * dynamics.m)
         if flights > free:
             got = f"{count}, {_gigabytes(flights)} or more"
             raise InputError("study.layouts", f"layouts that fit into the free memory, {_gigabytes(free)}", got)

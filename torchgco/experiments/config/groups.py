@@ -27,6 +27,7 @@ from torchgco.presets import PRESETS
 from torchgco.scenarios import (
     Crossing,
     Cylinders,
+    Floors,
     Forest,
     ForestMoving,
     LayoutFile,
@@ -45,7 +46,9 @@ from torchgco.search import Passes
 
 FAMILIES: tuple[type[Any], ...] = (
     Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
+    Floors,
 )  # fmt: skip
+ANYWHERE = {2: "unicycle", 3: "quadrotor"}  # the model for layouts that give positions alone
 BY_DIMENSION = "torchgco.by_dimension"
 ALIKE = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each
 WIDTH = 100  # of the help page
@@ -90,8 +93,15 @@ def options_of(group: str) -> list[str]:
 
 def scenarios_for(model: str) -> list[str]:
     """The families of layouts that a built-in model flies; none for another model."""
-    made = (family() for family in FAMILIES)
-    return sorted(one.name for one in made if BUILT_IN.get(model) == (one.dimension, one.states))
+    return sorted(family().name for family in FAMILIES if model == _model_of(family()))
+
+
+def _model_of(made: Any) -> str:
+    """The built-in model that flies a family's layouts unless a command names another."""
+    if made.states is None:  # positions alone
+        return ANYWHERE[made.dimension]
+    (model,) = (name for name, space in BUILT_IN.items() if space == (made.dimension, made.states))
+    return model
 
 
 def register() -> None:
@@ -105,8 +115,7 @@ def register() -> None:
     _store("scenario", "map", _fields_of(MapFile))
     for family in FAMILIES:
         made = family()
-        (model,) = (name for name, space in BUILT_IN.items() if space == (made.dimension, made.states))
-        picked = {"defaults": [{"override /model@_global_.model": model}, "_self_"]}  # unless a command names another
+        picked = {"defaults": [{"override /model@_global_.model": _model_of(made)}, "_self_"]}
         _store("scenario", made.name, picked | _fields_of(family))
     for name, make in PRESETS.items():
         trees = _tree(make(2)), _tree(make(3))

@@ -110,12 +110,33 @@ class Flight:
     name: str
     solver: Any
     bar: Bar
+    stages: int | None = None  # N of the controls returned: the most of the study; None: of these layouts
     shown: int = 0
     drawn: float = 0.0  # s, when the bar was drawn last
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
-        """Rows (without success) and controls (L, N, m), NaN where nothing was flown."""
-        setup, layouts = self.setup, self.layouts
+        """Rows (without success) and controls (L, N, m), NaN where nothing was flown.
+
+        Layouts with as many stages are solved together; their controls end with those at rest.
+        """
+        places = self.layouts.alike()
+        if len(places) == 1:
+            flown = [self._fly(self.layouts)]
+        else:
+            flown = [self._fly(self.layouts.take(some)) for some in places]
+        order = np.argsort(np.concatenate(places), kind="stable")
+        rows = pd.concat([some for some, _ in flown], ignore_index=True).iloc[order].reset_index(drop=True)
+        longest = max(self.stages or 0, *(U.shape[1] for _, U in flown))
+        return rows, np.concatenate([self._lengthened(U, longest) for _, U in flown])[order]
+
+    def _lengthened(self, U: np.ndarray, stages: int) -> np.ndarray:
+        """Controls (L, N, m) with those at rest after them, up to so many stages."""
+        rest = np.array(self.setup.vehicle.control_reference, np.float64)
+        return np.concatenate((U, np.broadcast_to(rest, (len(U), stages - U.shape[1], len(rest)))), axis=1)
+
+    def _fly(self, layouts: Layouts) -> tuple[pd.DataFrame, np.ndarray]:
+        """The same of layouts with as many stages."""
+        setup, self.shown = self.setup, 0
         task = setup.vehicle.task(layouts, setup.device, setup.dtype)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
         if (told := short_horizons(task.problem)) is not None:

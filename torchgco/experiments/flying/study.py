@@ -44,6 +44,7 @@ from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.results.success import sound, with_success
 from torchgco.missions import Mission
 from torchgco.native.kernels import native
+from torchgco.problem.horizons import within_horizons
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.
@@ -246,7 +247,8 @@ def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | 
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
     layouts, solver = study.layouts.take(ids), study.solvers[name]
     if study.setup.mission is None:
-        return Flight(study.setup, layouts, name, solver, bar)
+        most = None if study.layouts.stages is None else int(np.max(study.layouts.stages))
+        return Flight(study.setup, layouts, name, solver, bar, most)
     return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= FEW)
 
 
@@ -290,8 +292,9 @@ def _update_success(study: _Study, records: Records, show: Callable[[str], None]
 def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """States (L, N+1, n) of every solver, for the pictures."""
     problem = study.setup.vehicle.task(study.layouts).problem
+    dynamics = within_horizons(problem).dynamics
     names: Sequence[str] = flown["solver"].tolist()
     return {
-        name: open_loop(problem.dynamics, problem.x0, torch.from_numpy(U)).numpy()
+        name: open_loop(dynamics, problem.x0, torch.from_numpy(U)).numpy()
         for name, U in zip(names, flown["U"], strict=True)
     }

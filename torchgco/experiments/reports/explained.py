@@ -65,11 +65,18 @@ def explained(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
     if not failed:
         return f"\n{setup.solver_name} failed on no layout: there is nothing to explain."
     shown = failed[:EXPLAINED]
-    part = layouts.take(shown)
-    task = setup.vehicle.task(part, setup.device, setup.dtype)
-    ids = torch.as_tensor(part.ids, device=setup.device)
-    solution = setup.solver.recording().solve(task.problem, task.U0, seed=setup.seed, ids=ids)
-    solution = replace(solution, account=solution.account.of_preset(setup.solver_name))
-    told = [explanation(solution, i, what=f"Layout {number}") for i, number in enumerate(shown)]
+    part, found = layouts.take(shown), dict[int, str]()
+    for places in part.alike():
+        found |= _told(setup, part.take(places))
+    told = [found[number] for number in shown]
     more = f", the first {len(shown)} of them here" if len(failed) > len(shown) else ""
     return "\n\n".join([f"\n{setup.solver_name} failed on {len(failed)} of {len(own)} layouts{more}.", *told])
+
+
+def _told(setup: Setup, layouts: Layouts) -> dict[int, str]:
+    """What happened to layouts with as many stages, by their numbers."""
+    task = setup.vehicle.task(layouts, setup.device, setup.dtype)
+    ids = torch.as_tensor(layouts.ids, device=setup.device)
+    solution = setup.solver.recording().solve(task.problem, task.U0, seed=setup.seed, ids=ids)
+    solution = replace(solution, account=solution.account.of_preset(setup.solver_name))
+    return {number: explanation(solution, i, what=f"Layout {number}") for i, number in enumerate(layouts.ids.tolist())}

@@ -35,14 +35,22 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
                 continue
             watched = Watched(solver.guidance)
             solver, seen = replace(solver, guidance=watched), watched.seen
-        problem, solution = _solved(study, numbers, name, solver)
-        for b, number in enumerate(numbers):
-            part = search_of(solution, problem, b) or SearchPart([], [])
-            own = [one for one in seen if one.number == number]
-            guides = [(f"outer iteration {one.outer}", one.balls, one.sample) for one in own]
-            if part.passes or part.rounds or guides:
-                found[number].append(_named(replace(part, guides=guides), name))
+        for some in _alike(study, numbers):
+            problem, solution = _solved(study, some, name, solver)
+            for b, number in enumerate(some):
+                part = search_of(solution, problem, b) or SearchPart([], [])
+                own = [one for one in seen if one.number == number]
+                guides = [(f"outer iteration {one.outer}", one.balls, one.sample) for one in own]
+                if part.passes or part.rounds or guides:
+                    found[number].append(_named(replace(part, guides=guides), name))
     return {number: _joined(parts) for number, parts in found.items() if parts}
+
+
+def _alike(study: Study, numbers: Sequence[int]) -> list[list[int]]:
+    """The numbers of layouts that were solved together, as they have as many stages."""
+    ids = study.layouts.ids.tolist()
+    places = study.layouts.take([ids.index(number) for number in numbers]).alike()
+    return [[numbers[i] for i in some] for some in places]
 
 
 def _solved(study: Study, numbers: Sequence[int], name: str, solver: Any) -> tuple[Problem, Solution]:

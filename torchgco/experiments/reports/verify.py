@@ -95,9 +95,7 @@ class Verification:
         return any(len(table.differences) for table in self.tables)
 
 
-def verify(
-    folders: Iterable[str | os.PathLike[str]], trust: bool = False
-) -> tuple[list[Verification], list[str]]:
+def verify(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> tuple[list[Verification], list[str]]:
     """Confirm every finished study in and below some folders; also names the studies that aren't finished.
 
     Args:
@@ -213,7 +211,7 @@ def _trajectories(
         for first in range(0, layouts.count, BATCH):
             some = layouts.take(range(first, min(first + BATCH, layouts.count)))
             task = vehicle.task(some)
-            U = controls[[place[number] for number in some.ids.tolist()]]
+            U = controls[[place[number] for number in some.ids.tolist()], : task.problem.N]
             verdict = judge(task.problem, U, task.goal, task.goal_radius)
             columns = {"solver": name, "layout": some.ids, **frame_columns(verdict), "sound": verdict.sound.numpy()}
             parts.append(pd.DataFrame(columns))

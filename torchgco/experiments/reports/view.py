@@ -21,6 +21,7 @@ from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.records import SOLUTIONS
 from torchgco.judging.judge import OTHERS_WITHIN
+from torchgco.problem.horizons import within_horizons
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page
@@ -58,8 +59,9 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
         document = document or document_of(study, problem, look)
         ids, flown = study.layouts.ids[places].tolist(), []
         for name in document.solvers:
-            U = torch.from_numpy(controls[name][places])
-            X, here = open_loop(problem.dynamics, problem.x0, U), [rows[name, number] for number in ids]
+            U = torch.from_numpy(controls[name][places, : problem.N])
+            X = open_loop(within_horizons(problem).dynamics, problem.x0, U)
+            here = [rows[name, number] for number in ids]
             touching = np.array([not row["clearance"] >= 0 for row in here])
             said = [result_of(row) for row in here], [told(row) for row in here]
             flown.append(flights_of(problem, look, X, U, name, *said, OTHERS_WITHIN, touching))
@@ -107,9 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def write_view(
-    folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False
-) -> Path:
+def write_view(folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False) -> Path:
     """Write the page of a finished study; returns where it lies. Raises InputError as `study_page` does."""
     path = folder / NAME if output is None else output
     if path.is_dir():

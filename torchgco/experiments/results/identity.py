@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
 from torchgco.scenarios.layouts import BOXES, SINES
 from torchgco.scenarios.stored_maps import map_arrays
@@ -160,8 +161,9 @@ def layout_digests(
     for key, field in OVERRULED.items():
         given = getattr(layouts, field)
         shared[key] = vehicle.get(key) if given is None else given
-    if layouts.map is not None:
-        shared["map"] = {name: _digest_of_array(value) for name, value in map_arrays(layouts.map).items()}
+    alone = layouts.map is not None and layouts.map.batch is not None
+    if layouts.map is not None and not alone:
+        shared["map"] = _map_digests(layouts.map)
     shared = _normal(shared)  # once for all layouts: a study may have thousands
     moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
     codes = {}
@@ -181,8 +183,16 @@ def layout_digests(
         for name in ("start", "goal"):
             if getattr(layouts, name) is not None:
                 own[name] = getattr(layouts, name)[i]
+        if isinstance(layouts.stages, np.ndarray):
+            own["stages"] = int(layouts.stages[i])
+        if alone and layouts.map is not None:
+            own["map"] = _map_digests(layouts.map.single(i))
         codes[number] = _digest_of({**shared, **_normal(own)})
     return codes
+
+
+def _map_digests(field: DistanceField) -> dict[str, str]:
+    return {name: _digest_of_array(value) for name, value in map_arrays(field).items()}
 
 
 def difference(held: Any, new: Any, path: str = "") -> str:

@@ -103,7 +103,7 @@ def check_stages(folder: Path, vehicle: Vehicle, layouts: Layouts, most: int) ->
     Raises:
         InputError: they do.
     """
-    count, stages = min(most, layouts.count), vehicle.stages if layouts.stages is None else layouts.stages
+    count, stages = min(most, layouts.count), vehicle.stages if layouts.stages is None else int(np.max(layouts.stages))
     size = count * stages * (vehicle.dynamics.n + vehicle.dynamics.m) * NUMBER
     if size > LARGEST:
         refuse(folder, f"{count} trajectories of {stages} stages, {size / 1e9:.3g} GB")

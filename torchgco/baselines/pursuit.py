@@ -1,0 +1,229 @@
+"""A grid path, pursued by a simple controller, and the interior point: what anyone would try first among obstacles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.options import Natural, NonNegative, Positive, Share, check_options
+from torchgco.base.tree import put, take
+from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of
+from torchgco.lagrangian.quality import has_arrived
+from torchgco.maps.ways import Ways, length
+from torchgco.native.dispatch import chord_clearance, measured
+from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.problem import Problem
+from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.scene import scene_of
+from torchgco.search.chords import MARGIN, MIN_GROWTH
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Call, Solver
+from torchgco.solvers.infeasible import least_violated
+from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.rules import RAW
+from torchgco.solvers.session import Session
+from torchgco.solvers.state import SolveEnd
+
+Array = NDArray[np.float64]
+
+STEP = 0.5  # radii between nodes of the grid, at most
+NODES = 2**18  # of a grid, about, at most: a search of as many takes a second
+LEAST_NODES = 2**14  # and where there is no radius to go by
+FINE = 0.25  # radii between the points of a path
+BESIDE = 4.0  # radii that the grid reaches beyond start, goal and obstacles
+
+
+@dataclass(frozen=True)
+class PathPursuit(Solver):
+    """The shortest way over a grid, pursued, and the result solved by the interior point with a small barrier.
+
+    Where the trajectory touches an obstacle between two knots, obstacles grow by what is missing and the interior point
+    goes on. One problem's guess after the other; for a `Unicycle`, and for models whose position can be pushed in every
+    direction (points). The recipe uses nothing of `gco`'s search.
+
+    Args:
+        near: radii from contact within which a way costs more.
+        weight: of this: at contact a metre costs so much more.
+        smoothing: standard deviation of the Gaussian that rounds a path's corners, radii.
+        lookahead: radii that the controller looks ahead along the path.
+        share: of the horizon in which the path is driven.
+        solver: solves each problem from the trajectory along its path, and, by its `warm_barrier`, again where the
+            result touches an obstacle between knots.
+        rounds: of these at most, each with larger obstacles.
+
+    Raises:
+        InputError: a field out of its range; on `solve`, other models, no goal, obstacles that move or of kinds that no
+            path is sought among.
+    """
+
+    near: NonNegative = 2.0
+    weight: NonNegative = 2.0
+    smoothing: NonNegative = 2.0
+    lookahead: Positive = 2.4
+    share: Share = 0.75
+    solver: InteriorPoint = InteriorPoint(initial_barrier=1e-3, warm_barrier=1e-4)
+    rounds: Natural = 4
+
+    def __post_init__(self) -> None:
+        check_options(self, "solver")
+
+    def announce(self, problem: Problem) -> None:
+        """As the interior point."""
+        self.solver.announce(problem)
+
+    def run(self, call: Call) -> Solution:
+        """Find a path for each problem, pursue it, and solve."""
+        session, admitted = Session(call, RAW), self.solver.admitted(call.problem)
+        held = session.call
+        X, U, found = self.guess(held.problem, held.U0)
+        held = replace(held, U0=U)
+        end = self._cleared(held, self.solver.no_worse(held, self.solver.solved(held, X)))
+        solution = session.finished(least_violated(held, end, admitted), admitted)
+        return replace(solution, guided=found.long())
+
+    def guess(self, problem: Problem, U0: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """States (B, N+1, n) and controls (B, N, m) along the paths, and where (B,) there is one; else U0.
+
+        Raises:
+            InputError: as the class says.
+        """
+        driver, scene = self._checked(problem)
+        X, U = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1), U0.clone()
+        found = torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
+        for b in range(problem.B):
+            row = torch.tensor([b], device=problem.x0.device)
+            one = problem.take(row)
+            track = self._track(one, None if scene is None else scene.take(row))
+            if track is None:
+                X[b] = torch.nan  # the interior point then begins with its start held
+                continue
+            states, controls = driver(one, track)
+            X[b], U[b, : int(one.stages[0])] = U.new_tensor(states), U.new_tensor(controls)[: int(one.stages[0])]
+            found[b] = True
+        return X, U, found
+
+    def _checked(self, problem: Problem) -> tuple[Driver, Scene | None]:
+        """The controller, and start, goal and obstacles; None where there are no obstacles."""
+        if problem.dynamics.position is None or (driver := driver_of(problem)) is None:
+            expected = "a Unicycle, or a model whose position can be pushed in every direction, for path_pursuit"
+            raise InputError("problem.dynamics", expected, type(problem.dynamics).__name__)
+        if problem.goal is None:
+            raise InputError("problem.goal", "a Goal, to which path_pursuit seeks a way", "none")
+        rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+        scene = scene_of(problem, rest)
+        if scene is None and problem.obstacles:
+            kinds = ", ".join(type(part).__name__ for part in problem.obstacles)
+            raise InputError("problem.constraints", "obstacles at rest, of kinds that path_pursuit knows", kinds)
+        return driver, scene
+
+    def _track(self, problem: Problem, scene: Scene | None) -> Track | None:
+        """What to pursue in a batch of one; None where there is no way, or nowhere to go."""
+        assert problem.goal is not None
+        R, ends = radius_of(problem), (problem.x0[:, problem.position], problem.goal.position)
+        start, goal = (p[0].double().cpu().numpy() for p in ends)
+        way = np.stack((start, goal)) if scene is None else self._way(problem, scene, start, goal, R)
+        if way is None or length(way) <= 0.0:
+            return None
+        long, duration = length(way), float(problem.stages[0]) * float(problem.dynamics.dt)
+        unit = R or long / 100.0
+        step = min(FINE * unit, long / 10.0)
+        points = smoothed(evenly(way, step), self.smoothing * unit / step)
+        speed = length(points) / (self.share * duration)
+        braking = speed / (BRAKING * duration)
+        return Track(points, step, max(1, round(self.lookahead * unit / step)), speed, braking)
+
+    def _way(self, problem: Problem, scene: Scene, start: Array, goal: Array, R: float) -> Array | None:
+        """The cheapest way (P, d) over a grid, first by steps that are free for the vehicle, then by nodes that are."""
+        low, high = region(scene, BESIDE * R)
+        wide, d = high - low, len(low)
+        least = float(np.prod(wide) / NODES) ** (1.0 / d)
+        spacing = max(STEP * R, least) if R > 0 else float(np.prod(wide) / LEAST_NODES) ** (1.0 / d)
+        axes = [torch.arange(int(side / spacing) + 1, dtype=torch.float64) for side in wide]
+        nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+        places = problem.x0.new_tensor(low) + spacing * nodes.to(problem.x0)
+        away = clearance(problem, places.reshape(1, -1, d)).reshape(nodes.shape[:-1]).double().cpu().numpy()
+        near = self.near * (R or spacing)
+        for depth in (0.0, 0.5 * spacing * d**0.5):
+            way = Ways(away, low, spacing, -depth, near + depth, self.weight).way(start, goal)
+            if way is not None:
+                return way
+        return None
+
+    def _cleared(self, call: Call, end: SolveEnd) -> SolveEnd:
+        """The same, solved again with grown obstacles where trajectories touch one between two knots.
+
+        As `ClearChords`, but by the interior point alone: a new trajectory is kept where it is feasible among obstacles
+        as they are, arrives where the old one did, and keeps more clearance.
+        """
+        problem, best = call.problem, end.best
+        if not problem.obstacles:
+            return end
+        held, limit = chord_clearance(problem, best.X), ADMITTED
+        by, now = torch.zeros_like(held), held.clone()
+        for _ in range(self.rounds):
+            rows = ((best.violation <= limit) & (held < 0)).nonzero().flatten()
+            if rows.numel() == 0 or call.late:
+                break
+            by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
+            part, old = call.take(rows), take(best, rows)
+            grown = replace(part, problem=part.problem.grown(by[rows]), U0=old.U, warm=old.multipliers, X0=None)
+            new = self.solver.solved(replace(grown, callback=None), old.X)
+            X, U = new.best.X, new.best.U
+            end.iterations[rows] += new.iterations
+            now[rows] = chord_clearance(part.problem, X)
+            serves = (measured(part.problem, X, U) <= limit) & (now[rows] > held[rows])
+            serves &= has_arrived(part.problem, X) | ~has_arrived(part.problem, old.X)
+            kept = serves.nonzero().flatten()
+            found = replace(take(new.best, kept), violation=measured(part.problem, X, U)[kept])
+            put(best, rows[kept], found)
+            end.status[rows[kept]] = new.status[kept]
+            held[rows[kept]] = now[rows[kept]]
+        return end
+
+
+def radius_of(problem: Problem) -> float:
+    """The largest radius of the vehicle in a batch of one, m; 0 without obstacles."""
+    return max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
+
+
+def region(scene: Scene, margin: float) -> tuple[Array, Array]:
+    """The corners (d,) of the space in which a way is sought, in a scene of one."""
+    low, high = (part[0].double().cpu().numpy() for part in scene.obstacles.region(scene.start, scene.goal))
+    for part in scene.obstacles.maps:
+        which = int(part.which[0])
+        low, high = np.minimum(low, part.field.origin[which]), np.maximum(high, part.field.upper[which])
+    return low - margin, high + margin
+
+
+def clearance(problem: Problem, points: Tensor) -> Tensor:
+    """Clearances (K,) at points (1, K, d) from all obstacles of a batch of one, m."""
+    found = torch.full_like(points[0, :, 0], torch.inf)
+    for part in problem.obstacles:
+        if part.margins.shape[1] > 0:
+            away = part.signed_distance(points, points.new_zeros(points.shape[1]))[0]
+            found = torch.minimum(found, away.masked_fill(part.absent[0], torch.inf).amin(-1))
+    return found
+
+
+def evenly(way: Array, step: float) -> Array:
+    """Points (P, d) at equal distances of about `step`, m, along a way (Q, d)."""
+    along = np.concatenate(([0.0], np.linalg.norm(np.diff(way, axis=0), axis=1).cumsum()))
+    at = np.linspace(0.0, along[-1], max(2, round(along[-1] / step) + 1))
+    return np.stack([np.interp(at, along, x) for x in way.T], axis=1)
+
+
+def smoothed(points: Array, deviation: float) -> Array:
+    """Points (P, d) averaged by a Gaussian of so many points; the ends stay where they are."""
+    from scipy.ndimage import gaussian_filter1d
+
+    if deviation <= 0.0:
+        return points
+    between = points - np.linspace(points[0], points[-1], len(points))  # 0 at both ends
+    odd = np.concatenate((-between[:0:-1], between, -between[-2::-1]))  # about both: averages there are 0, too
+    averaged = gaussian_filter1d(odd, deviation, axis=0, mode="nearest")[len(points) - 1 : 2 * len(points) - 1]
+    return points - between + averaged
