@@ -17,11 +17,12 @@ from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.native.dispatch import chord_clearance, measured
 from torchgco.search.attempts import Search
-from torchgco.search.converge import continued
+from torchgco.search.converge import continued, mapped
 from torchgco.search.row import Row
 from torchgco.solvers.state import SolveEnd
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
+GROWN_BARRIER = 1e-4  # of warm solves among grown obstacles, which lie deeper than rounding
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
 
 
@@ -68,6 +69,13 @@ class ClearChords(Row):
             old = take(best.end.best, rows)
             call = search.call.take(rows)
             call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
+            if mapped(call.problem):  # along whose one row per knot AL-iLQR takes many short steps
+                grown = replace(search.interior, warm_barrier=GROWN_BARRIER)
+                new = tight = continued(grown, replace(call, callback=None), old)
+                serves, now[rows] = self._kept(search, rows, new, clearance[rows])
+                clearance[rows] = torch.where(serves, now[rows], clearance[rows])
+                rows = rows[clearance[rows] < 0]
+                continue
             new = best.attempt(call)
             serves, now[rows] = self._kept(search, rows, new, clearance[rows])
             tight = continued(search.interior, replace(call, callback=None), new.best)
