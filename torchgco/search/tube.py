@@ -151,8 +151,9 @@ class Tube(Row):
         cost[some] = torch.where(good, end.best.cost, torch.inf)
         made = made.index_add(0, some // tracked.count, end.iterations)
         clear, fits = torch.full_like(cost, torch.inf), good.nonzero().flatten()
-        misses = chord_clearance(call.problem.take(fits), end.best.X[fits]) >= 0  # others may end anywhere
-        clear[some[fits]] = torch.where(misses, end.best.cost[fits], torch.inf)
+        if fits.numel() > 0:  # others may end anywhere
+            misses = chord_clearance(call.problem.take(fits), end.best.X[fits]) >= 0
+            clear[some[fits]] = torch.where(misses, end.best.cost[fits], torch.inf)
         for merit in (clear, cost):  # the cheapest that is clear between knots, too, is remembered by `Best.keep`
             self._keep(search, rows, tracked.count, some, end, merit, made)
             made = torch.zeros_like(made)
