@@ -55,7 +55,7 @@ class Nearby:
 
     @classmethod
     def along(cls, call: Call, X: Tensor) -> Nearby | None:
-        """A call without the obstacles farther from X (B, N+1, n) than a mean one is thick; None where these are few."""
+        """A call without the obstacles farther from X (B, N+1, n) than a mean one is thick; None where few are."""
         return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids), FEWER)
 
     @classmethod

@@ -63,8 +63,8 @@ class Paths(Row):
 
     Args:
         num_paths, roadmap, follow, relax_iterations, relax_top, max_penetration: as of `PathProposals`.
-        refined: candidates that are refined before they are compared; 1: the best is proposed as relaxed, and only
-            those of paths that led to no proposal are refined.
+        refined: candidates that are refined before they are compared; 1: the best is proposed as relaxed, only those of
+            paths that led to no proposal are refined, and where the attempt ends far from the goal all of twice as many.
         max_gap: proposals that cost more than this above the trajectory without obstacles, as a share, are compared
             with those along twice as many paths; None: none are.
 
@@ -105,7 +105,13 @@ class Paths(Row):
         if self.refined == 1:
             again = replace(again, refine=REPAIRED, max_penetration=DEEP)
         more = () if self.max_gap is None else (self._more(first),)
-        return (first, *more, again, FromProposal(), IntoGoal())
+        steps = first, *more, again, FromProposal(), IntoGoal()
+        return (*steps, self._thorough(first), FromProposal()) if self.refined == 1 else steps
+
+    def _thorough(self, first: PathProposals) -> PathProposals:
+        """Along twice as many paths, to the end of the horizon and all refined, where the attempt ends far away."""
+        count, follow = 2 * self.num_paths, replace(self.follow, iterations=3 * self.follow.iterations, pace=None)
+        return replace(first, when="far", num_paths=count, follow=(follow,), relax_top=None, refine=Refine(top=count))
 
     def _more(self, first: PathProposals) -> PathProposals:
         """Along twice as many paths, over twice as many points too: other paths, but not always better ones."""
@@ -124,7 +130,10 @@ class Paths(Row):
     @property
     def does(self) -> str:
         more = "" if self.max_gap is None else f"; over {self.max_gap:.0%} dearer than free: twice as many paths"
-        return f"{self.proposals.does}{more}; without any: followed closer; then AL-iLQR from the best, into the goal"
+        far = "; still far: twice as many, all refined" if self.refined == 1 else ""
+        return (
+            f"{self.proposals.does}{more}; without any: followed closer; then AL-iLQR from the best, into the goal{far}"
+        )
 
     def fitting(self, m: int) -> Self:
         """Without initial offsets that have another number of controls than m."""
