@@ -64,7 +64,7 @@ class Paths(Row):
     Args:
         num_paths, roadmap, follow, relax_iterations, relax_top, max_penetration: as of `PathProposals`.
         refined: candidates that are refined before they are compared; 1: the best is proposed as relaxed, only those of
-            paths that led to no proposal are refined, and where the attempt ends far from the goal all of twice as many.
+            paths that led to no proposal are refined, and where the attempt ends far from the goal, twice as many.
         max_gap: proposals that cost more than this above the trajectory without obstacles, as a share, are compared
             with those along twice as many paths; None: none are.
 
@@ -144,6 +144,8 @@ class Paths(Row):
 class Samples(Row):
     """Attempts from samples, and one into the goal; then what the interior point found beside the search competes.
 
+    Where there was never a proposal, as among moving obstacles, the solve that was stopped goes on first.
+
     Args:
         redraws: as of `FromSamples`.
 
@@ -158,7 +160,7 @@ class Samples(Row):
 
     @property
     def steps(self) -> tuple[Row, ...]:
-        return FromSamples(redraws=self.redraws), IntoGoal(), Join()
+        return FromSamples("unproposed"), FromSamples(redraws=self.redraws), IntoGoal(), Join()
 
     @property
     def problems(self) -> str:
@@ -166,7 +168,7 @@ class Samples(Row):
 
     @property
     def does(self) -> str:
-        return f"{self.steps[0].does}; the best into the goal; what waits competes"
+        return f"{self.steps[1].does}; the best into the goal; what waits competes"
 
 
 @dataclass(frozen=True)
