@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,7 @@ from tests.search.test_chords import corners
 from tests.search.test_finish import brachistochrone, parking
 from torchgco import (
     AugmentedLagrangian,
+    Field,
     InputError,
     PathProposals,
     Problem,
@@ -23,6 +25,7 @@ from torchgco import (
     Spheres,
     presets,
 )
+from torchgco.maps import OccupancyGrid
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search import (
     ClearChords,
@@ -296,3 +299,19 @@ def test_rows_run_in_their_order_and_only_where_they_apply(attempts: int, monkey
     solution = solver.solve(*gates(), seed=3)
     assert made == list(solver.passes)
     assert solution.guided[[PASSES, SHORT]].tolist() == [1, 1]
+
+
+def test_a_problem_has_the_rows_of_its_kind() -> None:
+    bodies = planar_batch(B=1, N=10)[0]
+    moving = Spheres([[0.1, 0.1]], [0.2], 0.06, velocities=torch.zeros(1, 2, dtype=torch.float64))
+    bounds = bodies.constraints[1]
+    field = Field(OccupancyGrid(np.zeros((20, 20), bool), [-1.0, -1.0], 0.1), 0.05)
+    kinds = {"bodies": bodies.constraints, "moving": [moving, bounds], "free": [bounds], "maps": [field, bounds]}
+    rows = {
+        "free": ["guess", "tighten"], "moving": ["guess", "samples", "clear", "tighten"],
+        "maps": ["guess", "maps", "paths", "samples", "clear", "tighten"],
+        "bodies": ["guess", "paths", "tube", "samples", "clear", "tighten"],
+    }  # fmt: skip
+    for kind, constraints in kinds.items():
+        problem = replace(bodies, constraints=constraints)
+        assert presets.gco(problem).table(problem)["name"].tolist() == rows[kind]

@@ -7,6 +7,7 @@ step, the straight line between two knots may come closer than both.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -43,6 +44,8 @@ class ClearChords(Row):
     """
 
     rounds: Count = 4
+
+    kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
 
     def __post_init__(self) -> None:
         check_options(self, "chords")

@@ -56,7 +56,7 @@ class Direct(Row):
 
     @property
     def problems(self) -> str:
-        return f"caught, in the plane among at most {self.most} obstacles"
+        return f"caught in the plane among at most {self.most} obstacles"
 
     @property
     def does(self) -> str:

@@ -12,9 +12,10 @@ from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.native.dispatch import expect_interior
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.scene import has_paths
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
-from torchgco.search.converge import Converge
+from torchgco.search.converge import Converge, mapped
 from torchgco.search.nearby import Nearby, merged
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.proposals import PathProposals
@@ -57,11 +58,17 @@ class Restarts(Solver):
         _check(self.passes)
         check_options(self, "solver")
 
-    def table(self) -> pd.DataFrame:
-        """The passes, a row each: which problems they look at, and what they do with them."""
+    def table(self, problem: Problem | None = None) -> pd.DataFrame:
+        """The passes, a row each: which problems they look at, and what they do with them.
+
+        Args:
+            problem: only the rows that may work on problems of this kind; None: all.
+        """
         import pandas as pd
 
-        return pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
+        table = pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
+        kind = None if problem is None else kind_of(problem)
+        return table if kind is None else table[[kind in row.kinds for row in self.passes]]
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
         """The passes but the last solves, as the next plan continues this one; and the local solver, unguided."""
@@ -152,6 +159,13 @@ class Restarts(Solver):
         losses += [] if unsought is None else [unsought]
         warn_of_losses(losses, guidance is None and not any(one.seeks_paths for one in passes if one is not None))
         return passes, guidance
+
+
+def kind_of(problem: Problem) -> str:
+    """The kind of problem: "free" of obstacles, "moving" where no path can be sought, "maps", or "bodies" without."""
+    if not problem.geometric:
+        return "free"
+    return "moving" if not has_paths(problem) else "maps" if mapped(problem) else "bodies"
 
 
 def _check(passes: Passes) -> None:

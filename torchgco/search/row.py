@@ -8,6 +8,8 @@ from typing import Any, ClassVar, Self, overload
 
 from torchgco.base.errors import InputError, shown
 
+KINDS = ("free", "moving", "maps", "bodies")  # of problems: without obstacles, where no path can be sought, and others
+
 
 class Row:
     """A row of the table, and each step of one.
@@ -17,6 +19,7 @@ class Row:
 
     Attributes:
         seeks_paths: whether it needs obstacles among which the roadmap can seek a path.
+        kinds: of problems that it may work on.
         last: whether only a last answer is worth it; a planner that solves again soon leaves it out.
         problems: which problems it looks at, in words.
         does: what it does with them, in words.
@@ -24,6 +27,7 @@ class Row:
 
     seeks_paths: ClassVar[bool] = False
     last: ClassVar[bool] = False
+    kinds: Any = KINDS
 
     @property
     def steps(self) -> tuple[Row, ...]:

@@ -50,10 +50,11 @@ class FirstSolve(Row):
 
     @property
     def does(self) -> str:
-        _, _, solve, direct = self.steps
+        after = self.single_contact_after
+        single = "" if after is None else f", or one after {after} outer iterations"
         return (
-            "without obstacles: interior point from the guess, or the start held; where no path can be sought: AL-iLQR "
-            f"to the end; then {solve.does}; {direct.problems}: {direct.does}"
+            "without obstacles: interior point from the guess or the start held; where no path can be sought: AL-iLQR "
+            f"to the end; else until caught (two obstacles at a knot{single}); {Direct().problems}: interior point too"
         )
 
 
@@ -82,6 +83,7 @@ class Paths(Row):
     max_gap: Positive | None = None
 
     seeks_paths: ClassVar[bool] = True
+    kinds: ClassVar[tuple[str, ...]] = ("maps", "bodies")
 
     def __post_init__(self) -> None:
         check_options(self, "paths")
@@ -154,6 +156,8 @@ class Samples(Row):
     """
 
     redraws: Natural = 2
+
+    kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
 
     def __post_init__(self) -> None:
         check_options(self, "samples")

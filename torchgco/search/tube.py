@@ -74,6 +74,10 @@ class Tube(Row):
         check_options(self, "tube")
 
     @property
+    def kinds(self) -> tuple[str, ...]:
+        return (self.among,)
+
+    @property
     def problems(self) -> str:
         return f"{'in maps' if self.among == 'maps' else 'among spheres and boxes'}: caught, not arrived"
 
