@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -53,7 +53,7 @@ Price = Callable[[Array], Array]  # per metre at points (V, d)
 
 def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Tensor]:
     """As `Roadmap.paths`, where there are maps among the obstacles."""
-    return _in_each(scene, count, overlap, lambda *words: paths(*words, count, HOPS + 1))
+    return _in_each(scene, count, overlap, partial(paths, count=count, corners=HOPS + 1))
 
 
 def clear_path_in_maps(scene: Scene, overlap: float) -> tuple[Tensor, Tensor]:

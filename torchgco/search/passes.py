@@ -116,13 +116,31 @@ class FromProposal(Row):
 
 @dataclass(frozen=True)
 class IntoGoal(Row):
-    """An attempt from the best trajectories that end close to the goal, their ends attracted to it."""
+    """An attempt from the best trajectories that end close to the goal, their ends attracted to it.
 
-    problems: ClassVar[str] = "caught, close to the goal, not arrived"  # type: ignore[misc]
+    Args:
+        among: as of `Solve`.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    among: Literal["pathless", "all"] = "all"
+
+    @property
+    def problems(self) -> str:
+        where = ", where no path can be sought" if self.among == "pathless" else ""
+        return f"caught, close to the goal, not arrived{where}"
+
     does: ClassVar[str] = "AL-iLQR with the end attracted to the goal"  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        check_options(self, "into_goal")
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
+        if self.among == "pathless" and search.has_paths:
+            return
         rows, best = search.rows("close"), search.best
         start = take(best.end.best, rows)
         if rows.numel() > 0:

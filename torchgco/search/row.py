@@ -65,14 +65,13 @@ class Passes(tuple[Row, ...]):
     names: tuple[str, ...]
 
     def __new__(cls, rows: Mapping[str, Row] | Iterable[Row] = ()) -> Self:
-        if isinstance(rows, Passes):
-            names: Iterable[str] = rows.names
-        elif isinstance(rows, Mapping):
-            names, rows = rows.keys(), rows.values()
+        if isinstance(rows, Mapping):
+            names, rows = list[str](rows), tuple(rows.values())
         else:
+            known = rows.names if isinstance(rows, Passes) else None
             rows = tuple(rows)
-            names = _named(rows)
-        made = super().__new__(cls, tuple(rows))
+            names = list(known or _named(rows))
+        made = super().__new__(cls, rows)
         made.names = tuple(names)
         return made
 

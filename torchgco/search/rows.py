@@ -146,7 +146,8 @@ class Paths(Row):
 class Samples(Row):
     """Attempts from samples, and one into the goal; then what the interior point found beside the search competes.
 
-    Where there was never a proposal, as among moving obstacles, the solve that was stopped goes on first.
+    Where there was never a proposal, as among moving obstacles, the solve that was stopped goes into the goal, or on,
+    first.
 
     Args:
         redraws: as of `FromSamples`.
@@ -164,7 +165,9 @@ class Samples(Row):
 
     @property
     def steps(self) -> tuple[Row, ...]:
-        return FromSamples("unproposed"), FromSamples(redraws=self.redraws), IntoGoal(), Join()
+        return (
+            IntoGoal("pathless"), FromSamples("unproposed"), FromSamples(redraws=self.redraws), IntoGoal(), Join(),
+        )  # fmt: skip
 
     @property
     def problems(self) -> str:
@@ -172,7 +175,7 @@ class Samples(Row):
 
     @property
     def does(self) -> str:
-        return f"{self.steps[1].does}; the best into the goal; what waits competes"
+        return f"{self.steps[2].does}; the best into the goal; what waits competes"
 
 
 @dataclass(frozen=True)
