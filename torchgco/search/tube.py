@@ -106,6 +106,7 @@ class Tube(Row):
         part = Part(problem.in_cost_units(), rest, search.call.rows[rows], search.record)
         if part.scene is None:
             return
+        search.best.worked[rows] = True
         every = torch.arange(problem.B, device=rows.device)
         paths = part.seek(every, (ROADMAP,), self.num_paths).joined(*ROADMAP.clear_path(part.scene))
         starts, usable = _starts(problem, rest)
@@ -181,7 +182,6 @@ class Tube(Row):
         search.best.keep(rows[found], one)
         lost = (~torch.isfinite(least)).nonzero().flatten()
         search.best.end.iterations[rows[lost]] += made[lost]
-        search.best.worked[rows] = True
 
 
 def _starts(problem: Problem, rest: Tensor) -> tuple[Tensor, Tensor]:
