@@ -13,7 +13,7 @@ import pytest
 import torch
 import yaml
 
-from torchgco.native import kernels
+from torchgco import kernels
 from torchgco.native.compiler import find_compiler
 
 ROOT = Path(__file__).parents[1]
@@ -41,11 +41,11 @@ def _parse_once() -> None:
 
 
 _parse_once()
-# Without a C compiler PyTorch's kernels solve, many times slower: these folders, whose tests are of native kernels or
-# of many solves, are skipped then.
+# Without a C compiler PyTorch's kernels solve, many times slower: these folders and files, whose tests are of native
+# kernels or of many solves, are skipped then.
 COMPILED = (
     "native", "compiled", "search", "missions", "benchmarks", "experiments", "notebooks", "golden", "fuzz", "solvers",
-    "view", "cluster",
+    "view", "cluster", "test_horizons.py",
 )  # fmt: skip
 
 
@@ -54,10 +54,13 @@ def pytest_report_header() -> str | None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    if find_compiler() is None:
-        for item in items:
-            if not set(COMPILED).isdisjoint(item.path.relative_to(ROOT).parts):
-                item.add_marker(pytest.mark.skip(reason="no C compiler"))
+    """Without a compiler: no tests of these folders, and no cases of native kernels (`native=True`) of others."""
+    if find_compiler() is not None:
+        return
+    for item in items:
+        natively = getattr(item, "callspec", None) is not None and item.callspec.params.get("native") is True
+        if natively or not set(COMPILED).isdisjoint(item.path.relative_to(ROOT).parts):
+            item.add_marker(pytest.mark.skip(reason="no C compiler"))
 
 
 @pytest.fixture(params=["native", "eager"])

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from torchgco import (
     AugmentedLagrangian,
     ContactWarning,
@@ -40,6 +41,7 @@ def row_of_discs(B: int = 8, thin: tuple[int, ...] = (1, 3, 4, 5, 6, 7), dt: flo
     )
 
 
+@compiled
 def test_contact_between_knots_comes_with_one_warning_that_names_the_problems() -> None:
     problem = row_of_discs()
     with pytest.warns(ContactWarning) as caught:
@@ -52,6 +54,7 @@ def test_contact_between_knots_comes_with_one_warning_that_names_the_problems() 
     assert (frame.clearance < 0).tolist() == [i in (1, 3, 4, 5, 6, 7) for i in range(8)]
 
 
+@compiled
 def test_no_word_without_contact_or_without_a_claim() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

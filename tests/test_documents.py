@@ -34,9 +34,9 @@ from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.reports import report, view
 from torchgco.judging.certificate import CHORDS
 from torchgco.judging.judge import CLEARANCES
+from torchgco.kernels import EagerWarning
 from torchgco.native import store
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = ROOT / "docs" / "api"

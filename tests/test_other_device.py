@@ -38,10 +38,10 @@ from torchgco import (
 )
 from torchgco.base.shapes import computing_on
 from torchgco.experiments.config.build import compose
+from torchgco.kernels import use_native
 from torchgco.maps import Field, OccupancyGrid
 from torchgco.maps.distance import DistanceField
 from torchgco.missions import RotorPlant
-from torchgco.native.kernels import use_native
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.reach import longest_step
@@ -184,7 +184,7 @@ def test_solutions_are_polished_kept_and_shown(tmp_path: Path) -> None:
 def test_nothing_is_brought_to_the_cpu_within_a_solve() -> None:
     """Numbers that an option holds go to the device; no tensor comes back."""
     moved = on_both(lambda problem, U0: solved(problem, U0)[1], "boxes")
-    assert {place.partition(":")[0] for place in moved} <= {"outside", "solvers/line_search.py", "base/shapes.py"}
+    assert {place.partition(":")[0] for place in moved} <= {"outside", "ilqr/line_search.py", "base/shapes.py"}
 
 
 def test_mixed_devices_are_refused_here() -> None:

@@ -17,9 +17,11 @@ LAYERS = [
     ["maps"],
     ["problem"],
     ["lagrangian", "judging"],
+    ["ilqr"],
     ["eager"],
     ["explaining"],
     ["solution", "native"],
+    ["kernels"],
     ["solvers", "roadmap"],
     ["guidance", "missions", "scenarios"],
     ["search", "plotting"],
@@ -53,14 +55,27 @@ def imports_of(path: Path) -> set[str]:
     for node in nodes_of(path):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("torchgco"):
             names.add(node.module.removeprefix("torchgco").removeprefix("."))
-    return names - {""}
+    return (names | imported_by_name(path)) - {""}
+
+
+def imported_by_name(path: Path) -> set[str]:
+    """Modules of torchgco that a file names in a string, as `import_module` takes them."""
+    texts = (node.value for node in nodes_of(path) if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    named = {text.removeprefix("torchgco.") for text in texts if re.fullmatch(r"torchgco(\.\w+)+", text)}
+    return {name for name in named if module_of(name)}
+
+
+def module_of(name: str) -> bool:
+    """Whether torchgco has a module of this name."""
+    path = PACKAGE.joinpath(*name.split("."))
+    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
 
 
 def modules_of(path: Path) -> set[str]:
     """All modules that a file may import: each imported name may be a module itself."""
     froms = [node for node in nodes_of(path) if isinstance(node, ast.ImportFrom) and node.module]
     named = {f"{node.module}.{alias.name}" for node in froms for alias in node.names} | {node.module for node in froms}
-    return {name.removeprefix("torchgco.") for name in named if name.startswith("torchgco.")}
+    return {name.removeprefix("torchgco.") for name in named if name.startswith("torchgco.")} | imported_by_name(path)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))

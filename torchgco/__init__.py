@@ -4,10 +4,10 @@
     solution = torchgco.solve(problem)
 
 What a solve does, folder by folder: `problem` checks the parts and binds them to a batch; `tracing` records their
-functions, and `native` compiles them. `solvers` holds the local solvers: AL-iLQR (with the `lagrangian`) and an
-interior point. Where obstacles catch a trajectory, `search` runs the table of passes that `presets.gco` lists, along
-paths from the `roadmap` and from samples of the `guidance`, and keeps the best. `judging` measures the result by code
-of its own.
+functions, and `native` compiles them. `kernels` is what solvers compute with: this C, or PyTorch (`ilqr`, `eager`)
+where it can't serve. `solvers` holds the local solvers: AL-iLQR (with the `lagrangian`) and an interior point. Where
+obstacles catch a trajectory, `search` runs the table of passes that `presets.gco` lists, along paths from the
+`roadmap` and from samples of the `guidance`, and keeps the best. `judging` measures the result by code of its own.
 
 `torchgco.compose` needs Hydra and is imported lazily: importing torchgco loads neither Hydra nor matplotlib.
 """
@@ -17,9 +17,11 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from torchgco import kernels as kernels
 from torchgco import presets as presets
 from torchgco.api import compare as compare
 from torchgco.api import plot as plot
+from torchgco.api import show as show
 from torchgco.api import solve as solve
 from torchgco.base.errors import ContactWarning as ContactWarning
 from torchgco.base.errors import GuidanceWarning as GuidanceWarning
@@ -62,7 +64,6 @@ from torchgco.maps import Field as Field
 from torchgco.maps import OccupancyGrid as OccupancyGrid
 from torchgco.maps import PointCloud as PointCloud
 from torchgco.missions.constraints import FirstStepRates as FirstStepRates
-from torchgco.native import kernels as kernels
 from torchgco.obstacles import Boxes as Boxes
 from torchgco.obstacles import Capsules as Capsules
 from torchgco.obstacles import OscillatingBoxes as OscillatingBoxes
@@ -83,6 +84,7 @@ from torchgco.solvers import Polish as Polish
 from torchgco.solvers import plan_batch as plan_batch
 
 if TYPE_CHECKING:
+    from torchgco.base.html import HtmlPage as HtmlPage
     from torchgco.experiments.config.build import compose as compose
 
 # In the order of the API reference.
@@ -95,7 +97,7 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "Status", "presets", "plan_batch",
+    "solve", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets", "plan_batch",
     "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap",
     "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
     # checking the result
@@ -106,6 +108,14 @@ __all__ = [  # noqa: RUF022
 ]  # fmt: skip
 
 __version__ = VERSION
+
+
+def _shown(self: Solution, problem: Problem) -> HtmlPage:
+    """`torchgco.show(problem, self)`."""
+    return show(problem, self)
+
+
+Solution.show = _shown
 
 # On some processors the library behind PyTorch's matrix products (MKL) picks a kernel by a matrix's address in memory,
 # and so by its place in the batch: a problem's bits would depend on the other problems. Read at MKL's first use.

@@ -19,7 +19,7 @@ from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.judging.scale import SHARE, TIGHT, dwarfed
 from torchgco.judging.worst import NONE, kind_of
-from torchgco.native.dispatch import current, engine_of, open_loop
+from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -33,6 +33,8 @@ from torchgco.solvers.watching import Watcher
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+    from torchgco.base.html import HtmlPage
 
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
 NAMED = 5  # problems that the warning names
@@ -134,7 +136,7 @@ def compare(
     made = _named_solvers(problem, solvers)
     frames = []
     for name, solver in made.items():
-        engine_of(problem)
+        kernels_of(problem)
         prepared = solver.prepare(problem)
         began = time.perf_counter()
         found = solve(problem, U0, prepared, seed, max_seconds=max_seconds, verbose=False)
@@ -267,6 +269,17 @@ def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = N
     from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
 
     return solution_figure(problem, solution, b)
+
+
+def show(problem: Problem, solution: Solution) -> HtmlPage:
+    """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
+
+    Raises:
+        InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
+    """
+    from torchgco.view import notebook  # slow to load
+
+    return notebook.show(problem, solution)
 
 
 def _guess(problem: Problem, whole: Problem) -> Tensor:

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -230,14 +229,9 @@ class Solution:
         check_shape(self.U, (problem.B, problem.N, problem.m), "problem: solution.U")
         return pd.DataFrame(worst_rows(problem, self.X, self.U)).rename_axis("element")
 
-    def show(self, problem: Problem) -> HtmlPage:
-        """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
+    if TYPE_CHECKING:  # pages know solutions: `torchgco` adds the method
 
-        Raises:
-            InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
-        """
-        # By name: it is a layer above this one, and slow to load.
-        return import_module("torchgco.view.notebook").show(problem, self)
+        def show(self, problem: Problem) -> HtmlPage: ...
 
     def save(self, path: str | Path) -> None:
         """Write an npz: all of it or, if interrupted, nothing."""

@@ -25,8 +25,8 @@ from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY
 from benchmarks.lib.rasters import rasterised
 from torchgco import Problem
+from torchgco.kernels import open_loop
 from torchgco.maps import DistanceField
-from torchgco.native.dispatch import open_loop
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import bodies
 from torchgco.plotting.style import INK, PALETTE, tidy

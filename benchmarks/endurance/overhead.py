@@ -19,7 +19,7 @@ from benchmarks.lib.timers import Timers
 from torchgco import compose
 from torchgco.experiments import app
 from torchgco.experiments.flying import flight
-from torchgco.native.dispatch import engine_of
+from torchgco.kernels import kernels_of
 from torchgco.solvers.memory import plan_batch
 
 COMMON = ["solver=gco", "device.threads=1"]
@@ -51,7 +51,7 @@ def direct(count: int, shard_size: int) -> None:
     for begin in range(0, count, shard_size):
         part = layouts.take(range(begin, min(count, begin + shard_size)))
         task = setup.vehicle.task(part)
-        engine_of(task.problem)
+        kernels_of(task.problem)
         solver = setup.solver.prepare(task.problem).in_slots(plan_batch(task.problem))
         solution = solver.solve(task.problem, task.U0, seed=setup.seed, ids=torch.as_tensor(part.ids))
         verdict = flight.judge(task.problem, solution.U, task.goal, task.goal_radius)

@@ -17,7 +17,7 @@ from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
 from benchmarks.lib.page import SET_UP, markdown, shown
 from torchgco import InteriorPoint, Solution, solve
-from torchgco.native.kernels import use_native
+from torchgco.kernels import use_native
 
 SAME = 1e-6  # share of the cost
 HEAD = (

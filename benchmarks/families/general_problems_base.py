@@ -19,12 +19,13 @@ class Draws:
     """Numbers for the problems of a batch, always the same under a seed."""
 
     def __init__(self, B: int, seed: int) -> None:
-        self.B, self._generator = B, torch.Generator().manual_seed(seed)
+        self.B, self._generator = B, torch.Generator("cpu").manual_seed(seed)
 
     def shared(self, low: float | Sequence[float], high: float | Sequence[float], *shape: int) -> Tensor:
         """Uniform draws (*shape), the same for all problems; bounds per column as lists."""
         a, b = torch.as_tensor(low, dtype=D), torch.as_tensor(high, dtype=D)
-        return a + (b - a) * torch.rand(*shape, *a.shape, dtype=D, generator=self._generator)
+        share = torch.rand(*shape, *a.shape, dtype=D, generator=self._generator, device="cpu")
+        return a + (b - a) * share.to(a.device)
 
     def __call__(self, low: float | Sequence[float], high: float | Sequence[float], *shape: int) -> Tensor:
         """Uniform draws per problem, (B, *shape), and one more axis where the bounds are lists."""

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchgco import compose
 from torchgco.base.draws import DrawKey
 from torchgco.guidance import GCO, MPPI
+from torchgco.kernels import open_loop
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.native.dispatch import open_loop
 from torchgco.plotting.trajectory import inside
 from torchgco.problem.problem import Problem
 from torchgco.search import PathProposals

@@ -19,7 +19,7 @@ from benchmarks.lib.families import EVERY
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.config.build import Setup
-from torchgco.native.dispatch import engine_of
+from torchgco.kernels import kernels_of
 from torchgco.scenarios import Task
 from torchgco.search import FromProposal, FromSamples, PathProposals, Restarts, Row, Tube
 
@@ -78,7 +78,7 @@ def measure(order: dict[str, Any]) -> dict[str, Any]:
     # A mean of few problems is uncertain: small batches repeat until `fewest_layouts` layouts are flown.
     while flown < max(batch, sizes.fewest_layouts):
         task = _task(setup, flown, batch)
-        engine_of(task.problem)
+        kernels_of(task.problem)
         solution, took = bench.timed(lambda t=task: setup.solver.solve(t.problem, t.U0, seed=setup.seed))
         total, iterations, flown = total + took, iterations + int(solution.iterations.sum()), flown + batch
     peak = _peak_of_memory(bench.device)

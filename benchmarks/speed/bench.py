@@ -14,7 +14,7 @@ from benchmarks.speed.results import MEASURED, Results
 from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.config.build import Setup, compose
 from torchgco.judging.judge import Verdict
-from torchgco.native.dispatch import engine_of
+from torchgco.kernels import kernels_of
 from torchgco.scenarios import Task
 
 T = TypeVar("T")
@@ -57,7 +57,7 @@ class Bench:
 
     def warm(self, setup: Setup, task: Task) -> None:
         """Trace and compile everything that the solver needs for these problems: solve the first two, untimed."""
-        engine_of(task.problem)
+        kernels_of(task.problem)
         rows = torch.arange(min(WARM_UP, task.problem.B), device=task.U0.device)
         setup.solver.solve(task.problem.take(rows), task.U0[rows], seed=setup.seed)
 

@@ -19,8 +19,9 @@ import torch
 
 import torchgco
 from benchmarks.lib import ROOT
-from torchgco import presets
-from torchgco.native.dispatch import engine_of, sampler_of
+from torchgco import MPPI, presets
+from torchgco.base.draws import DrawKey
+from torchgco.kernels import kernels_of
 from torchgco.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -69,10 +70,11 @@ def measure(name: str) -> dict[str, float]:
     from benchmarks.speed.batch import limited
 
     solver = limited(presets.gco(problem))
-    engine = _took(lambda: engine_of(problem))
+    engine = _took(lambda: kernels_of(problem))
     first, again = (_took(lambda: solver.solve(problem, _controls(problem))) for _ in range(2))
     rest = [max(0.0, a - b) for a, b in zip(first, again, strict=True)]
-    sampler = _took(lambda: sampler_of(problem, torch.float32))
+    key = DrawKey(0, torch.arange(problem.B), torch.arange(problem.B))
+    sampler = _took(lambda: MPPI(samples=1, dtype="float32").improve(problem, _controls(problem), key))
     return {
         "kernels": engine[0],
         "more by the first solve": rest[0],

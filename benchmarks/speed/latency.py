@@ -11,8 +11,8 @@ from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import CasADiPeer
 from torchgco.experiments.config.build import Setup
 from torchgco.judging.judge import Verdict, judge
+from torchgco.kernels import kernels_of
 from torchgco.lagrangian.lagrangian import Multipliers, shifted
-from torchgco.native.dispatch import engine_of
 from torchgco.scenarios import Task
 from torchgco.solution import Solution
 
@@ -63,7 +63,7 @@ def _fly(bench: Bench, setup: Setup, task: Task, start: str, warm: Multipliers |
     """Fly FATROP, `gco`, FATROP, so that a drift of the machine's speed cancels in the ratio."""
     peer = CasADiPeer.ready(bench, "fatrop", task)
     peer.fly(bench)
-    setup_time = bench.timed(lambda: engine_of(task.problem))[1]
+    setup_time = bench.timed(lambda: kernels_of(task.problem))[1]
     solution, took = bench.timed(lambda: setup.solver.solve(task.problem, task.U0, seed=setup.seed, warm=warm))
     peer.fly(bench)
     assert peer.verdict is not None

@@ -15,7 +15,7 @@ from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from torchgco.base.draws import DrawKey
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.guidance.mppi import COLLISION_PENALTY
-from torchgco.native.dispatch import open_loop
+from torchgco.kernels import open_loop
 from torchgco.scenarios import Task
 
 SECTION = "mppi"

@@ -25,6 +25,9 @@ WORDS = {
     "time of a period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep their\n"
     "multipliers; `compile` solves to 1e-8. Disturbed cars meet discs that are put into their way; `solved` of\n"
     "several cars in one call counts periods in which all are.",
+    "learned": "Models of a user's own, in a new process: the first solve by `gco` with an empty cache, and with one\n"
+    "where another model has been solved; networks (tanh) by the interior point, its library's time per iteration;\n"
+    "training steps, each a solve, a gradient of the model's error and a step; code that isn't traced.",
     "own_model": "A user's unicycle (4 states, 2 controls, a Python function, RK4), 100 stages, five discs,\n"
     "`torchgco.solve` without options.",
     "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles;\n"

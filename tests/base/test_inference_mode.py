@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from tests.slow import mostly
 from torchgco import Cost, FunctionConstraint, FunctionDynamics, Hold, Polish, Problem, certify, judge
@@ -68,6 +69,7 @@ def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
     ]
 
 
+@compiled
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # 0.1 s between knots is long
 @pytest.mark.parametrize("name", mostly(MAKERS, "planar"))
 def test_every_mode_gives_the_same_bits(name: str) -> None:

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost
+from tests.engines import compiled, engine_of
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost, kernels
 from torchgco.base.values import NONE
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of, measured
+from torchgco.kernels import EagerWarning, measured
 
 D = torch.float64
 B, N = 3, 20
@@ -92,6 +92,7 @@ def test_functions_of_the_knot_leave_pytorchs_precision_as_it_was() -> None:
     assert torch.get_default_dtype() is torch.float32
 
 
+@compiled
 def test_new_values_need_no_new_kernel() -> None:
     first = problem()
     torchgco.solve(first)

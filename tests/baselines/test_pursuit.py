@@ -32,7 +32,7 @@ from torchgco.baselines.pursuit import evenly, smoothed
 from torchgco.dynamics import Dynamics
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import compose
-from torchgco.native.dispatch import chord_clearance
+from torchgco.kernels import chord_clearance
 from torchgco.scenarios import Floors
 from torchgco.solvers.interior import InteriorPoint
 

@@ -149,7 +149,8 @@ def test_the_samples_shown_are_those_that_the_solver_averaged() -> None:
     V = call.controls(sampler.samples)
     X = problem.x0.expand(sampler.samples, -1)
     S, spheres = torch.zeros(sampler.samples, dtype=X.dtype), problem.geometric[0]
-    noise = call.sampler._noise(problem, call.key, sampler._sigma(problem).sqrt(), 0, range(sampler.samples)).eps
+    how = sampler.sampling(problem, call.key)
+    noise = how.noise(problem, call.key, how.sigma.sqrt(), 0, range(sampler.samples)).eps
     states = [X]
     for k in range(problem.N):
         S = S + problem.cost.stage(X, V[:, k], k) + (call.U[:, k] / 100.0 * noise[k, 0]).sum(-1)

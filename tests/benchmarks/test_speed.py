@@ -18,6 +18,7 @@ from benchmarks.speed import (
     first_use,
     growth,
     latency,
+    learned,
     loop,
     mppi,
     own_model,
@@ -38,7 +39,7 @@ from torchgco.native import engine as native_engine
 TINY = Sizes(
     families=("forest30",), family_batch=2, large_batch=None, layouts=1, ipopt_layouts=1, ipopt_families=("forest30",),
     latency_layouts=1, loop_periods=9, loop_disturbed=7, loop_fleets=(2,), loop_compiled=False,
-    own_layouts=1, paper_layouts=1, models=1,
+    own_layouts=1, own_models=1, training_steps=2, paper_layouts=1, models=1,
     whole_batches=(), limited_batches=(2,), fewest_layouts=2,
     world_batch=0, cores_batch=2, growth_batch=2, peers_layouts=1, stages=(6,), obstacles=(30,),
     samples=(16,), mppi_repeats=1,
@@ -67,7 +68,7 @@ def tiny(folder: Path) -> Bench:
     return Bench(TINY, Results(folder / "results.csv"), provenance("cpu"), say=lambda text: None)
 
 
-SLOW = batch, cores, families, first_use, growth, mppi, paper, scaling, share
+SLOW = batch, cores, families, first_use, growth, learned, mppi, paper, scaling, share
 
 
 def numbers(bench: Bench, quantity: str) -> list[float]:
@@ -77,7 +78,10 @@ def numbers(bench: Bench, quantity: str) -> list[float]:
 @pytest.mark.parametrize(
     "section",
     [
-        latency, loop, own_model, targets,
+        latency,
+        loop,
+        own_model,
+        targets,
         *(pytest.param(section, marks=pytest.mark.slow) for section in SLOW),
     ],
 )

@@ -18,6 +18,7 @@ import torchgco
 from torchgco import (
     Boxes,
     ControlBounds,
+    Dynamics,
     FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
@@ -30,9 +31,9 @@ from torchgco import (
     StateBounds,
     Status,
 )
+from torchgco.kernels import use_native
 from torchgco.native import kept
 from torchgco.native.compiler import find_compiler
-from torchgco.native.kernels import use_native
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
@@ -294,6 +295,43 @@ def test_what_a_function_captures_is_read_at_each_call() -> None:
     assert "compile it again" in str(mpc.stale())
     gain[0], wind = 1.0, torch.tensor([0.3, 0.1], dtype=D)
     assert "compile it again" in str(mpc.stale())
+
+
+def test_what_python_reads_of_captured_tensors_is_read_again_too() -> None:
+    """And tensors whose numbers lie apart in memory."""
+    table, sharp, side = torch.rand(4, 3, dtype=D), torch.tensor(1.5, dtype=D), torch.tensor([0.3], dtype=D)
+    drag = table[:, 1]
+    field = lambda x, u: torch.stack((x[..., 1], u[..., 0] - drag.sum() * x[..., 1]), -1)
+    cost = FunctionCost(lambda x, u: torch.nn.functional.softplus(x[..., 0], beta=sharp) + u.square().sum(-1))
+    rows = FunctionConstraint(lambda x: x[..., :1] - 2.0 if side < 1.0 else 1.5 - x[..., :1], knots=slice(10, None))
+    problem = Problem(FunctionDynamics(field, 2, 1, DT), cost, [rows], torch.ones(1, 2, dtype=D), N)
+    mpc = torchgco.compile(problem, "interior_point", tolerance=1e-10)
+    before = mpc()
+    for change in (lambda: table.mul_(2.0), lambda: sharp.mul_(0.3), lambda: side.add_(1.0)):
+        change()
+        answer, fresh = mpc(warm=False), torchgco.solve(problem, solver=replace(InteriorPoint(), tolerance=1e-10))
+        assert answer.statuses == [Status.CONVERGED] and mpc.stale() is None
+        torch.testing.assert_close(answer.X, fresh.X, rtol=1e-6, atol=1e-7)
+        assert float((answer.X - before.X).abs().max()) > 1e-4
+        before = answer
+
+
+def test_what_python_reads_of_a_problems_own_numbers_is_no_code() -> None:
+    class Cart(Dynamics):
+        n, m, dt = 2, 1, DT
+        per_element = ("mass",)
+
+        def __init__(self, mass: float) -> None:
+            self.mass = torch.tensor([mass], dtype=D)
+
+        def field(self, x: Tensor, u: Tensor) -> Tensor:
+            return torch.cat((x[..., 1:], u / float(self.mass)), dim=-1)
+
+    make = lambda mass: Problem(Cart(mass), QuadraticCost([1.0] * 2, [1.0], [9.0] * 2), [], [[1.0, 0.0]], N)
+    mpc = torchgco.compile(make(1.5), "interior_point")
+    answers = mpc(), mpc(mass=0.5)
+    for answer, mass in zip(answers, (1.5, 0.5), strict=True):
+        torch.testing.assert_close(answer.X, torchgco.solve(make(mass), solver="interior_point").X)
 
 
 def test_one_thread_at_a_time_and_processes_compile_their_own() -> None:

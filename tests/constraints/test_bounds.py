@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, inf
 
 import torchgco
+from tests.engines import compiled
 from tests.native.users import N, with_bounds_by_knot
 from torchgco import (
     ILQR,
@@ -22,12 +23,12 @@ from torchgco import (
     Problem,
     StateBounds,
     Status,
+    kernels,
 )
 from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, current
+from torchgco.kernels import EagerWarning, current
 
 D = torch.float64
 STEPS = 20
@@ -47,6 +48,7 @@ def fading(B: int = 2) -> Tensor:
     return each * torch.linspace(1.0, 1.5, B, dtype=D).view(B, 1, 1)
 
 
+@compiled
 def test_controls_follow_their_bounds_natively() -> None:
     problem = point(ControlBounds(-1.0, fading()), goal=50.0)
     with warnings.catch_warnings():

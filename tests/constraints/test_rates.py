@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, inf
 
 import torchgco
+from tests.engines import compiled, engine_of
 from tests.native.test_engine import DAMPED, eager, natively, running_state
 from tests.native.users import Each, GaussNewton, Smooth, Tube, user_problem
 from torchgco import (
@@ -29,13 +30,13 @@ from torchgco import (
     Spheres,
     StateBounds,
     Status,
+    kernels,
 )
 from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of
+from torchgco.kernels import EagerWarning
 from torchgco.problem.rates import with_controls_before
 
 D = torch.float64
@@ -56,6 +57,7 @@ def changes(U: Tensor, previous: Tensor | None = None) -> Tensor:
     return (U if previous is None else torch.cat((previous.unsqueeze(1), U), 1)).diff(dim=1)
 
 
+@compiled
 @pytest.mark.parametrize("previous", [None, [0.5, -0.25]])
 def test_controls_change_no_faster_natively_and_as_ipopt_finds(previous: list[float] | None) -> None:
     """IPOPT gets the rows of two knots as they are, and FATROP the further states."""
@@ -152,6 +154,7 @@ def wide() -> dict[str, Problem]:
     }
 
 
+@compiled
 @pytest.mark.parametrize("name", ["quadratic", "diagonal", "per problem", "own expansion"])
 def test_native_iterations_are_pytorchs(name: str) -> None:
     problem = wide()[name]
@@ -234,6 +237,7 @@ def test_obstacles_are_searched_as_without_rates() -> None:
     assert int(judge(problem, slow.U).reached.sum()) >= 3
 
 
+@compiled
 def test_new_limits_and_new_controls_before_need_no_new_kernel() -> None:
     problem = carts(RateBounds(-0.3, 0.3, previous=[0.0, 0.0]))
     moved = problem.started_at(problem.x0 + 0.1, [RateBounds(-0.2, 0.4, previous=[1.0, 0.5])])

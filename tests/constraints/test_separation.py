@@ -28,7 +28,7 @@ from torchgco import (
 )
 from torchgco.baselines import CasADiSolver
 from torchgco.dynamics.rollout import open_loop
-from torchgco.native.dispatch import EagerWarning, chord_clearance
+from torchgco.kernels import EagerWarning, chord_clearance
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # unless a test asks for it
 

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled, engine_of
 from tests.native.users import N, with_stages
-from torchgco import ILQR, AugmentedLagrangian, FunctionCost, FunctionDynamics, InputError, Problem, Status
+from torchgco import ILQR, AugmentedLagrangian, FunctionCost, FunctionDynamics, InputError, Problem, Status, kernels
 from torchgco.baselines import CasADiSolver
 from torchgco.dynamics import rollout
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of, open_loop
+from torchgco.kernels import EagerWarning, open_loop
 
 D = torch.float64
 BRIEF = AugmentedLagrangian(inner=ILQR(max_iterations=2), max_outer_iterations=2)
@@ -43,6 +43,7 @@ def some_controls(problem: Problem) -> Tensor:
     return torch.randn(problem.B, problem.N, problem.m, dtype=D, generator=generator)
 
 
+@compiled
 def test_rollouts_and_derivatives_are_those_of_a_loop() -> None:
     problem = with_stages()
     U = some_controls(problem)
@@ -69,6 +70,7 @@ def test_rollouts_and_derivatives_are_those_of_a_loop() -> None:
     assert not torch.equal(fx[:, 0], fx[:, 5])
 
 
+@compiled
 def test_a_solve_is_native_and_agrees_with_the_judge_and_with_ipopt() -> None:
     problem = with_stages()
     with warnings.catch_warnings():
@@ -94,6 +96,7 @@ def test_the_rest_of_the_batch_changes_nothing(native: bool) -> None:
         kernels.use_native(True)
 
 
+@compiled
 def test_new_numbers_of_stages_need_no_new_kernel() -> None:
     first = with_stages()
     values = first.dynamics.values

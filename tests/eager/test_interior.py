@@ -15,6 +15,7 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.families.general_problems import FAMILIES
+from tests.engines import compiled
 from torchgco import (
     Constraint,
     ControlBounds,
@@ -32,12 +33,9 @@ from torchgco import (
 )
 from torchgco.base.shapes import Dimensions
 from torchgco.eager.curvature import by_forward, by_reverse, expansion_of, flat
-from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning
-from torchgco.native.kernels import use_native
+from torchgco.kernels import EagerWarning, use_native
 
 D = torch.float64
-compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 
 @contextmanager

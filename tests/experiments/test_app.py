@@ -15,12 +15,12 @@ from tqdm import tqdm
 
 import torchgco
 from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem_line
+from torchgco import kernels
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.config.groups import options_of
 from torchgco.experiments.flying import progress, study
 from torchgco.experiments.results.identity import decisive, plain
 from torchgco.experiments.results.records import COLUMNS
-from torchgco.native import kernels
 from torchgco.scenarios import Layouts
 from torchgco.solvers.augmented_lagrangian import OuterLoop
 

@@ -79,7 +79,7 @@ WRONG = {
 }  # fmt: skip
 
 
-NAMES = ["a b", "a[1]", "[a]", "a(1)", "{a}", "a'b", "a\"b", "a=b", "grün", "a#&;b", "12", "a\\", "\\'a", "null.d"]
+NAMES = ["a b", "a[1]", "[a]", "a(1)", "{a}", "a'b", 'a"b', "a=b", "grün", "a#&;b", "12", "a\\", "\\'a", "null.d"]
 
 
 @pytest.mark.parametrize("name", NAMES)

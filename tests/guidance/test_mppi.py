@@ -14,7 +14,7 @@ from tests.reference.mppi import MppiSettings, mppi
 from torchgco import GCO, MPPI, InputError
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.dynamics.rollout import open_loop
-from torchgco.guidance.mppi import Flight, Noise, draw, fly
+from torchgco.eager.sampling import Flight, Noise, draw, fly
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.solvers.caught import active_counts, caught_knots
 
@@ -121,9 +121,8 @@ def test_a_single_sphere_counts_after_some_iterations() -> None:
 
 def test_smooth_noise_is_linear_between_its_knots_and_shrinks() -> None:
     problem, U = planar_batch(B=2, N=21)
-    noise = MPPI(samples=4, noise_knots=5)._noise(
-        problem, key(2), torch.ones(1, 1, 2, dtype=torch.float64), 0, range(4)
-    )
+    how = MPPI(samples=4, noise_knots=5).sampling(problem, key(2))
+    noise = how.noise(problem, key(2), torch.ones(1, 1, 2, dtype=torch.float64), 0, range(4))
     V = draw(torch.zeros(21, 2, 1, 2, dtype=torch.float64), noise, None)
     torch.testing.assert_close(V[::5], noise.z)
     torch.testing.assert_close(V[2], 0.6 * noise.z[0] + 0.4 * noise.z[1])
@@ -135,15 +134,18 @@ def test_smooth_noise_is_linear_between_its_knots_and_shrinks() -> None:
 def test_elite_temperature_is_the_gap_to_the_better_samples() -> None:
     S = torch.tensor([[3.0, 1.0, 2.0, 9.0]], dtype=torch.float64)
     expected = torch.softmax(-torch.tensor([[2.0, 0.0, 1.0, 8.0]]) / 2.0, dim=1).double()
-    torch.testing.assert_close(MPPI(samples=4, elite=3)._weights(S), expected)
-    torch.testing.assert_close(MPPI(samples=4)._weights(S), torch.softmax(-S, dim=1))
+    problem = planar_batch(B=1, N=6)[0]
+    elite, plain = (MPPI(samples=4, elite=count).sampling(problem, key(1)) for count in (3, 0))
+    torch.testing.assert_close(elite.weights(S), expected)
+    torch.testing.assert_close(plain.weights(S), torch.softmax(-S, dim=1))
 
 
 def test_dwelling_charges_where_a_sample_ends() -> None:
     problem, U = planar_batch(B=1, N=6)
     flight = flown(problem, U.unsqueeze(1) + torch.tensor([0.0, 4.0]).view(1, 2, 1, 1))
     V = flight.V
-    plain, longer = MPPI(samples=2).scores(problem, flight), MPPI(samples=2, dwell_cost=2.0).scores(problem, flight)
+    sampling = [MPPI(samples=2, dwell_cost=dwell).sampling(problem, key(1)) for dwell in (0.0, 2.0)]
+    plain, longer = (how.scores(problem, flight) for how in sampling)
     for s in range(2):
         controls = V[:, :, s].transpose(0, 1)
         X = open_loop(problem.dynamics, problem.x0, controls)
@@ -166,7 +168,7 @@ def test_many_samples_are_flown_in_blocks(knots: int, native: bool, monkeypatch)
     problem, U = planar_batch(B=3, N=12)
     sampler = MPPI(samples=23, noise_knots=knots, rounds=2, covariance=4.0)
     whole = sampler.improve(problem, U, key(3))[1]
-    monkeypatch.setattr("torchgco.guidance.mppi.CHUNK", 10)
+    monkeypatch.setattr("torchgco.eager.sampling.CHUNK", 10)
     torch.testing.assert_close(sampler.improve(problem, U, key(3))[1], whole, rtol=1e-12, atol=1e-12)
 
 
@@ -214,7 +216,7 @@ def test_a_diverging_sample_is_not_chosen() -> None:
     problem, U = planar_batch(B=1, N=5)
     V = U.unsqueeze(1).repeat(1, 3, 1, 1)
     V[0, 1] = torch.inf
-    S = MPPI(samples=3).scores(problem, flown(problem, V))
+    S = MPPI(samples=3).sampling(problem, key(1)).scores(problem, flown(problem, V))
     assert torch.isfinite(S).all() and S[0, 1] > 1e300
 
 

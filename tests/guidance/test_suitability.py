@@ -30,11 +30,11 @@ from torchgco import (
     Solution,
     Spheres,
     Status,
+    kernels,
     presets,
 )
 from torchgco.guidance.gco import REACH, _radius
 from torchgco.guidance.suitability import TRIAL_SAMPLES, suited_sampler
-from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 from torchgco.search import Follow, PathProposals
 

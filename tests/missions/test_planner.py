@@ -11,14 +11,23 @@ from torch import Tensor
 
 from tests.missions.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
 from tests.reference import models
-from torchgco import Airframe, ControlBounds, FirstStepRates, InputError, Planar, Problem, QuadraticCost, Restarts
+from torchgco import (
+    Airframe,
+    ControlBounds,
+    FirstStepRates,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Restarts,
+    kernels,
+)
 from torchgco.dynamics.rollout import open_loop
+from torchgco.kernels import followed
 from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import Margin
 from torchgco.missions.plant import RotorPlant, hovering
-from torchgco.native import kernels
-from torchgco.native.dispatch import followed
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.search import Solve, Tighten
 from torchgco.solution import Solution

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.engines import engine_of
 from tests.missions.missions import DOUBLE
 from tests.problems import assert_same_bits, planar_batch, quadrotor_batch
 from torchgco import (
@@ -19,13 +20,13 @@ from torchgco import (
     QuadrotorPlanning,
     Spheres,
     StateBounds,
+    kernels,
 )
 from torchgco.constraints import Constraint, ControlBounds
 from torchgco.dynamics.rollout import open_loop as eager_rollout
+from torchgco.kernels import cost_unit, open_loop
 from torchgco.missions.planning_problem import BiasedPlanning
-from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import cost_unit, engine_of, open_loop
 
 SOLVER = AugmentedLagrangian(ILQR(max_iterations=6), initial_penalty=0.1, max_outer_iterations=4)
 INF = torch.inf

@@ -224,9 +224,12 @@ def attribute_of_a_class() -> Case:
 
 
 @is_code
-def property_of_an_object() -> Case:
-    memory = Memory()
-    return lambda v: memory.hidden * v, lambda: setattr(memory, "value", MUCH)
+def property_replaced() -> Case:
+    class Own(Memory):
+        hidden = property(lambda self: LITTLE)
+
+    memory = Own()
+    return lambda v: memory.hidden * v, lambda: setattr(Own, "hidden", property(lambda self: MUCH))
 
 
 @is_code
@@ -310,6 +313,17 @@ def tensor_read_by_numpy() -> Case:
 def length_of_a_choice() -> Case:
     drag = torch.tensor([LITTLE, -1.0], dtype=D)
     return lambda v: len(drag[drag > 0.0]) * v, lambda: drag.fill_(MUCH)
+
+
+@is_code
+def place_of_a_cut() -> Case:
+    place = torch.tensor([1])
+
+    def drag(v: Tensor) -> Tensor:
+        first, second = torch.tensor_split(v, place, dim=-1)
+        return torch.cat((LITTLE * first, second), dim=-1)
+
+    return drag, lambda: place.fill_(0)
 
 
 @is_code

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import torch
 
+from tests.engines import engine_of
 from tests.native import users
 from tests.native.test_engine import BRIEF, PRINTED, running_state
 from tests.problems import boxed_batch, planar_batch
 from torchgco import MPPI, Problem
 from torchgco.base.draws import DrawKey
-from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of
+from torchgco.kernels import EagerWarning, cost_unit, kernels_of
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 from torchgco.solvers.ending import optimality
-from torchgco.solvers.ilqr import advance
-from torchgco.solvers.lifted import native_lifted_search
 
 SAMPLER = MPPI(samples=19, covariance=0.5, rounds=2, noise_knots=3, elite=4, dwell_cost=0.5)
 
@@ -25,8 +24,8 @@ def call_all(problem: Problem) -> None:
     for inner, guided in ((BRIEF, None), (PRINTED, "region"), (BRIEF, "path")):
         state, lagrangian = running_state(problem, guided)
         optimality(lagrangian, state.X, state.U)
-        native_lifted_search(lagrangian, state.X, state.U, torch.full_like(state.merit, 1e9))
-        advance(inner, state, lagrangian, 4)
+        kernels_of(problem).lifted(lagrangian, state.X, state.U, torch.full_like(state.merit, 1e9))
+        kernels_of(problem).descend(lagrangian, state, inner.descent, 4)
     key = DrawKey(7, torch.arange(B), torch.arange(B))
     SAMPLER.improve(problem, state.U, key)
     cost_unit(problem)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from tests.engines import engine_of
 from tests.problems import boxed_batch, planar_batch, random_trajectory
 from torchgco import Boxes, Capsules, ControlBounds, Goal, Problem, judge
 from torchgco.baselines.casadi import CasADiSolver
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import engine_of
 from torchgco.obstacles.boxes import BoundBoxes
 
 

@@ -9,14 +9,16 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import engine_of
 from tests.native import changes_of_code
 from tests.native.changes import INPUTS, D, Drag, number
 from tests.native.changes_of_code import CODE
 from torchgco import FunctionDynamics, Problem, QuadraticCost
 from torchgco.dynamics.rollout import open_loop as by_pytorch
-from torchgco.native import compiler, dispatch
+from torchgco.kernels import choice, current
+from torchgco.native import compiler
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import current, engine_of
+from torchgco.tracing import Watch
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 N = 4
@@ -38,7 +40,7 @@ def after(problem: Problem) -> tuple[Tensor, bool]:
     engine = engine_of(fresh)
     assert engine is not None
     found = engine.open_loop(fresh, U)
-    return found, any(engine.captured is kept.captured for kept, _ in dispatch._engines.values())
+    return found, any(engine.captured is kept.captured for kept, _ in choice._engines.values())
 
 
 def made(drag: Drag) -> Problem:
@@ -85,7 +87,7 @@ def test_training_calls_no_compiler_and_keeps_nothing(solver: str, monkeypatch: 
     compiled = torchgco.compile(problem, solver, tolerance=1e-10)
     found = [torchgco.solve(problem, solver=solver).X]
     compiled()
-    kept = len(compiler._loaded), len(dispatch._engines)
+    kept = len(compiler._loaded), len(choice._engines)
     monkeypatch.setattr(compiler, "_start", lambda *args: pytest.fail("a compiler was called"))
     for _ in range(4):
         steps.zero_grad()
@@ -97,13 +99,54 @@ def test_training_calls_no_compiler_and_keeps_nothing(solver: str, monkeypatch: 
         torch.testing.assert_close(solution.X, model, rtol=1e-11, atol=1e-11)
         torch.testing.assert_close(answer.X, solution.X, rtol=1e-6, atol=1e-7)
         assert float((found[-1] - found[-2]).abs().max()) > 1e-5
-    assert (len(compiler._loaded), len(dispatch._engines)) == kept
+    assert (len(compiler._loaded), len(choice._engines)) == kept
 
 
 @pytest.mark.parametrize("name", ["tensor_in_place", "weight", "array_in_place", "cell", "attribute", "training_flag"])
 def test_what_stays_isnt_traced_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = made((INPUTS | CODE)[name]()[0])
     after(problem)
-    monkeypatch.setattr(dispatch, "Engine", lambda *args: pytest.fail("traced again"))
+    monkeypatch.setattr(choice, "Engine", lambda *args: pytest.fail("traced again"))
     assert after(problem)[1]
     assert after(problem.started_at(X0 + 1.0, ()))[1]
+
+
+def test_what_is_kept_holds_no_numbers_of_problems() -> None:
+    """Nor does it serve others with them."""
+    B = 1000
+
+    def given(drag: float) -> Problem:
+        field = lambda x, u, by: torch.cat((x[..., 2:], u - by * x[..., 2:]), dim=-1)
+        values = {"by": torch.full((B, 2), drag, dtype=D)}
+        return Problem(FunctionDynamics(field, 4, 2, 0.1, values=values), COST, [], X0.repeat(B, 1), N)
+
+    for drag in (0.2, 2.0):
+        problem = given(drag)
+        engine = engine_of(current(problem))
+        assert engine is not None and engine.captured is [*choice._engines.values()][-1][0].captured
+        found = engine.open_loop(problem, U.repeat(B, 1, 1))
+        expected = by_pytorch(problem.dynamics, problem.x0, U.repeat(B, 1, 1)).detach()
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+        held = [tensor for traced in engine.captured.traces for tensor in traced._captured.values()]
+        assert max(tensor.untyped_storage().nbytes() for tensor in held) < 100
+
+
+def test_large_tensors_leave_room_for_fewer_engines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "_engines", {})
+    monkeypatch.setattr(choice, "CAPTURED", 1000)
+    for _ in range(4):
+        drag = torch.rand(2, 50, dtype=D)  # 800 bytes
+        assert after(made(lambda v, drag=drag: v * drag.mean(-1)))[1]
+    assert len(choice._engines) == 1
+
+
+@pytest.mark.parametrize("layout", ["strided", "sparse"])
+def test_changes_of_tensors_of_any_layout_are_seen(layout: str) -> None:
+    numbers = torch.arange(1.0, 7.0, dtype=D).reshape(3, 2)
+    tensor = numbers[:, 1] if layout == "strided" else numbers.to_sparse()
+    watch = Watch([tensor])
+    before = watch.look()
+    assert watch.look() == before
+    (numbers[2:] if layout == "strided" else tensor).mul_(2.0)
+    assert before is None or watch.look() != before
+    assert (before is None) == (layout == "sparse")

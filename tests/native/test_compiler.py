@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.engines import engine_of
 from tests.problems import planar_batch
-from torchgco import presets
-from torchgco.native import compiler, kernels, store
+from torchgco import kernels, presets
+from torchgco.native import compiler, store
 from torchgco.native.compiler import NativeError, Unit, build, find_compiler
-from torchgco.native.dispatch import engine_of
 
 pytestmark = pytest.mark.usefixtures("cache")
 

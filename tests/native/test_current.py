@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import engine_of
 from torchgco import (
     Boxes,
     ControlBounds,
@@ -29,8 +30,8 @@ from torchgco import (
     judge,
 )
 from torchgco.base.shapes import lead
+from torchgco.kernels import EagerWarning
 from torchgco.native import engine
-from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.native.identity import signature
 
 D = torch.float64
@@ -385,11 +386,11 @@ def test_a_module_with_trainable_parameters_is_a_model(native: bool) -> None:
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(6, 8), torch.nn.Tanh(), torch.nn.Linear(8, 4)).double()
     problem = boat(lambda x, u: field(x, u) + 0.1 * network(torch.cat((x, u), dim=-1)))
-    torchgco.native.kernels.use_native(native)
+    torchgco.kernels.use_native(native)
     try:
         solution = torchgco.solve(problem, solver=torchgco.presets.al_ilqr(problem))
     finally:
-        torchgco.native.kernels.use_native(True)
+        torchgco.kernels.use_native(True)
     assert not solution.X.requires_grad and not solution.cost.requires_grad
     assert float(certify(problem, solution.X, solution.U).dynamics_residual.max()) < 1e-9
     assert bool(torch.isfinite(judge(problem, solution.U, [4.0, 1.0], 0.5).cost).all())

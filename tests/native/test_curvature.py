@@ -30,3 +30,13 @@ def test_a_branch_that_is_not_taken_spoils_nothing(name: str) -> None:
     assert _has_hidden_pole(ca.Function("total", [x, y], [total])) is hidden
     hessian = ca.Function("hessian", [x, y], [_hessian(total, ca.vertcat(x, y), [x, y])])
     np.testing.assert_allclose(np.array(hessian(-1.0, 2.0)), expected, atol=1e-12)
+
+
+def test_what_a_network_makes_may_be_a_pole() -> None:
+    x, y, made = ca.SX.sym("x"), ca.SX.sym("y"), ca.SX.sym("made")
+    total = ca.if_else(x > 0, made**3, x * y)
+    inputs = [x, y, made]
+    assert _has_hidden_pole(ca.Function("total", inputs, [total]), {2})
+    assert not _has_hidden_pole(ca.Function("total", inputs, [made + total]), {2})
+    hessian = ca.Function("hessian", inputs, [_hessian(total, ca.vertcat(x, y), inputs, {made.element_hash()})])
+    np.testing.assert_allclose(np.array(hessian(-1.0, 2.0, np.nan)), [[0, 1], [1, 0]])

@@ -12,25 +12,27 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.engines import engine_of
 from tests.native.test_engine import running_state
 from tests.problems import boxed_batch, planar_batch
-from torchgco import ILQR, MPPI, LineSearch, Problem
+from torchgco import ILQR, MPPI, LineSearch, Problem, kernels
 from torchgco.base.draws import DrawKey
 from torchgco.base.status import Status
 from torchgco.guidance import mppi
-from torchgco.native import kernels, structures
+from torchgco.ilqr import descent, lifted
+from torchgco.ilqr.lifted import lifted_search
+from torchgco.ilqr.step import iterate
+from torchgco.kernels import kernels_of
+from torchgco.kernels.in_c import native_options
+from torchgco.lagrangian.state import State
+from torchgco.native import structures
 from torchgco.native.codegen.source import INTERIOR, LANES, SAMPLER, SOLVER, C
 from torchgco.native.compiler import NativeError, build, find_compiler
 from torchgco.native.declarations import Structure, defines, fields, head, load
-from torchgco.native.dispatch import engine_of
 from torchgco.native.structures import CONSTANTS, STRUCTURES, End, Options
 from torchgco.roadmap import native as roadmap
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
-from torchgco.solvers import ilqr, lifted
-from torchgco.solvers.ilqr import advance
-from torchgco.solvers.lifted import lifted_search, native_lifted_search
-from torchgco.solvers.state import State
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
@@ -146,9 +148,13 @@ def run(inner: ILQR, prepare: Callable[[State], None], problem: Problem, native:
     state, lagrangian = running_state(problem)
     prepare(state)
     for _ in range(count):
-        end = advance(inner, state, lagrangian, 1) if native else inner.one_iteration(state, lagrangian)
+        end = (
+            kernels_of(lagrangian.problem).descend(lagrangian, state, inner.descent, 1)
+            if native
+            else iterate(inner.descent, state, lagrangian)
+        )
         while not native and bool((end.failed & (end.status == Status.RUNNING)).all()):
-            end = inner.one_iteration(state, lagrangian)
+            end = iterate(inner.descent, state, lagrangian)
     return state
 
 
@@ -190,7 +196,7 @@ OF_LINE_SEARCH = {
 def test_a_constant_of_ilqr_changes_both_kernels(name: str, monkeypatch) -> None:
     value, inner, prepare, problem, count = OF_ILQR[name]
     usual = run(inner, prepare, problem(), True, count)
-    monkeypatch.setattr(ilqr, name, value)
+    monkeypatch.setattr(descent, name, value)
     mine, theirs = (run(inner, prepare, problem(), native, count) for native in (True, False))
     assert not same(mine, usual) and same(mine, theirs)
 
@@ -214,8 +220,7 @@ def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
     """With LOST = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
     problem = planar().take(torch.arange(B))
     usual = run(CHOOSY, unchanged, problem, True, 1)
-    for module in (ilqr, lifted):
-        monkeypatch.setattr(module, "LOST", 0.0)
+    monkeypatch.setattr(lifted, "LOST", 0.0)
     mine, theirs = (run(CHOOSY, unchanged, problem, native, 1) for native in (True, False))
     assert not same(mine, usual) and same(mine, theirs)
 
@@ -223,7 +228,7 @@ def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
 @pytest.mark.parametrize(("name", "value"), [("LIFTED_STEPS", 1), ("GAIN", 0.9999)])
 def test_a_constant_of_the_lifted_search_changes_both_kernels(name: str, value: float, monkeypatch) -> None:
     state, lagrangian = running_state(planar())
-    searches = (native_lifted_search, lifted_search)
+    searches = (kernels_of(lagrangian.problem).lifted, lifted_search)
     usual = [search(lagrangian, state.X, state.U, state.merit).accepted for search in searches]
     monkeypatch.setattr(lifted, name, value)
     changed = [search(lagrangian, state.X, state.U, state.merit).accepted for search in searches]
@@ -234,19 +239,19 @@ def test_a_constant_of_the_lifted_search_changes_both_kernels(name: str, value: 
 def test_every_option_reaches_the_library() -> None:
     """Each field has the value of the option, or of the constant, that bears its name."""
     inner = ILQR(tolerance=0.011, max_iterations=13, damp_below=0.17, line_search=LineSearch(back=2))
-    options, search = ilqr.native_options(inner), inner.line_search
+    options, search = native_options(inner.descent), inner.line_search
     want = {
         "rungs": len(search.ladder(False)), "back": 2, "max_iterations": 13, "accept_last": 0, "tolerance": 0.011,
         "absolute_tolerance": 0.0, "ratio_min": search.ratio_min, "ratio_max": search.ratio_max,
-        "smallest": search.smallest, "damp_below": 0.17, "rounding": ilqr.ROUNDING, "lost": lifted.LOST,
-        "regularisation_first": ilqr.REGULARISATION_FIRST, "regularisation_growth": ilqr.REGULARISATION_GROWTH,
-        "regularisation_max": ilqr.REGULARISATION_MAX, "damping": ilqr.DAMPING,
-        "damping_growth": ilqr.DAMPING_GROWTH, "damping_decay": ilqr.DAMPING_DECAY,
+        "smallest": search.smallest, "damp_below": 0.17, "rounding": descent.ROUNDING, "lost": lifted.LOST,
+        "regularisation_first": descent.REGULARISATION_FIRST, "regularisation_growth": descent.REGULARISATION_GROWTH,
+        "regularisation_max": descent.REGULARISATION_MAX, "damping": descent.DAMPING,
+        "damping_growth": descent.DAMPING_GROWTH, "damping_decay": descent.DAMPING_DECAY,
     }  # fmt: skip
     assert {name: getattr(options, name) for name in Options.kinds if name != "ladder"} == want
     ladder = (ctypes.c_double * options.rungs).from_address(options.ladder)
     assert list(ladder) == search.ladder(False)
-    printed = ilqr.native_options(replace(inner, as_printed=True))
+    printed = native_options(replace(inner, as_printed=True).descent)
     assert (printed.tolerance, printed.absolute_tolerance, printed.damping, printed.accept_last) == (0.0, 0.011, 0, 1)
 
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.engines import engine_of
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from torchgco import (
     ILQR,
@@ -25,18 +26,19 @@ from torchgco import (
     QuadraticCost,
     Spheres,
     StateBounds,
+    kernels,
 )
 from torchgco.dynamics.rollout import open_loop
+from torchgco.ilqr import descent
+from torchgco.ilqr.riccati import BackwardPass, backward
+from torchgco.ilqr.step import iterate
+from torchgco.kernels import EagerWarning, kernels_of
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of
+from torchgco.lagrangian.state import PassEnd, State
 from torchgco.solvers import ilqr
 from torchgco.solvers.ending import optimality
-from torchgco.solvers.ilqr import advance
-from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import PassEnd, State
 
 DAMPED = ILQR()
 BRIEF = replace(DAMPED, line_search=LineSearch(back=2))
@@ -155,7 +157,7 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
     ends: dict[int, tuple[bool, bool, int]] = {}
     for _ in range(3 * count):
         frozen = replace(state)
-        end = inner.one_iteration(state, lagrangian)
+        end = iterate(inner.descent, state, lagrangian)
         for b in range(lagrangian.problem.B):
             if b in ends:  # an ended problem keeps its state
                 for name in ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation"):
@@ -170,7 +172,7 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
 def natively(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> PassEnd:
     """Up to `count` iterations of every problem by native kernels."""
     assert engine_of(lagrangian.problem) is not None
-    return advance(inner, state, lagrangian, count)
+    return kernels_of(lagrangian.problem).descend(lagrangian, state, inner.descent, count)
 
 
 @pytest.mark.parametrize("phr", [True, False], ids=["phr", "printed"])
@@ -296,13 +298,13 @@ def test_statuses_are_those_of_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
     free = planar_batch(B=2, N=6)[0]
     concave = replace(free.cost, R=-free.cost.R)
     problem = free._with({"cost": concave, "constraints": ()})
-    for inner, limit in ((DAMPED, 1e-4), (replace(DAMPED, max_iterations=3), ilqr.REGULARISATION_MAX)):
-        monkeypatch.setattr(ilqr, "REGULARISATION_MAX", limit)
+    for inner, limit in ((DAMPED, 1e-4), (replace(DAMPED, max_iterations=3), descent.REGULARISATION_MAX)):
+        monkeypatch.setattr(descent, "REGULARISATION_MAX", limit)
         (a, first), (b, second) = running_state(problem), running_state(problem)
         native = natively(inner, b, second, 3)
         statuses = torch.zeros(2, dtype=torch.int64)
         for _ in range(20):
-            end = inner.one_iteration(a, first)
+            end = iterate(inner.descent, a, first)
             statuses = torch.where(statuses == 0, end.status, statuses)
             if bool((end.ended | (statuses > 0)).all()):
                 break
@@ -358,10 +360,10 @@ def test_a_pivot_of_zero_is_a_failed_factorisation() -> None:
     problem = Problem(idle, QuadraticCost([1.0] * 2, [0.0], [1.0] * 2), [], normal(3, 2), 1)
     (a, first), (b, second) = running_state(problem), running_state(problem)
     assert bool(a.merit.isfinite().all())
-    end = DAMPED.one_iteration(a, first)
+    end = iterate(DAMPED.descent, a, first)
     native = natively(DAMPED, b, second, 1)
-    assert bool(end.failed.all()) and a.regularisation.tolist() == [ilqr.REGULARISATION_FIRST] * 3
-    assert native.used.tolist() == [ilqr.REGULARISATION_FIRST] * 3 and not bool(native.stuck.any())
+    assert bool(end.failed.all()) and a.regularisation.tolist() == [descent.REGULARISATION_FIRST] * 3
+    assert native.used.tolist() == [descent.REGULARISATION_FIRST] * 3 and not bool(native.stuck.any())
     assert engine_of(problem).gains(second, b.X, b.U, torch.zeros_like(b.merit))[3].all()
 
 
@@ -371,6 +373,6 @@ def test_a_small_change_under_damping_is_no_convergence(times: float, converges:
     problem, loose = planar_batch(B=3, N=8)[0], ILQR(tolerance=1e3)
     for native in (True, False):
         state, lagrangian = running_state(problem)
-        state.regularisation = torch.full_like(state.merit, times * ilqr.DAMPING)
-        end = natively(loose, state, lagrangian, 1) if native else loose.one_iteration(state, lagrangian)
+        state.regularisation = torch.full_like(state.merit, times * descent.DAMPING)
+        end = natively(loose, state, lagrangian, 1) if native else iterate(loose.descent, state, lagrangian)
         assert end.converged.tolist() == [converges] * 3

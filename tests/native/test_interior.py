@@ -26,8 +26,8 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
+from torchgco.kernels import interior_of
 from torchgco.maps import OccupancyGrid
-from torchgco.native.dispatch import interior_of
 from torchgco.problem.rates import with_controls_before
 from torchgco.solvers.interior import FILTER
 

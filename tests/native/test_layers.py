@@ -12,15 +12,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.engines import engine_of
 from tests.native.lanes import Emitted, Model
 from tests.slow import mostly
-from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InteriorPoint, Problem
-from torchgco.native import kernels
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InteriorPoint, Problem, kernels
+from torchgco.kernels import EagerWarning
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource, trace_dynamics
 from torchgco.native.codegen.emit import SHARED
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.tracing import Traced
 from torchgco.tracing.nets import MOST_WEIGHTS, Call
 
@@ -102,12 +102,34 @@ def of_other_forms() -> tuple[Step, int, int]:
     return step, 4, 2
 
 
+def of_rows() -> tuple[Step, int, int]:
+    """As many rows as neurons, and weights of the rows, which aren't those of neurons."""
+    net, out, gains = perceptron(2, 40, 4), nn.Linear(4, 2), torch.rand(4, 1)
+    return (lambda x, u: out((net(x.reshape(-1, 4, 2)) * gains).tanh()).reshape(-1, 8) + u), 8, 1
+
+
+def of_constants() -> tuple[Step, int, int]:
+    """A recurrent network that begins at zero, and layers that the inputs cancel out of."""
+    into, again, out = nn.Linear(5, 16), nn.Linear(16, 16), nn.Linear(16, 3)
+
+    def step(x: Tensor, u: Tensor) -> Tensor:
+        seen = into(together(x, u))
+        state = torch.zeros_like(seen)
+        for _ in range(2):
+            state = torch.tanh(seen + again(state))
+        return out(state) + out(seen - seen) + out(torch.ones_like(seen)) + torch.ones_like(state)[..., :3]
+
+    return step, 3, 2
+
+
 CASES: dict[str, tuple[Callable[[], tuple[Step, int, int]], str]] = {
     "activations": (of_all_activations, "none"),
     "sizes": (of_all_sizes, "none"),
     "many states": (of_many_states, "midpoint"),
     "expressions": (in_expressions, "midpoint"),
     "forms": (of_other_forms, "euler"),
+    "rows": (of_rows, "none"),
+    "constants": (of_constants, "none"),
 }
 
 
@@ -115,14 +137,18 @@ def compiled(model: FunctionDynamics) -> Callable[[Tensor, Tensor, Tensor], list
     """Step (B, n), Jacobian twice (B, n, n+m), and second derivatives (B, n+m, n+m) of y' step, of x, u, y in C."""
     source, n, s = trace_dynamics(model), model.n, model.n + model.m
     code = source.code + curvature_code(source, [])
-    assert "TGCO_TOGETHER" in code
     wrapped = f"""
 static void tgco_all(
     const V *x, const V *u, const V *p, const double *w, const V *y, V *next, V *first, V *f, V *H) {{
     tgco_step(x, u, p, w, next);
     tgco_jacobian(x, u, p, w, first);
     memset(H, 0, {s * s} * sizeof(V));
+#ifdef TGCO_TOGETHER
     tgco_together(x, u, p, w, y, f, H);
+#else
+    tgco_jacobian(x, u, p, w, f);
+    tgco_curve(x, u, p, w, y, H);
+#endif
 }}
 """
     sizes, count = [n, model.m, 0, int(shared(model).numel()), n], source.computed
@@ -163,6 +189,7 @@ def test_derivatives_are_those_of_autodiff(name: str) -> None:
         return model.step(z[:n].unsqueeze(0), z[n:].unsqueeze(0))[0]
 
     z, native = together(x, u), compiled(model)
+    assert calls_of(function, n, m)
     J = torch.func.vmap(torch.func.jacfwd(one))(z)
     H = torch.func.vmap(torch.func.hessian(lambda z, y: (one(z) * y).sum()))(z, y).triu()
     found = native(x, u, y)
@@ -175,6 +202,57 @@ def test_derivatives_are_those_of_autodiff(name: str) -> None:
     for i in range(5):
         for mine, alone in zip(found, native(x[[i]], u[[i]], y[[i]]), strict=True):
             assert torch.equal(alone[0], mine[i])
+
+
+def test_a_network_in_a_branch_that_is_not_taken_spoils_nothing() -> None:
+    """Its inputs, values and tangents are NaN or infinite there; one output is read in either branch."""
+    net, potential = perceptron(3, 32, 3), perceptron(3, 32, 1, activation=nn.Softplus())
+
+    def step(x: Tensor, u: Tensor) -> Tensor:
+        found = net(torch.cat((x[..., :1].sqrt(), u), dim=-1))
+        chained = net(found.exp()) ** 3 * u[..., :1]
+        steep = torch.func.grad(lambda z: potential(1e4 * z).sum())(torch.cat((x[..., 1:2], u), dim=-1))
+        return torch.where(x[..., :1] > 0, found**2 + chained, 0.1 * x**2) + steep
+
+    x, u, y = torch.randn(6, 3), torch.randn(6, 2), torch.randn(6, 3)
+    x[:3, 0], x[3:, 0] = -x[:3, 0].abs() - 0.1, x[3:, 0].abs() + 0.1
+    model = FunctionDynamics(step, 3, 2, 0.1, "none")
+
+    def one(z: Tensor) -> Tensor:
+        return step(z[:3].unsqueeze(0), z[3:].unsqueeze(0))[0]
+
+    # Forward over forward: PyTorch's reverse mode has NaN here.
+    J = torch.func.vmap(torch.func.jacfwd(one))(together(x, u))
+    H = torch.func.vmap(torch.func.jacfwd(torch.func.jacfwd(lambda z, y: (one(z) * y).sum())))(together(x, u), y)
+    found = compiled(model)(x, u, y)
+    for mine, theirs in zip(found, (model.step(x, u), J, J, H.triu()), strict=True):
+        assert torch.isfinite(theirs).all()
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
+
+
+def test_powers_and_sinc_at_zero() -> None:
+    exponents = torch.tensor([0.0, 1.0, 2.0, 3.0], requires_grad=True)
+    model = FunctionDynamics(
+        lambda x, u: torch.cat((x[..., :4] ** exponents, x[..., 4:].sinc()), -1), 5, 1, 0.1, "none"
+    )
+    z = torch.tensor([0.0, 1e-12, 1e-9, 1e-5, 0.09, 0.4, -1.7])
+    native, x, u = compiled(model), z.unsqueeze(-1).expand(-1, 5).contiguous(), torch.zeros(7, 1)
+    p, zero, t = exponents.detach(), torch.zeros_like(z), torch.pi * z
+    slopes = torch.stack((zero, zero + 1.0, 2.0 * z, 3.0 * z**2), -1)
+    bends = torch.stack((zero, zero, zero + 2.0, 6.0 * z), -1)
+    # sinc' / pi = -t/3 + t^3/30 - ..., whose further terms count from 0.1 on
+    far = z.abs() > 0.1
+    slope = torch.where(far, (t.cos() - t.sin() / t) / z, torch.pi * (-t / 3 + t**3 / 30 - t**5 / 840 + t**7 / 45360))
+    bend = torch.where(
+        far,
+        -(torch.pi**2) * (t.sin() / t + 2 * t.cos() / t**2 - 2 * t.sin() / t**3),
+        torch.pi**2 * (-1 / 3 + t**2 / 10 - t**4 / 168 + t**6 / 6480),
+    )
+    for i, (first, second) in enumerate(zip((*slopes.T, slope), (*bends.T, bend), strict=True)):
+        value, J, _, H = native(x, u, torch.eye(5)[i].expand(7, 5).contiguous())
+        torch.testing.assert_close(value[:, i], z ** p[i] if i < 4 else z.sinc(), rtol=1e-14, atol=1e-14)
+        torch.testing.assert_close(J[:, i, i], first, rtol=1e-10, atol=1e-14)
+        torch.testing.assert_close(H[:, i, i], second, rtol=1e-8, atol=1e-14)
 
 
 def learned(B: int = 3) -> Problem:
@@ -237,6 +315,13 @@ def test_a_single_precision_network_is_rounded_as_by_pytorch() -> None:
     model = FunctionDynamics(lambda x, u: net(together(x, u).float()).double(), 3, 2, 0.1, "none")
     x, u = torch.randn(4, 3), torch.randn(4, 2)
     torch.testing.assert_close(Model(trace_dynamics(model)).step(x, u), model.step(x, u), rtol=1e-5, atol=1e-6)
+
+
+def test_sparse_weights_are_read_as_all_others() -> None:
+    W, V = torch.randn(5, 32).relu().to_sparse(), torch.randn(32, 3)
+    model = FunctionDynamics(lambda x, u: torch.tanh(together(x, u) @ W) @ V, 3, 2, 0.1, "none")
+    x, u = torch.randn(4, 3), torch.randn(4, 2)
+    torch.testing.assert_close(Model(trace_dynamics(model)).step(x, u), model.step(x, u), rtol=1e-13, atol=1e-13)
 
 
 def test_pytorch_takes_over_where_a_network_is_large() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 from pathlib import Path
 
 import pytest
 
-from tests.native.test_compiler import needs_compiler, next_process, times
-from torchgco.native import compiler
+from tests.native.test_compiler import needs_compiler, next_process, source, times
+from torchgco.native import compiler, store
+from torchgco.native.compiler import build
 
 pytestmark = pytest.mark.usefixtures("cache")
 
@@ -54,3 +56,33 @@ def test_a_folder_of_temporary_files_that_libraries_cannot_be_loaded_from(
 
     monkeypatch.setattr(compiler.ctypes, "CDLL", forbidding)
     assert times(2) == 6.0 and len(compilations) == 1
+
+
+@needs_compiler
+def test_libraries_that_nobody_uses_any_more_are_closed(monkeypatch) -> None:
+    """A loop over models maps no more and more memory; functions of a library keep it."""
+    maps = Path("/proc/self/maps")
+    if not maps.exists():
+        pytest.skip("no list of what this process has mapped")
+    monkeypatch.setattr(compiler, "_KEPT", 1)
+    gc.collect()
+    mapped = lambda: maps.read_text().count("kernels.so")
+    before = mapped()
+    function = build(source(2)).tgco_times
+    function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double]
+    one = mapped() - before
+    for factor in range(3, 7):
+        assert times(factor) == 3.0 * factor
+    gc.collect()
+    assert mapped() == before + 2 * one and function(4.0) == 8.0
+    assert len(compiler._loaded) == 1
+
+
+def test_the_first_entries_are_dropped() -> None:
+    kept = {name: size for size, name in enumerate("abcdef")}
+    store.trim(kept, 4)
+    assert list(kept) == ["c", "d", "e", "f"]
+    store.trim(kept, 4, 9.0, float)
+    assert list(kept) == ["e", "f"]
+    store.trim(kept, 4, 1.0, float)
+    assert list(kept) == ["f"]  # the last one stays, however large

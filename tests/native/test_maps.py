@@ -7,17 +7,19 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.engines import engine_of
 from tests.maps.test_field import random_grid
 from tests.native.lanes import drawn
 from tests.problems import assert_same_bits, planar_batch, quadrotor_batch, random_trajectory
 from torchgco import MPPI, ControlBounds, Field, Goal, Planar, Problem, QuadraticCost, Solution, judge, kernels, presets
 from torchgco.base.draws import DrawKey
+from torchgco.eager import sampling
 from torchgco.guidance import mppi
+from torchgco.kernels import measured
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.maps.field import BoundField
-from torchgco.native.dispatch import engine_of, measured
 
 
 @pytest.fixture(autouse=True)
@@ -114,7 +116,7 @@ def test_samples_that_touch_the_map_are_counted_as_pytorch_counts_them(dtype: st
     def same_noise(key: DrawKey, rows: int, samples: range, dtype: torch.dtype, stream: int) -> Tensor:
         return drawn(key, rows, samples.stop, stream)[..., samples.start :].to(dtype)
 
-    monkeypatch.setattr(mppi, "standard_normal", same_noise)
+    monkeypatch.setattr(sampling, "standard_normal", same_noise)
     monkeypatch.setattr(mppi, "COLLISION_PENALTY", 10.0)
     sampler = MPPI(
         samples=33,

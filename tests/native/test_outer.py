@@ -13,14 +13,14 @@ from tests.problems import planar_batch, quadrotor_batch
 from tests.search.test_finish import brachistochrone, bryson_denham, parking
 from torchgco import ILQR, AugmentedLagrangian, Boxes, Problem, Spheres, StateBounds, presets
 from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.kernels import chord_clearance, measured, open_loop
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import chord_clearance, measured, open_loop
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.native.engine import Engine
 from torchgco.native.packing import is_bounded
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import SolveEnd
 
 STANDARD = AugmentedLagrangian(ILQR(max_iterations=12), initial_penalty=0.3, max_outer_iterations=8)
 SOLVERS = {
@@ -68,7 +68,7 @@ def both(monkeypatch: pytest.MonkeyPatch, solve: Callable[[], SolveEnd]) -> tupl
         self.measures = False
 
     monkeypatch.setattr(Engine, "__init__", without)
-    monkeypatch.setattr("torchgco.native.dispatch._engines", {})
+    monkeypatch.setattr("torchgco.kernels._engines", {})
     return native, solve()
 
 

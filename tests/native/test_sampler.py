@@ -14,10 +14,11 @@ from tests.native import users
 from tests.native.lanes import drawn
 from tests.native.test_engine import user_problem
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
-from torchgco import MPPI, ControlBounds, Problem, Spheres, presets
+from torchgco import MPPI, ControlBounds, Problem, Spheres, kernels, presets
 from torchgco.base.draws import DrawKey, standard_normal
+from torchgco.eager import sampling
 from torchgco.guidance import mppi
-from torchgco.native import dispatch, kernels
+from torchgco.kernels import in_c
 from torchgco.native.compiler import find_compiler
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -111,7 +112,7 @@ def test_rounds_equal_those_of_pytorch(made: str, sampler: str, monkeypatch) -> 
     def same_noise(key: DrawKey, rows: int, samples: range, dtype: torch.dtype, stream: int) -> Tensor:
         return drawn(key, rows, samples.stop, stream)[..., samples.start :].to(dtype)
 
-    monkeypatch.setattr(mppi, "standard_normal", same_noise)
+    monkeypatch.setattr(sampling, "standard_normal", same_noise)
     drawing = sampler_of(sampler, monkeypatch)
     X, V = drawing.improve(problem, U, key(3))
     kernels.use_native(False)
@@ -160,6 +161,6 @@ def test_a_solve_that_never_samples_compiles_no_sampler(monkeypatch) -> None:
     problem, U = planar_batch(B=1, N=20)
     free = Problem(problem.dynamics, problem.cost, [Spheres([[50.0, 50.0]], [0.1], 0.1)], problem.x0, problem.N)
     made = []
-    monkeypatch.setattr(dispatch, "Sampler", lambda *words: made.append(words))
+    monkeypatch.setattr(in_c, "Sampler", lambda *words: made.append(words))
     presets.gco(free).solve(free, U)
     assert not made

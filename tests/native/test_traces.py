@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from tests.engines import engine_of
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost, solve
 from torchgco.dynamics import rollout
+from torchgco.kernels import EagerWarning, measured, open_loop, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning, engine_of, measured, open_loop, value
 
 D = torch.float64
 B, N = 4, 6

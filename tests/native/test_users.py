@@ -15,15 +15,15 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import engine_of
 from tests.native.test_engine import DAMPED, eager, natively, normal, running_state
 from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
 from tests.problems import planar_batch, quick_gco
-from torchgco import Problem, Status
+from torchgco import Problem, Status, kernels
 from torchgco.constraints.base import Constraint
-from torchgco.native import kernels
+from torchgco.ilqr.lifted import lifted_search
+from torchgco.kernels import EagerWarning, cost_unit, kernels_of
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of
-from torchgco.solvers.lifted import lifted_search, native_lifted_search
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
@@ -155,7 +155,7 @@ def test_steps_in_states_and_controls_together_are_pytorchs() -> None:
     X[:, 0] = problem.x0
     merit = torch.full_like(state.merit, 1e9)
     for _ in range(2):
-        mine, theirs = (search(lagrangian, X, state.U, merit) for search in (native_lifted_search, lifted_search))
+        mine, theirs = (search(lagrangian, X, state.U, merit) for search in (kernels_of(problem).lifted, lifted_search))
         assert torch.equal(mine.accepted, theirs.accepted) and bool(mine.accepted.any())
         for name in ("X", "U", "merit"):
             torch.testing.assert_close(getattr(mine, name), getattr(theirs, name), rtol=1e-8, atol=1e-8)
@@ -163,7 +163,7 @@ def test_steps_in_states_and_controls_together_are_pytorchs() -> None:
         torch.testing.assert_close(mine.cost[rows], theirs.cost[rows], rtol=1e-8, atol=0)
         assert bool((mine.merit[rows] < 0.99 * merit[rows]).all())
         merit = theirs.merit
-    none = native_lifted_search(lagrangian, X, state.U, -merit.abs())
+    none = kernels_of(problem).lifted(lagrangian, X, state.U, -merit.abs())
     assert not bool(none.accepted.any()) and torch.equal(none.X, X) and torch.equal(none.U, state.U)
 
 

@@ -23,9 +23,9 @@ from torchgco import (
     Spheres,
     StateBounds,
     Unicycle,
+    kernels,
 )
 from torchgco.judging.judge import judge
-from torchgco.native import kernels
 
 D = torch.float64
 HORIZONS = [30, 18, 24]

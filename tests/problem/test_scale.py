@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import FunctionCost, FunctionDynamics, Problem, QuadraticCost, Spheres, presets
+from torchgco import FunctionCost, FunctionDynamics, Problem, QuadraticCost, Spheres, kernels, presets
 from torchgco.costs.base import ShiftedCost
-from torchgco.native import kernels
 
 D = torch.float64
 

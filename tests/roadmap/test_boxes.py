@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.engines import engine_of
 from tests.reference import boxes as brute_force
 from tests.search.scenes import first_of_class
 from torchgco import (
@@ -25,8 +26,7 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.native.dispatch import engine_of
-from torchgco.native.kernels import use_native
+from torchgco.kernels import use_native
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated, Scene

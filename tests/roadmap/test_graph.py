@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from tests.search.scenes import NONE, inflated
+from torchgco import kernels
 from torchgco.base.tree import cast, take
-from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning
+from torchgco.kernels import EagerWarning
 from torchgco.obstacles.base import Solids
 from torchgco.roadmap import native as native
 from torchgco.roadmap.geometry import Inflated, Scene

@@ -8,7 +8,7 @@ import torch
 from tests.roadmap.test_roadmap import random_scene
 from tests.roadmap.test_trunks import trunks
 from tests.slow import mostly
-from torchgco.native.kernels import use_native
+from torchgco.kernels import use_native
 from torchgco.roadmap import known as known_searches
 from torchgco.roadmap import roadmap as searches
 from torchgco.roadmap.geometry import Scene

@@ -21,11 +21,11 @@ from torchgco import (
     QuadrotorPlanning,
     Roadmap,
     Spheres,
+    kernels,
     presets,
 )
 from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.maps.field import BoundField
-from torchgco.native import kernels
 from torchgco.obstacles.base import Obstacles
 from torchgco.roadmap.blocks import blocks_of
 from torchgco.roadmap.geometry import Inflated, length

@@ -13,7 +13,7 @@ from tests.reference import boxes as brute_force
 from tests.search.scenes import NONE, spheres
 from torchgco import Capsules, ControlBounds, Goal, Planar, Problem, QuadraticCost, QuadrotorPlanning, Spheres, judge
 from torchgco.base.tree import take
-from torchgco.native.kernels import use_native
+from torchgco.kernels import use_native
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated, Scene

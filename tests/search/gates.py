@@ -23,9 +23,9 @@ from torchgco import (
     QuadraticCost,
     Spheres,
 )
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.search import Follow
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import SolveEnd
 
 LOCAL = AugmentedLagrangian(ILQR(tolerance=5e-6, max_iterations=20), initial_penalty=2.0, max_outer_iterations=12)
 SAMPLER = MPPI(

@@ -11,10 +11,11 @@ from tests.problems import planar_batch
 from tests.search.gates import LOCAL, Solve
 from tests.search.rows import restarts
 from torchgco import GCO, ILQR, AugmentedLagrangian, LineSearch, Problem, QuadraticCost, Solution
+from torchgco.kernels.in_c import NativeKernels
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.search.attempts import Best
 from torchgco.search.passes import SEED_STEP
 from torchgco.solvers.contracts import Advice, Call
-from torchgco.solvers.state import SolveEnd
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> S
     problem, U0, local = given(monkeypatch)
     monkeypatch.setattr("torchgco.lagrangian.quality.GOAL_TOLERANCE", share)
     monkeypatch.setattr("torchgco.solvers.caught.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
-    monkeypatch.setattr("torchgco.solvers.augmented_lagrangian.engine_of", lambda problem: None)  # which tests it in C
+    monkeypatch.setattr(NativeKernels, "outer_passes", lambda *_, **__: None)  # which test it in C
     last = ()  # no clearing of chords: trajectories here do collide
     return restarts(local, None, Given(levels=levels), len(levels), last=last, **options).solve(problem, U0)
 

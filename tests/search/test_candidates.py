@@ -7,7 +7,7 @@ import torch
 from tests.search.cup import QUICK, controls, cup
 from torchgco import Problem
 from torchgco.dynamics.rollout import open_loop
-from torchgco.native.dispatch import chord_clearance
+from torchgco.kernels import chord_clearance
 from torchgco.search.candidates import Candidates
 
 

@@ -26,8 +26,7 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.native.dispatch import chord_clearance, open_loop
-from torchgco.native.kernels import use_native
+from torchgco.kernels import chord_clearance, open_loop, use_native
 from torchgco.search import ClearChords, Converge, PathProposals
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")

@@ -20,9 +20,9 @@ from torchgco import (
     Solution,
     StateBounds,
     Status,
+    kernels,
     presets,
 )
-from torchgco.native import kernels
 
 D, INF = torch.float64, math.inf
 LIMITS = torch.tensor([0.08, 0.12, 0.16], dtype=D)  # of Bryson and Denham's problem

@@ -9,12 +9,12 @@ import torch
 
 from tests.problems import assert_same_bits, planar_batch, quick_gco
 from torchgco import Boxes, InteriorPoint, Problem, Solution, Spheres, judge
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.native.compiler import find_compiler
 from torchgco.search import nearby
 from torchgco.search.converge import continued
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import Iterate, SolveEnd
 
 B, FAR = 3, 40
 

@@ -24,13 +24,13 @@ from torchgco import (
     solve,
 )
 from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps import OccupancyGrid
 from torchgco.roadmap.geometry import length
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 from torchgco.search import Solve, Tube, tube
 from torchgco.search.following import Free, Paths
-from torchgco.solvers.state import SolveEnd
 
 D = torch.float64
 RADIUS = 0.25

@@ -12,9 +12,8 @@ import torch
 import torchgco
 from tests.problems import planar_batch
 from torchgco import Hold, InteriorPoint, Problem, Solution, Status
+from torchgco.kernels import EagerWarning, use_native
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning
-from torchgco.native.kernels import use_native
 
 
 def problem_of(obstacles: bool, dtype: torch.dtype = torch.float64) -> Problem:

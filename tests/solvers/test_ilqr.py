@@ -11,8 +11,8 @@ import torch
 from tests.problems import planar_batch
 from tests.solvers.problems import linear_problem, zeros
 from torchgco import ILQR, AugmentedLagrangian, Cost, FunctionConstraint, LineSearch, Problem, Solution, Status
+from torchgco.ilqr.riccati import backward
 from torchgco.solvers import ilqr, line_search
-from torchgco.solvers.riccati import backward
 
 
 def test_lqr_is_solved_in_one_step() -> None:

@@ -27,11 +27,11 @@ from torchgco import (
     StateBounds,
     Status,
     certify,
+    kernels,
 )
 from torchgco.base.tree import take
 from torchgco.baselines import CasADiSolver
 from torchgco.dynamics.rollout import open_loop
-from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 from torchgco.solvers import interior
 from torchgco.solvers.contracts import Call

@@ -8,9 +8,9 @@ import torch
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from tests.search.rows import varied
 from torchgco import ILQR, MPPI, AugmentedLagrangian, MultiStart, PathProposals, Polish, Problem, Restarts
+from torchgco.kernels.in_c import NativeKernels
+from torchgco.kernels.outer import NativeOuter
 from torchgco.native.interior import InteriorEngine
-from torchgco.solvers import augmented_lagrangian, ilqr
-from torchgco.solvers.native_outer import NativeOuter
 
 BATCHES = {
     "planar": lambda: planar_batch(B=3, N=25, obstacles=9, seed=4),
@@ -39,14 +39,13 @@ def made(monkeypatch) -> list[int]:
     """Numbers of iterations and Newton steps, noted in every solve."""
     made: list[int] = []
 
-    def advance(inner, state, lagrangian, limit, real=ilqr.advance):
+    def descend(self, lagrangian, state, how, limit, real=NativeKernels.descend):
         before = int(state.iterations.sum())
-        end = real(inner, state, lagrangian, limit)
+        end = real(self, lagrangian, state, how, limit)
         made.append(int(state.iterations.sum()) - before)
         return end
 
-    for module in (ilqr, augmented_lagrangian):
-        monkeypatch.setattr(module, "advance", advance)
+    monkeypatch.setattr(NativeKernels, "descend", descend)
 
     def passes(self, real=NativeOuter._run, **fields):
         before = int(self.state.iterations.sum())

@@ -7,10 +7,10 @@ import sys
 import pytest
 import torch
 
+from tests.engines import engine_of
 from tests.problems import planar_batch, quadrotor_batch
 from torchgco import InputError
 from torchgco.base.memory import free_memory
-from torchgco.native.dispatch import engine_of
 from torchgco.solvers.memory import (
     CPU_LIMIT,
     element_bytes,

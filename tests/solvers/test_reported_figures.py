@@ -25,10 +25,10 @@ from torchgco import (
     Status,
 )
 from torchgco.lagrangian.quality import violation
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.native.compiler import find_compiler
 from torchgco.problem.horizons import within_horizons
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
-from torchgco.solvers.state import SolveEnd
 
 D, INF = torch.float64, torch.inf
 SOLVERS = "gco", "gco_fast", "gco_max", "interior_point", "al_ilqr", "mppi", "ipopt", "hold"

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from tests.problems import planar_batch
 from tests.search.test_starts import swing_up
-from torchgco import ControlBounds, InputError, Problem, QuadraticCost, RateBounds, Unicycle, presets, solve
-from torchgco.native import kernels
+from torchgco import ControlBounds, InputError, Problem, QuadraticCost, RateBounds, Unicycle, kernels, presets, solve
 from torchgco.search import Starts
 
 D = torch.float64

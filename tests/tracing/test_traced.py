@@ -162,6 +162,8 @@ FUNCTIONS = {
     "any": lambda x: (x > 0.5).any(-1, keepdim=True).to(x.dtype) * x + (x > -9.0).all() * 2.0 * x,
     "matrices": lambda x: (x.mT @ x) @ ONES[0] + torch.einsum("bi,ij,bj->b", x, ONES, x),
     "products": lambda x: torch.linalg.cross(x[..., :3], torch.ones_like(x[..., 1:])) + torch.outer(x[0], x[0])[:3, 1],
+    "a matrix times vectors": lambda x: F.linear(x[0], ONES.cumsum(-1), ONES[0]) + F.linear(x[0], ONES[1:2]),
+    "own shape changed": lambda x: (2.0 * x).unsqueeze_(-1).squeeze_(0).t_() + (2.0 * x).transpose_(0, 1).t_(),
     "shapes": lambda x: x.reshape(2, 2).T.flip(0).repeat(1, 2).unsqueeze(0).squeeze().expand(3, 2, 4).flatten(),
     "parts": lambda x: torch.cat((*x.split(2, dim=-1), torch.stack(x.unbind(-1), -1), *x.chunk(2, -1)), dim=-1),
     "places": lambda x: x[:, torch.tensor([3, 0])] + x.index_select(1, torch.tensor([1, 1])) + x[..., 1:-1:1],

@@ -6,7 +6,7 @@ may use parameters per problem. `vmap` over the batch would not allow that.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -24,8 +24,8 @@ class WithoutReading(TorchFunctionMode):
     """Raises ReadsMemory where a function leaves PyTorch with a tensor that is differentiated or recorded.
 
     Such a tensor has no memory of its own: reading it may crash, and what is made of the numbers is a constant. Other
-    tensors may be read; `seen` keeps by which methods. `called` is the function of PyTorch that was called last,
-    `refused` the first error, which the function itself may have caught.
+    tensors may be read; `seen` keeps by which methods, `read` which ones. `called` is the function of PyTorch that was
+    called last, `refused` the first error, which the function itself may have caught.
     """
 
     READERS = (
@@ -39,27 +39,36 @@ class WithoutReading(TorchFunctionMode):
         "__repr__",
         "__format__",
     )
+    PLACED = ("tensor_split",)  # functions of PyTorch that read where to cut without any operation
 
     def __init__(self) -> None:
         super().__init__()
         self.seen: set[str] = set()
+        self.read: list[Tensor] = []
         self.called: Any = None
         self.refused: ReadsMemory | None = None
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         self.called, name = func, getattr(func, "__name__", "")
         if name in self.READERS:
-            self.seen.add(name)
-            if _stands_for_another(args[0]):
-                found = ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
-                self.refused = self.refused or found
-                raise found
+            self._hand_over(name, args[:1])
+        elif name in self.PLACED:
+            self._hand_over(name, (*args[1:], *(kwargs or {}).values()))
         return func(*args, **(kwargs or {}))
 
+    def _hand_over(self, name: str, values: Sequence[Any]) -> None:
+        """Note that a function reads these values without an operation."""
+        tensors = [value for value in values if isinstance(value, Tensor)]
+        if tensors:
+            self.seen.add(name)
+        if any(map(_stands_for_another, tensors)):
+            found = ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
+            self.refused = self.refused or found
+            raise found
+        self.read += tensors
 
-def _stands_for_another(value: object) -> bool:
-    if not isinstance(value, Tensor):
-        return False
+
+def _stands_for_another(value: Tensor) -> bool:
     return is_functional(value) or is_functorch_wrapped_tensor(value)
 
 

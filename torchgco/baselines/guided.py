@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.options import check_options
 from torchgco.baselines.casadi import CasADiSolver
-from torchgco.native.dispatch import engine_of
+from torchgco.kernels import kernels_of
 from torchgco.problem.problem import Problem
 from torchgco.search.proposals import PathProposals, propose
 from torchgco.solution import Solution
@@ -58,7 +58,7 @@ class GuidedCasADi(Solver):
         for proposals in self.passes:
             for follow in proposals.follow:
                 follow.starts(problem, problem.at_rest[1])
-        engine_of(problem)  # compiled now, so that no solve waits for it
+        kernels_of(problem)  # compiled now, so that no solve waits for it
         return PreparedGuided(self, self.solver.prepare(problem))
 
     def run(self, call: Call) -> Solution:

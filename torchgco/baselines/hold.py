@@ -10,8 +10,8 @@ from torch import Tensor
 from torchgco.base.options import Positive, check_options
 from torchgco.base.status import Status
 from torchgco.dynamics.rollout import open_loop
+from torchgco.kernels import measured
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.native.dispatch import measured
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution

@@ -13,8 +13,8 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.baselines.hold import rolled_out
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_sampler
+from torchgco.kernels import measured
 from torchgco.lagrangian.quality import is_better
-from torchgco.native.dispatch import measured
 from torchgco.obstacles.base import ADMITTED
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver

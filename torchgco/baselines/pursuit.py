@@ -13,9 +13,10 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Natural, NonNegative, Positive, Share, check_options
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of
+from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps.ways import Ways, length
-from torchgco.native.dispatch import chord_clearance, measured
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Scene
@@ -27,7 +28,6 @@ from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
-from torchgco.solvers.state import SolveEnd
 
 Array = NDArray[np.float64]
 

@@ -22,9 +22,9 @@ from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_own_numbers
 from torchgco.explaining.account import Account
+from torchgco.kernels import cost_unit, current, interior_of
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import cost_unit, current, interior_of
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
@@ -155,7 +155,8 @@ class Compiled:
         form, before, self._kept = current(for_solvers(problem)), self._kept, None
         if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
             kernels = interior_of(form)
-            if isinstance(kernels, InteriorEngine):
+            # What Python has read of a problem's own numbers stays in the code.
+            if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
                 self._problem, self._unit = form, cost_unit(form)
                 self._kept = Kept(kernels, form, **self._options(form))
                 if before is not None:
@@ -291,11 +292,11 @@ class Compiled:
         """The problem with its numbers as they are, and nothing that was computed from others."""
         problem = self._problem
         constraints = tuple(_renewed(part) for part in problem.constraints)
-        form = {key: value for key, value in problem.form.items() if key not in ("packed", "rows")}
-        now = problem._with({"constraints": constraints}, form)
+        known = replace(problem.known, row_shapes=None, packed=(None, None))
+        now = problem._with({"constraints": constraints}, known)
         if now.goal is None or now.goal.assumed:
             dims = now._dimensions(now.x0)
-            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, form)
+            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, known)
         return now
 
     def _solved(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
@@ -348,11 +349,11 @@ class Compiled:
         ended = kept.statuses
         status = np.where(good | (ended == TIME_LIMIT), ended, Status.MAX_ITERATIONS)
         multipliers = Multipliers(tuple(lam.clone() for lam in kept.lam), PENALTY * self._unit)
-        X, U = (part.clone() for part in kept.rolled)
-        none, cost = torch.zeros_like(kept.iterations), X.new_full((X.shape[0],), torch.nan)
+        X, U, K, _, iterations = kept.copies()
+        none, cost = torch.zeros_like(iterations), X.new_full((X.shape[0],), torch.nan)
         return Solution(
-            X, U, kept.feedback.clone(), torch.zeros_like(U), multipliers, cost, self._violation().clone(),
-            torch.from_numpy(status.astype(np.int64)), kept.iterations.clone(), none, none.clone(),
+            X, U, K, torch.zeros_like(U), multipliers, cost, self._violation().clone(),
+            torch.from_numpy(status.astype(np.int64)), iterations, none, none.clone(),
         )  # fmt: skip
 
     def _again(self, found: Solution, rows: Tensor, until: float) -> None:
@@ -383,8 +384,8 @@ class Compiled:
             )
         else:
             assert kept is not None
-            (X, U), K, status = (part.clone() for part in kept.rolled), kept.feedback.clone(), kept.status.long()
-            worst, iterations = self._violation().clone(), kept.iterations.clone()
+            X, U, K, status, iterations = kept.copies()
+            worst = torch.from_numpy(kept.violations.copy()) if kept.engine.measures else self._violation()
         # The next call may begin with solutions, and with what only the time was over for.
         ended = status.numpy()
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)

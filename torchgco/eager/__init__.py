@@ -1,1 +1,1 @@
-"""The interior point in PyTorch's kernels: any device, any dtype, any code that PyTorch can differentiate."""
+"""The interior point and MPPI's rounds in PyTorch: any device, any dtype, any code that PyTorch can differentiate."""

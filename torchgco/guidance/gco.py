@@ -13,8 +13,8 @@ from torchgco.base.options import AtLeast, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
+from torchgco.kernels import cost_unit
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.native.dispatch import cost_unit
 from torchgco.problem.problem import Problem
 from torchgco.solvers.caught import active_counts, caught_knots
 from torchgco.solvers.contracts import Advice

@@ -14,7 +14,7 @@ import torch
 
 from torchgco.base.errors import GuidanceWarning
 from torchgco.guidance.mppi import MPPI
-from torchgco.native.dispatch import engine_of
+from torchgco.kernels import kernels_of
 from torchgco.problem.problem import Problem
 
 TRIAL_SAMPLES = 2  # of a trial
@@ -29,7 +29,7 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
     if sampler is None:
         return None, None
     sampler.check(problem)
-    if engine_of(problem) is not None:
+    if kernels_of(problem).compiled:
         return sampler, None  # natively it samples the same traced functions that the solver runs
     own, wanted, why = _tried(_sample, problem, sampler.dtype)
     if why is None:

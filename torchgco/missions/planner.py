@@ -14,6 +14,7 @@ from torchgco.base.options import NonNegative, PositiveOrInfinite, Seconds, Shar
 from torchgco.base.tree import Rows, put, take
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
+from torchgco.kernels import followed, measured, open_loop, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.missions.planning_problem import (
     Margin,
@@ -24,7 +25,6 @@ from torchgco.missions.planning_problem import (
     follows,
     planning_state,
 )
-from torchgco.native.dispatch import followed, measured, open_loop, value
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution

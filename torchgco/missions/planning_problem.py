@@ -13,8 +13,8 @@ from torchgco.constraints import ControlBounds
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning, pose_rates
+from torchgco.kernels import open_loop
 from torchgco.missions.constraints import FirstStepRates
-from torchgco.native.dispatch import open_loop
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.problem.problem import Problem
 

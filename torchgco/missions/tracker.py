@@ -15,9 +15,9 @@ from torchgco.constraints import StateBounds
 from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import Airframe, RotorTracking
+from torchgco.kernels import measured
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update_and_raise_penalty
 from torchgco.missions.constraints import RotorLimits, ThrustSum
-from torchgco.native.dispatch import measured
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
 from torchgco.solvers.ilqr import ILQR, descend

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _ctypes
 import ctypes
 import functools
 import itertools
@@ -14,6 +15,7 @@ import signal
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -109,9 +111,9 @@ def build(source: str | Sequence[Unit], flags: Sequence[str] = ()) -> ctypes.CDL
                 "no C compiler found: install gcc or clang, or `pip install ziglang`, or name one in TORCHGCO_CC"
             )
         library = _load(compiler, units, (*compiler.flags, *flags, *compiler.further))
+        weakref.finalize(library, _ctypes.dlclose, library._handle).atexit = False  # functions of it hold it, too
     _loaded[known] = library  # the most recent one is the last
-    if len(_loaded) > _KEPT:
-        del _loaded[next(iter(_loaded))]
+    store.trim(_loaded, _KEPT)
     return library
 
 
@@ -235,8 +237,7 @@ def _known(key: str, unit: Unit) -> bytes | None:
 
 def _remember(key: str, content: bytes) -> None:
     _objects[key] = content
-    if len(_objects) > _OBJECTS:
-        del _objects[next(iter(_objects))]
+    store.trim(_objects, _OBJECTS)
 
 
 def _object(compiler: Compiler, unit: Unit, flags: tuple[str, ...]) -> bytes:

@@ -39,7 +39,6 @@ from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.problem.problem import Problem
 
-PACKED = "packed"  # marks the constraints that were packed last, among what a form keeps
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -55,9 +54,7 @@ class Engine:
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(
-        self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True
-    ) -> None:
+    def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MAX_VARIABLES:
@@ -85,6 +82,11 @@ class Engine:
         if name not in self._libraries:
             self._libraries[name] = load(units(), STRUCTURES)
         return self._libraries[name]
+
+    def forget_values(self) -> None:
+        """Let go of the numbers of the problem that the functions were traced with: all are solved with their own."""
+        for traced in self.captured.traces:
+            traced.forget_values()
 
     def with_shared(self, shared: Shared) -> Engine:
         """The same functions with other shared numbers, such as `captured.read` gives."""
@@ -270,13 +272,13 @@ class Engine:
 
     def _constraints(self, problem: Problem) -> list[c.Constraint]:
         """The rows without multipliers; those of the last problem where this one differs in its cost alone."""
-        known, rows = problem.form.get(PACKED, (None, []))
+        known, rows = problem.known.packed
         if known is problem.constraints:
             return rows
         rows = []
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
             rows.append(constraint_of(constraint, shape, self.row_numbers(problem, i), problem))
-        problem.form[PACKED] = problem.constraints, rows
+        problem.known.packed = problem.constraints, rows
         return rows
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:

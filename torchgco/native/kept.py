@@ -60,6 +60,7 @@ class Kept:
         self._rolled, self._x0 = [part.numpy() for part in self.rolled], problem.x0.numpy()
         self._flat = [part.reshape(B, -1) for part in self._rolled]
         self._gains = self.gains.numpy()
+        self._feedback = self._gains[..., :-1]
         self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
         self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
         self._follow = self.packed.copy()
@@ -79,8 +80,10 @@ class Kept:
         self._barrier[:] = mu
         self.statuses[:] = 0
         self._iterations[:] = 0
-        self._gains[rows] = 0.0  # of problems that a deadline leaves no time for
-        for first, last in _spans(rows):
+        spans = _spans(rows)
+        for first, last in spans:
+            self._gains[first:last] = 0.0  # of problems that a deadline leaves no time for
+        for first, last in spans:
             run(self.library.tgco_interior, last - first, self.lanes, self.how, first)
             self.how.fill({"seconds": max(0.0, until - time.monotonic())})
         if not math.isfinite(self._gains.sum()):
@@ -101,10 +104,12 @@ class Kept:
         X, U = self._flat
         return np.asarray(np.isfinite(X).all(axis=1) & np.isfinite(U).all(axis=1))
 
-    @property
-    def feedback(self) -> Tensor:
-        """Gains K (B, N, m, n)."""
-        return self.gains[..., :-1]
+    def copies(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """X (B, N+1, n) and U (B, N, m) as rolled out, gains K (B, N, m, n), status (B,) and iterations (B,)."""
+        X, U = self._rolled
+        parts = X.copy(), U.copy(), self._feedback.copy(), self.statuses.astype(np.int64), self._iterations.copy()
+        x, u, K, status, iterations = map(torch.from_numpy, parts)
+        return x, u, K, status, iterations
 
     def start(self) -> None:
         """Let all trajectories begin at the problem's starts."""

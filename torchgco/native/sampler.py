@@ -5,9 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import words
+from torchgco.eager.sampling import Sampling
+from torchgco.native import structures
 from torchgco.native.codegen.source import SAMPLER
 from torchgco.native.engine import Engine, run
-from torchgco.native.structures import Sampling
+from torchgco.native.structures import array
 from torchgco.problem.problem import Problem
 
 REALS = {torch.float64: ("double", 8), torch.float32: ("float", 16)}  # type and lanes in C
@@ -24,15 +27,27 @@ class Sampler:
         self.engine = engine
         self.library = engine.further(dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]))
 
-    def improve(self, problem: Problem, U: Tensor, sampling: Sampling) -> Tensor:
-        """Controls (B, N, m): the weighted mean of the last round's samples, the first drawn around U.
-
-        Args:
-            sampling: all fields but `of`, `geometric` and `mean`.
-        """
+    def improve(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
+        """See `kernels.base.Kernels.sample`."""
         mean = U.clone(memory_format=torch.contiguous_format)
-        sampling.of = self.engine.packed(problem, X=problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1))
-        sampling.geometric = torch.tensor([int(c.geometric) for c in problem.constraints], dtype=torch.int32)
-        sampling.mean = mean
-        run(self.library.tgco_sample, problem.B, 1, sampling)
+        rounds = _structure(problem, how)
+        rounds.of = self.engine.packed(problem, X=problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1))
+        rounds.geometric = torch.tensor([int(c.geometric) for c in problem.constraints], dtype=torch.int32)
+        rounds.mean = mean
+        run(self.library.tgco_sample, problem.B, 1, rounds)
         return mean
+
+
+def _structure(problem: Problem, how: Sampling) -> structures.Sampling:
+    """All fields but `of`, `geometric` and `mean`."""
+    wide = problem.x0.new_full((1, 1, 1, problem.m), torch.inf)
+    lower, upper = (array(bound.squeeze(2).transpose(0, 1), knots=True) for bound in how.bounds or (-wide, wide))
+    rounds = structures.Sampling(
+        samples=how.samples, rounds=how.rounds, knots=how.noise_knots, decay=how.decay, elite=how.elite,
+        temperature=how.temperature, collision_penalty=how.collision_penalty, dwell_cost=how.dwell_cost,
+        keys=torch.stack([words(how.key, i) for i in range(how.rounds)], dim=-1),
+        deviation=array(how.sigma.sqrt(), knots=True), lower=lower, upper=upper,
+    )  # fmt: skip
+    if how.left is not None and how.share is not None:
+        rounds.left, rounds.share = how.left.to(torch.int32), how.share.double()
+    return rounds

@@ -56,10 +56,20 @@ class Captured:
         """Whether numbers that differ between problems depend on it, too."""
         return any(traced.is_mixed for traced in self.traces)
 
+    @property
+    def reads_own(self) -> bool:
+        """Whether a function's code has read the numbers of a problem that others may not have."""
+        return any(traced.reads_own for traced in self.traces)
+
+    @property
+    def nbytes(self) -> int:
+        """The size of all these tensors."""
+        return sum(tensor.nbytes for tensor in self._watch.tensors)
+
     def is_still(self, last: Shared | None) -> bool:
         """Whether `read` would give what it gave before, `last`; done without PyTorch's operations."""
         then, known = self._last
-        return last is not None and last is known and self._watch.look() == then
+        return then is not None and last is known and self._watch.look() == then
 
     def read(self) -> Shared | None:
         """The numbers as they are now, not to be written to; None where a function is to be traced again.

@@ -14,7 +14,9 @@ write to is not used, which a CacheWarning says; root's own are, as on a cluster
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+import math
 import os
 import re
 import stat
@@ -61,9 +63,19 @@ def made(parts: Sequence[str], make: Callable[[str], dict[str, Any]], kin: str =
             known = json.dumps(make(key)).encode()
             save(key, ".json", known)
         _made[key, place] = Made(key, json.loads(known))
-        if len(_made) > FILES:
-            del _made[next(iter(_made))]
+        trim(_made, FILES)
     return _made[key, place]
+
+
+def trim(
+    kept: dict[Any, Any], most: int, total: float = math.inf, size: Callable[[Any], float] = lambda _: 0.0
+) -> None:
+    """Drop the first entries beyond so many, or while the sizes of several add up to more; other threads may, too."""
+    pairs = list(kept.items())  # at once: no thread changes it meanwhile
+    sums = list(itertools.accumulate(size(value) for _, value in reversed(pairs)))[::-1]
+    for (key, _), left, after in zip(pairs, range(len(pairs), 1, -1), sums, strict=False):
+        if left > most or after > total:
+            kept.pop(key, None)
 
 
 def folder() -> Path:

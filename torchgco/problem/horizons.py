@@ -58,7 +58,7 @@ def within_horizons(problem: Problem) -> Problem:
         "cost": _cost(problem, running),
         "constraints": tuple(_constraint(problem, i) for i in range(len(problem.constraints))),
     }
-    return problem._with(parts, form=problem.form.setdefault(FORM, {}))
+    return problem._with(parts, known=problem.known.of_lifted(FORM))
 
 
 def at_rest_after(problem: Problem, U: Tensor) -> Tensor:

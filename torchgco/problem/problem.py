@@ -25,10 +25,9 @@ from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import chooses_position, moved_inside, start_mask
 from torchgco.problem.goal import Goal
+from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
 from torchgco.problem.summary import summary
-
-ROWS = "rows"  # marks the shapes of the constraints' rows among what a form keeps
 
 
 @dataclass(frozen=True)
@@ -65,9 +64,7 @@ class Problem:
     horizon: Any = None
     free_start: Any = None
 
-    # A cache for everything that depends only on the problems' form (native kernels, say), shared by all subsets of a
-    # batch.
-    form: ClassVar[dict[Any, Any]]
+    known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
 
     def __post_init__(self) -> None:
         self._check_border()
@@ -89,7 +86,7 @@ class Problem:
         given = self.goal if self.goal is not None and not self.goal.assumed else None
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
-        object.__setattr__(self, "form", {})
+        object.__setattr__(self, "known", Known())
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
@@ -190,12 +187,14 @@ class Problem:
     @property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
         """Knots and rows of every constraint; the same for all problems of a form."""
-        if ROWS not in self.form:
+        shapes = self.known.row_shapes
+        if shapes is None:
             # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
             one = self.take(slice(0, 1))
             X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-            self.form[ROWS] = tuple(tuple(c.value(X, U).shape[1:]) for c in one.constraints)
-        return self.form[ROWS]
+            found = [c.value(X, U).shape for c in one.constraints]
+            shapes = self.known.row_shapes = tuple((knots, rows) for _, knots, rows in found)
+        return shapes
 
     @property
     def cost_unit(self) -> Tensor:
@@ -217,11 +216,11 @@ class Problem:
         cost = self.cost.scaled(1.0 / unit)
         if bool((constant != 0).any()):
             cost = ShiftedCost(cost, constant / (unit * self.N))
-        return self._with({"cost": cost}, form=self.form)
+        return self._with({"cost": cost}, known=self.known)
 
     def __getstate__(self) -> dict[str, Any]:
         """The parts alone: native kernels stay in their process."""
-        return {f.name: getattr(self, f.name) for f in fields(self)} | {"form": {}}
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"known": Known()}
 
     def take(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a slice); a row may occur more than once.
@@ -239,7 +238,7 @@ class Problem:
             "horizon": None if self.horizon is None else self.horizon[index],
             "free_start": None if self.free_start is None else self.free_start[index],
         }
-        return self._with(parts, form=self.form)
+        return self._with(parts, known=self.known)
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
@@ -255,15 +254,15 @@ class Problem:
 
     def guessing(self, x: Tensor) -> Self:
         """The same problems with other guesses of their free starts, `start_in` x (B, n)."""
-        return self._with({"x0": self.start_in(x)}, self.form)
+        return self._with({"x0": self.start_in(x)}, self.known)
 
     def held_at(self, x: Tensor) -> Self:
         """The same problems with starts that are given, `start_in` x (B, n); themselves where no start is free."""
-        return self if self.free_start is None else self._with({"x0": self.start_in(x), "free_start": None}, self.form)
+        return self if self.free_start is None else self._with({"x0": self.start_in(x), "free_start": None}, self.known)
 
     def grown(self, by: Tensor) -> Self:
         """The same problems with their obstacles grown by `by` (B,), m."""
-        return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, form=self.form)
+        return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, known=self.known)
 
     def started_at(
         self,
@@ -322,12 +321,12 @@ class Problem:
         parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0", "goal")}
         return self._with(parts)
 
-    def _with(self, parts: dict[str, object], form: dict[Any, Any] | None = None) -> Self:
+    def _with(self, parts: dict[str, object], known: Known | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
         copy = object.__new__(type(self))
         for f in fields(self):
             object.__setattr__(copy, f.name, parts.get(f.name, getattr(self, f.name)))
-        object.__setattr__(copy, "form", {} if form is None else form)
+        object.__setattr__(copy, "known", Known() if known is None else known)
         return copy
 
     def check_controls(self, U: Tensor, field: str = "U0") -> None:

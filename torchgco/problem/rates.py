@@ -43,7 +43,7 @@ def with_controls_before(problem: Problem) -> Problem:
         "x0": torch.cat((x0, before[:, controls].expand(problem.B, -1)), dim=-1),
         "free_start": None if free is None else torch.nn.functional.pad(free, (0, len(controls))),
     }
-    return problem._with(parts, form=problem.form.setdefault(FORM, {}))
+    return problem._with(parts, known=problem.known.of_lifted(FORM))
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchgco.kernels import EagerWarning, native
 from torchgco.native.compiler import Compiler, NativeError, find_compiler
 from torchgco.native.declarations import Structure, fields, head, load
-from torchgco.native.dispatch import EagerWarning
 from torchgco.native.engine import run
-from torchgco.native.kernels import native
 from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated

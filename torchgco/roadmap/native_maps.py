@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchgco.kernels import EagerWarning, native
 from torchgco.native.compiler import Compiler, NativeError, find_compiler
 from torchgco.native.declarations import Structure, fields, head, load
-from torchgco.native.dispatch import EagerWarning
-from torchgco.native.kernels import native
 
 SURE = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at

@@ -17,7 +17,6 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
 
 LITTLE = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
-PATHS = "paths"  # marks whether there is a way to seek paths, among what a form keeps
 S = TypeVar("S", bound=Solids)
 FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
 
@@ -52,11 +51,11 @@ def has_paths(problem: Problem) -> bool:
     """Whether there is a goal, and obstacles among which the roadmap can seek a path to it."""
     if problem.dynamics.position is None:
         return False
-    if PATHS not in problem.form:
+    if problem.known.paths is None:
         one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
         rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
-        problem.form[PATHS] = scene_of(one, rest) is not None
-    return problem.form[PATHS]
+        problem.known.paths = scene_of(one, rest) is not None
+    return problem.known.paths
 
 
 def _by_kind(start: Tensor, parts: Sequence[Solids], maps: tuple[BoundField, ...]) -> Inflated | None:

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from torchgco.base.status import STOPPED, Status
 from torchgco.base.tree import copied, put, take
+from torchgco.kernels import chord_clearance
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import has_arrived, is_preferred
-from torchgco.native.dispatch import chord_clearance
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.candidates import unwatched
@@ -24,7 +25,6 @@ from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress, RowEnd
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import Iterate, SolveEnd
 
 CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
 

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.tree import LastTaken, put, take
+from torchgco.ilqr.line_search import LineSearch
+from torchgco.kernels import chord_clearance, measured, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import Penalty
-from torchgco.native.dispatch import chord_clearance, measured, value
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import at_rest_after
 from torchgco.problem.problem import Problem
@@ -21,7 +22,6 @@ from torchgco.roadmap import scene as seen
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ilqr import ILQR, descend
-from torchgco.solvers.line_search import LineSearch
 
 CANDIDATES_AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4

@@ -15,12 +15,12 @@ from torch import Tensor
 from torchgco.base.options import Count, check_options
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
+from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import has_arrived
-from torchgco.native.dispatch import chord_clearance, measured
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued, mapped
 from torchgco.search.row import Row
-from torchgco.solvers.state import SolveEnd
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
 GROWN_BARRIER = 1e-4  # of warm solves among grown obstacles, which lie deeper than rounding

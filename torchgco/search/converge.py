@@ -11,9 +11,10 @@ from torch import Tensor
 from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status, is_over
 from torchgco.base.tree import put, take
+from torchgco.kernels import chord_clearance
 from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.maps.field import BoundField
-from torchgco.native.dispatch import chord_clearance
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.nearby import Nearby
@@ -21,7 +22,6 @@ from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import Iterate, SolveEnd
 
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 

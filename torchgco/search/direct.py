@@ -16,6 +16,7 @@ from torch import Tensor
 from torchgco.base.options import Natural, NonNegative, check_options
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
@@ -23,7 +24,6 @@ from torchgco.search.nearby import without_obstacles
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import SolveEnd
 
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little
 LIMIT = 100  # iterations

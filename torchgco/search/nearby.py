@@ -15,13 +15,13 @@ from torch import Tensor
 
 from torchgco.base.tree import put
 from torchgco.constraints.base import Constraint
+from torchgco.kernels import chord_clearance, kernels_of, measured
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.native.dispatch import chord_clearance, engine_of, measured
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.obstacles.base import Obstacles, Solids
-from torchgco.problem.problem import ROWS, Problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import Iterate, SolveEnd
 
 DETOUR = math.sqrt(2.0)  # ways this many times as long as the straight one stay within half of its length from it
 FEWER = 0.5  # share of a problem's obstacles that must be far from a trajectory, for leaving any out of its refining
@@ -104,9 +104,8 @@ def without_obstacles(problem: Problem) -> Problem | None:
 
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
-    engine_of(problem)  # which both then share: two forms would trace the problem twice
-    other = problem._with({"constraints": constraints}, form=dict(problem.form))
-    other.form.pop(ROWS, None)
+    kernels_of(problem)  # which both then share: two forms would trace the problem twice
+    other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None))
     return other
 
 

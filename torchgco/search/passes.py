@@ -14,15 +14,15 @@ import torch
 from torchgco.base.options import Count, Natural, check_options
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
+from torchgco.kernels import cost_unit
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import goal_tolerance
-from torchgco.native.dispatch import cost_unit
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.proposals import WHEN
 from torchgco.search.row import Row
 from torchgco.solvers.caught import StopWhenCaught
-from torchgco.solvers.state import SolveEnd
 
 WITHIN = 0.95  # share of the goal tolerance to which trajectories are attracted
 STIFF = 1e3  # weight of that attraction, in units of cost per radius^4

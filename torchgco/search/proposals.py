@@ -21,8 +21,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Natural, Positive, check_options
 from torchgco.base.tree import put, take
+from torchgco.kernels import cost_unit, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.native.dispatch import cost_unit, open_loop, value
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Scene

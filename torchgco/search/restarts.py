@@ -10,7 +10,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
-from torchgco.native.dispatch import expect_interior
+from torchgco.kernels import expect_interior
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.attempts import Late, Search

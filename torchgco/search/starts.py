@@ -13,12 +13,12 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.status import UNMOVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.constraints.bounds import ControlBounds
+from torchgco.lagrangian.state import Iterate
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import Converge, keep_tight
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import Iterate
 
 KNOTS = 4  # of the noise: with 8, guesses are bent more often than optima are, and lead to fewer of them
 STREAM = 1 << 21  # outer iteration that keys the noise: no solve makes so many

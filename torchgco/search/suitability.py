@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from torchgco.guidance.suitability import check_form, failure
+from torchgco.kernels import kernels_of
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.row import Row
@@ -32,7 +32,7 @@ def suited_paths(passes: Sequence[Row], problem: Problem) -> tuple[Sequence[Row 
         return others, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
     if not has_paths(problem):
         return others, None
-    why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
+    why = None if kernels_of(problem).compiled else failure(_expand, problem, problem.x0.dtype)
     if why is not None:
         return others, f"no path can be followed ({why})"
     return [one.fitting(problem.m) for one in passes], None

@@ -17,9 +17,10 @@ from torch import Tensor
 from torchgco.base.options import Count, check_options
 from torchgco.base.status import Status
 from torchgco.base.tree import take
+from torchgco.kernels import chord_clearance, open_loop
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import has_arrived
-from torchgco.native.dispatch import chord_clearance, open_loop
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.attempts import Search
@@ -29,7 +30,6 @@ from torchgco.search.following import Follow, Free, Paths
 from torchgco.search.proposals import Part
 from torchgco.search.row import Row
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import SolveEnd
 
 AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
 # Tracked candidates lie a small part of R inside an obstacle, from where the interior point leads out of it again; from

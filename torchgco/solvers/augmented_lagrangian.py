@@ -13,11 +13,12 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive, check_options
 from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.base.tree import copied, put, take
+from torchgco.kernels import kernels_of, measured, open_loop, value
+from torchgco.kernels.base import OuterPasses
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, update_and_raise_penalty
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import is_preferred
-from torchgco.native.dispatch import engine_of, measured, open_loop, value
-from torchgco.native.engine import Engine
+from torchgco.lagrangian.state import Iterate, PassEnd, SolveEnd, State
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -25,10 +26,8 @@ from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Advice, Call, Guidance, Progress, Solver
 from torchgco.solvers.ending import start_status
 from torchgco.solvers.history import Recorder
-from torchgco.solvers.ilqr import ILQR, advance
-from torchgco.solvers.native_outer import NativeOuter
+from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.session import Session
-from torchgco.solvers.state import Iterate, PassEnd, SolveEnd, State
 
 PENALTY_MAX = 1e12  # ceiling of mu
 HALVED = 0.5  # of a violation: the least that an outer iteration with a growing penalty should give
@@ -140,7 +139,7 @@ class OuterLoop:
         self._result: SolveEnd | None = None
         self.stopped = 0  # problems that guidance has stopped
         self.limit = 1 if recorder is not None else solver.inner.max_iterations
-        self._native: NativeOuter | None = None  # of the running problems
+        self._passes: OuterPasses | None = None  # of the running problems
 
     @property
     def result(self) -> SolveEnd:
@@ -179,7 +178,7 @@ class OuterLoop:
     def regroup(self, rows: Tensor) -> None:
         """Continue with these problems as the running ones."""
         self.problem = self._part(rows)
-        self._native = None
+        self._passes = None
 
     def _part(self, rows: Tensor) -> Problem:
         """The problems `rows`, in their order; all of them are the whole, of which native kernels know more."""
@@ -191,42 +190,50 @@ class OuterLoop:
 
         At least one inner solve each; by PyTorch, or if recorded, one iteration.
         """
-        engine = engine_of(self.problem)
-        status = self._by_pytorch(s) if engine is None or not engine.measures else self._by_native(engine, s)
+        status = self._by_iterations(s) if (passes := self._whole_passes(s)) is None else self._by_passes(passes, s)
         if self.call.late:
             status[status == Status.RUNNING] = Status.TIME_LIMIT
         return status
 
-    def _by_native(self, engine: Engine, s: State) -> Tensor:
-        """As `advance`: with one call of the library for all of it where nothing else has to look on."""
+    def _whole_passes(self, s: State) -> OuterPasses | None:
+        """Passes over the running problems by their kernels; None where these make single iterations alone."""
         solver, stop = self.solver, self.guidance if isinstance(self.guidance, StopWhenCaught) else None
-        guided = self.guidance is not None and stop is None
-        if self._native is None or guided:  # guidance may have replaced tensors of the state
-            base = self.call.outer[s.rows]
-            self._native = NativeOuter(
-                engine, solver.inner, self.problem, s, stop, base, self.by_arrival,
-                max_outer=solver.max_outer_iterations, patience=-1 if solver.patience is None else solver.patience,
-                growth=solver.penalty_growth, stalled_growth=solver.stalled_growth or 0.0, penalty_max=PENALTY_MAX,
+        if self._passes is None or self._guided:  # guidance may have replaced tensors of the state
+            after = None if stop is None else stop.single_contact_after
+            self._passes = kernels_of(self.problem).outer_passes(
+                self.problem, s, solver.inner.descent, phr=self.rules.phr, base=self.call.outer[s.rows],
+                by_arrival=self.by_arrival, stops=stop is not None, single_after=-1 if after is None else after,
+                ends=self.rules.ends, max_outer=solver.max_outer_iterations,
+                patience=-1 if solver.patience is None else solver.patience, growth=solver.penalty_growth,
+                stalled_growth=solver.stalled_growth or 0.0, penalty_max=PENALTY_MAX,
                 tolerance=solver.violation_tolerance, halved=HALVED, settled=SETTLED,
             )  # fmt: skip
-        native = self._native
+        return self._passes
+
+    @property
+    def _guided(self) -> bool:
+        """Whether guidance is asked after every pass."""
+        return self.guidance is not None and not isinstance(self.guidance, StopWhenCaught)
+
+    def _by_passes(self, passes: OuterPasses, s: State) -> Tensor:
+        """As `advance`: with one call of the kernels for all of it where nothing else has to look on."""
         if self.recorder is not None:
-            self.recorder.add(self.problem, self.call.rows[s.rows], s, native.iterate())
-            native.update()
-        elif guided or self.call.callback is not None or self.call.deadline is not None:
-            native.run(1)
+            self.recorder.add(self.problem, self.call.rows[s.rows], s, passes.iterate())
+            passes.update()
+        elif self._guided or self.call.callback is not None or self.call.deadline is not None:
+            passes.run(1)
         else:
-            native.run_half(PASSES)
-        status = native.outcome.clone()
-        going = (native.ended & (status == Status.RUNNING)).nonzero().flatten()
-        if guided and going.numel() > 0:
+            passes.run_half(PASSES)
+        status = passes.outcome.clone()
+        going = (passes.ended & (status == Status.RUNNING)).nonzero().flatten()
+        if self._guided and going.numel() > 0:
             self._ask_guidance(self.problem, s, going, status)
             self._begin_inner(self.problem, s, going)
         return status
 
-    def _by_pytorch(self, s: State) -> Tensor:
+    def _by_iterations(self, s: State) -> Tensor:
         lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, self.rules.phr)
-        end = advance(self.solver.inner, s, lagrangian, self.limit)
+        end = kernels_of(self.problem).descend(lagrangian, s, self.solver.inner.descent, self.limit)
         if self.recorder is not None:
             self.recorder.add(self.problem, self.call.rows[s.rows], s, end)
         rows = end.ended.nonzero().flatten()

@@ -19,9 +19,9 @@ from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
+from torchgco.kernels import cost_unit, current, open_loop, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.native.dispatch import cost_unit, current, kernels_of, open_loop
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
@@ -197,7 +197,7 @@ class Solver(Brief):
                 warnings.warn(held, StartWarning, stacklevel=2)
             found = self.run(call)
             found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
-            return replace(found, account=Account(problem, self, kernels=self.kernels or kernels_of(call.problem)))
+            return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""

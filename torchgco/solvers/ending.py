@@ -6,18 +6,16 @@ J_var + lam'c, plus the complementarity gap. It doesn't depend on the scale of c
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchgco.base.status import STALLED, UNMOVED, Status, is_over
-from torchgco.lagrangian.expansion import linearise
+from torchgco.ilqr.riccati import BackwardPass
+from torchgco.kernels import cost_unit, kernels_of
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.native.dispatch import cost_unit, engine_of
 from torchgco.problem.problem import Problem
-from torchgco.solvers.riccati import BackwardPass, backward
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
@@ -46,7 +44,7 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
     """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers."""
     problem = lagrangian.problem
     slack = lagrangian.slack(X, U)
-    run = _backward(lagrangian, X, U)
+    run = kernels_of(problem).optimality_pass(lagrangian, X, U)
     mu = torch.zeros_like(slack)
     step = run(mu)
     for i in range(TRIES):
@@ -70,20 +68,6 @@ def constant_cost(problem: Problem) -> Tensor:
 def least_cost(problem: Problem) -> Tensor:
     """As how much each problem's cost counts at least where a share of it is meant, (B,)."""
     return LEAST_COST * problem.N * cost_unit(problem)
-
-
-def _backward(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
-    """The backward pass on J_var + lam'c for regularisations mu_r (B,)."""
-    problem, engine = lagrangian.problem, engine_of(lagrangian.problem)
-    if engine is None:
-        F, H = linearise(problem, X, U), lagrangian.expand_optimality(X, U)
-        return lambda mu: backward(F, H, mu)
-
-    def native(mu: Tensor) -> BackwardPass:
-        G, linear, quadratic, failed = engine.gains(lagrangian, X, U, mu)
-        return BackwardPass(G.transpose(0, 1), linear, quadratic, failed)
-
-    return native
 
 
 def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:

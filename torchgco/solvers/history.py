@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchgco.native.dispatch import measured
+from torchgco.kernels import measured
+from torchgco.lagrangian.state import PassEnd, State
 from torchgco.problem.problem import Problem
-from torchgco.solvers.state import PassEnd, State
 
 if TYPE_CHECKING:
     import pandas as pd

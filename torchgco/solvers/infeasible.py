@@ -7,14 +7,14 @@ from torch import Tensor
 
 from torchgco.base.status import STALLED, Status
 from torchgco.base.tree import put, take
+from torchgco.ilqr.riccati import backward
+from torchgco.kernels import cost_unit, measured
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import cost_unit, measured
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ilqr import ILQR, descend
-from torchgco.solvers.riccati import backward
-from torchgco.solvers.state import Iterate, SolveEnd
 
 GAVE_UP = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE, Status.NON_FINITE
 HEAVY = 1e11  # penalty beside which a cost of one unit counts for nothing

@@ -14,11 +14,7 @@ from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.kernels import least_violation
-from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.lagrangian.quality import is_better
-from torchgco.lagrangian.unmoved import unmoved
-from torchgco.native.dispatch import (
-    InteriorKernels,
+from torchgco.kernels import (
     cost_unit,
     expect_interior,
     followed,
@@ -26,6 +22,11 @@ from torchgco.native.dispatch import (
     measured,
     open_loop,
 )
+from torchgco.kernels.base import InteriorKernels
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import is_better
+from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.lagrangian.unmoved import unmoved
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
@@ -33,7 +34,6 @@ from torchgco.solvers.ending import STATIONARY, constant_cost, least_cost, start
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
-from torchgco.solvers.state import Iterate, SolveEnd
 
 AT_ONCE = 256  # problems between two reports of progress
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit

@@ -7,8 +7,8 @@ import torch
 from torchgco.base.memory import free_memory
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import check_device
+from torchgco.kernels import kernels_of
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem, check_problem
 
 CPU_LIMIT = 256  # a larger batch is no faster on a core: the overhead that problems share is negligible by then
@@ -30,7 +30,7 @@ def element_bytes(problem: Problem) -> int:
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
     rows = sum(lam.numel() for lam in Multipliers.zero(one, 0.0).lam)
     # F, H and the derivatives they are built from; native kernels hold them for eight problems only.
-    expansion = 0 if engine_of(problem) is not None else N * (2 * z * s + 2 * s * s)
+    expansion = 0 if kernels_of(problem).compiled else N * (2 * z * s + 2 * s * s)
     return least_bytes(N, n, m, rows) + BYTES_PER_NUMBER * expansion
 
 

@@ -35,12 +35,6 @@ class Rules:
         """The call in the units of cost that the solver works in, and these units (B,)."""
         return call.in_cost_units() if self.in_cost_units else (call, torch.ones_like(call.problem.x0[:, 0]))
 
-    def is_flat(self, change: Tensor, expected: Tensor, merit: Tensor, tolerance: float) -> Tensor:
-        """Whether L_M = merit (B,) changes too little to go on: as a share of it, or as printed in units of cost."""
-        if not self.in_cost_units:
-            return change < tolerance
-        return torch.maximum(change, expected) <= tolerance * merit.abs()
-
 
 PRINTED = Rules(in_cost_units=False, phr=False, accept_last=True, damped=False, ends=False)
 STANDARD = Rules(in_cost_units=True, phr=True, accept_last=False, damped=True, ends=True)

@@ -12,15 +12,15 @@ from torchgco.base.errors import TraceWarning
 from torchgco.base.status import STOPPED, Status, is_over
 from torchgco.base.tree import is_users, put, spread, take
 from torchgco.dynamics.rollout import open_loop
+from torchgco.kernels import kernels_of, reproducible
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import engine_of, reproducible
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import Optimality, final_status, optimality
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.rules import Rules
-from torchgco.solvers.state import Iterate, SolveEnd
 from torchgco.solvers.unbounded import falls_without_end
 
 UNLIKE = 1e-6  # difference of two rollouts' steps, as a share of the largest state, that no rounding explains
@@ -89,7 +89,7 @@ class Session:
         """
         user = self.given.problem
         unlike = torch.zeros_like(found.cost, dtype=torch.bool)
-        if engine_of(user) is None or not is_users(user.dynamics) or found.U.numel() == 0:
+        if not kernels_of(user).compiled or not is_users(user.dynamics) or found.U.numel() == 0:
             return found, unlike
         X = found.X[:, 1:]
         gap = (user.along.step(found.X[:, :-1], found.U) - X).abs() / (1.0 + X.abs().amax(dim=(1, 2), keepdim=True))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.native.dispatch import cost_unit, measured, open_loop
+from torchgco.kernels import cost_unit, measured, open_loop
+from torchgco.lagrangian.state import Iterate
 from torchgco.problem.problem import Problem
 from torchgco.solvers.ending import STATIONARY, constant_cost
-from torchgco.solvers.state import Iterate
 
 # Falls of the cost from that of the guess, as multiples of the size of that cost plus the cost unit of all stages.
 DEEP = 1e6  # a fall that asks for a closer look

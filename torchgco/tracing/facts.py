@@ -8,46 +8,52 @@ clocks, random numbers, C extensions, names made at run time) ends it: such a fu
 
 from __future__ import annotations
 
+import abc
 import collections
-import dis
 import functools
 import hashlib
-import sys
 import types
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.modules.module import _has_any_global_hook
+from torch.nn.utils import parametrize
 from torch.utils._device import DeviceContext
 from torch.utils._python_dispatch import _get_current_dispatch_mode_stack
 
 from torchgco.base.tree import PerElement
+from torchgco.tracing.trust import (
+    BY_NAME,
+    ELSEWHERE,
+    HEAP,
+    OPERATIONS,
+    is_fixed,
+    is_library,
+    is_made,
+    is_python,
+    is_trusted,
+    read_by,
+    tells_settings,
+)
 
 MOST = 50_000  # facts of a problem: with more of them a trace is as quick
 FEW = 10_000  # numbers of a tensor of torchgco's own parts that are compared by content
-PLAIN = {bool, int, str, bytes, complex, range, torch.dtype, torch.device, *map(type, (None, ..., NotImplemented))}
+PLAIN = {bool, int, str, bytes, torch.dtype, torch.device, *map(type, (None, ..., NotImplemented))}
 TENSORS = {Tensor, torch.nn.Parameter}
-# Packages whose functions compute by their arguments alone, and whose classes keep what they know in `vars`.
-TRUSTED = {
-    "torch", "torchgco", "numpy", "math", "cmath", "operator", "builtins", "functools", "itertools", "collections",
-    "dataclasses", "enum", "abc", "typing", "types", "copy", "contextlib", "numbers", "string", "warnings",
+# What Python and decorators write into a class; no code reads numbers there.
+BESIDES = {
+    "__dict__", "__weakref__", "__annotations__", "__slots__", "__orig_bases__", "__parameters__",
+    "__dataclass_fields__", "__dataclass_params__", "__objclass__", "__slotnames__",
+    "_abc_impl",
 }  # fmt: skip
-APART = "numpy.random", "torch.jit", "torch._C", "torch.hub"  # parts of them that do otherwise
-# Names by which these packages' functions read from elsewhere, be it global or an attribute.
-ELSEWHERE = {
-    "globals", "locals", "eval", "exec", "compile", "open", "input", "breakpoint", "__import__", "__builtins__",
-    "__globals__", "random", "rand", "seed", "initial_seed", "load", "loadtxt", "genfromtxt", "fromfile", "from_file",
-    "memmap", "hub", "jit", "ctypes",
-}  # fmt: skip
-BY_NAME = {"getattr", "hasattr", "vars", "dir", "attrgetter", "methodcaller", "__dict__", "__getattribute__"}
-BESIDES = {"__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slots__", "_abc_impl"}
-HISTORY = {"grad", "_grad", "grad_fn", "is_leaf", "_version"}
-HEAP = 1 << 9  # the flag of classes that a program has made
+# What tensors know of their past, and what was asked of them: it changes without any change of theirs.
+HISTORY = {"grad", "_grad", "grad_fn", "is_leaf", "_version", "retains_grad", "_backward_hooks", "_base"}
 ABSENT = "absent"
 
 
@@ -73,6 +79,7 @@ class Facts:
         self._passed: list[Any] = []  # what the walk has met: meanwhile nothing else gets these identities, either
         self._names: set[str] = set()
         self._modules: list[types.ModuleType] = []
+        self._libraries: list[Any] = [Tensor]
         self._tensors: dict[int, Tensor] = {}
         self._memory: list[tuple[int, int]] = []
         try:
@@ -80,7 +87,9 @@ class Facts:
                 self.walk(root)
             self._walk_modules()
             self._walk_histories()
-        except (RecursionError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+        except Unseen:
+            raise
+        except Exception as error:  # of a user's `__getattr__`, say
             raise Unseen(str(error)) from error
         self.key = tuple(self._found)
         del self._met, self._passed, self._found
@@ -103,13 +112,15 @@ class Facts:
             self._all(thing)
         elif isinstance(thing, type):
             self._class(thing)
-        elif kind in _WALKS or not isinstance(thing, (np.generic, Enum, np.ufunc, *_OPERATIONS)):
-            if self._first(thing):
-                _WALKS.get(kind, Facts._object)(self, thing)
         elif isinstance(thing, np.generic):
-            self.note(kind, thing.tobytes())
-        else:
+            self._scalar(thing)
+        elif isinstance(thing, OPERATIONS):
+            if not is_fixed(thing):
+                raise Unseen(str(thing))
             self.same(thing)
+        elif self._first(thing):
+            walk = Facts._member if isinstance(thing, Enum) else _WALKS.get(kind, Facts._object)
+            walk(self, thing)
 
     def note(self, *facts: Hashable) -> None:
         self._found.append(facts)
@@ -139,7 +150,8 @@ class Facts:
     def _tensor(self, tensor: Tensor) -> None:
         self._tensors[id(tensor)] = tensor
         self.same(tensor)
-        self.note(tensor.shape, tensor.stride(), tensor.dtype, tensor.device, tensor.requires_grad)
+        self.note(tensor.shape, tensor.stride(), tensor.storage_offset())
+        self.note(tensor.dtype, tensor.device, tensor.requires_grad)
         if vars(tensor):
             self._items(vars(tensor))
 
@@ -153,7 +165,12 @@ class Facts:
             self._memory.append((first + low, first + high + array.itemsize))
         self.same(array)
         digest = hashlib.blake2b(array.tobytes()).digest()
-        self.note(first, array.dtype.str, array.shape, array.strides, digest)
+        self.note(first, str(array.dtype), array.shape, array.strides, digest)
+
+    def _scalar(self, number: np.generic) -> None:
+        if number.dtype.hasobject:
+            raise Unseen("an object in a NumPy scalar")
+        self.note(type(number), str(number.dtype), number.tobytes())
 
     def _items(self, items: Any) -> None:
         self.note(len(items))
@@ -175,15 +192,18 @@ class Facts:
             except ValueError:  # not filled yet
                 self.note(ABSENT)
         self._all((function.__defaults__, function.__kwdefaults__))
-        if is_trusted(function.__module__):
-            return self.same(function)
         self.same(function.__code__)
         if vars(function):
             self._items(vars(function))
+        if is_library(function):
+            if tells_settings(function.__name__, function):
+                raise Unseen(function.__name__)
+            return self.same(function)
+        self.note(function.__name__, function.__doc__)
         known = function.__globals__
         usual: Any = known.get("__builtins__", {})
         usual = vars(usual) if isinstance(usual, types.ModuleType) else usual
-        code = _code(function.__code__)
+        code = read_by(function.__code__)
         self._names |= code.names
         for name in code.reads:
             if name in known or name in usual:
@@ -201,10 +221,11 @@ class Facts:
         if of is None or isinstance(of, types.ModuleType):
             home = function.__module__ if of is None else name
             # What torch._C has is the functions of torch.
-            if not (is_trusted(home) or str(home).startswith("torch._C")) or function.__name__ in ELSEWHERE:
+            by_arguments = is_trusted(home) or str(home).startswith("torch._C")
+            if not by_arguments or function.__name__ in ELSEWHERE or tells_settings(function.__name__, function):
                 raise Unseen(function.__name__)
         elif isinstance(of, type):
-            if of.__module__.partition(".")[0] not in TRUSTED:
+            if not is_trusted(of.__module__) and not of.__module__.startswith("torch._C"):
                 raise Unseen(function.__name__)
         else:
             self.walk(of)
@@ -212,7 +233,7 @@ class Facts:
         return self.same(function)
 
     def _descriptor(self, found: Any) -> None:
-        if found.__objclass__.__module__.partition(".")[0] not in TRUSTED:
+        if not is_trusted(found.__objclass__.__module__) and not found.__objclass__.__module__.startswith("torch._C"):
             raise Unseen(found.__name__)
         self.same(found)
 
@@ -220,60 +241,92 @@ class Facts:
         self._all((part.func, part.args, part.keywords, vars(part)))
 
     def _module(self, module: types.ModuleType) -> None:
-        if is_trusted(module.__name__):
+        if is_library(module):
+            self._libraries.append(module)
             return self.same(module)
-        if not _is_python(module.__name__):
+        if not is_python(module.__name__):
             raise Unseen(module.__name__)
         self._modules.append(module)
         return None
 
     def _walk_modules(self) -> None:
-        """What code may read of modules: all attributes whose names it has."""
+        """What code may read of modules, and of tensors' class: all attributes whose names it has."""
         done = set[tuple[int, str]]()
         while True:
-            pairs = [(module, name) for module in self._modules for name in sorted(self._names)]
-            new = [(module, name) for module, name in pairs if (id(module), name) not in done]
+            names = sorted(self._names)
+            pairs = [(self._of_module, module, name) for module in self._modules for name in (*names, "__getattr__")]
+            pairs += [(self._of_library, module, name) for module in self._libraries for name in names]
+            new = [pair for pair in pairs if (id(pair[1]), pair[2]) not in done]
             if not new:
                 break
-            for module, name in new:
+            for walk, module, name in new:
                 done.add((id(module), name))
                 if name in vars(module):
                     self.note(name)
-                    self.walk(vars(module)[name])
+                    walk(name, vars(module)[name])
         if self._names & ELSEWHERE or (self._modules and self._names & BY_NAME):
             raise Unseen(f"one of {sorted(self._names & (ELSEWHERE | BY_NAME))}")
 
+    def _of_module(self, name: str, value: Any) -> None:
+        self.walk(value)
+
+    def _of_library(self, name: str, value: Any) -> None:
+        """What stands under a name in a trusted package, where a program may have put another thing."""
+        if tells_settings(name, value):
+            raise Unseen(name)
+        kind = type(value)
+        if isinstance(value, types.ModuleType):
+            if is_library(value):
+                self._module(value)
+        elif (kind is types.FunctionType and not is_library(value)) or kind in PLAIN or kind is float:
+            self.walk(value)
+        else:
+            self.same(value)
+
     def _walk_histories(self) -> None:
-        """What tensors know of their past, where code may ask for it: it changes without any change of theirs."""
+        """What code may ask tensors for that changes without any change of theirs."""
         for name in sorted(HISTORY & self._names):
             for tensor in list(self._tensors.values()):
                 value = getattr(tensor, name)
                 self.walk(value if type(value) in (bool, int, *TENSORS) else value is None)
 
     def _class(self, cls: type) -> None:
-        """A class by identity, and with its code where it is a user's."""
+        """A class by identity, with what stands in it: a program may put other methods there, by names or from afar."""
         if not self._first(cls):
             return
         self.same(cls)
-        if is_trusted(cls.__module__) or issubclass(cls, Enum):
+        if "_abc_impl" in vars(cls):  # classes that were registered for an abstract one
+            self.note(len(abc._get_dump(cls)[0]))  # type: ignore[attr-defined]
+        if is_library(cls):
+            if cls.__flags__ & HEAP:
+                held = [value for name, value in vars(cls).items() if name not in BESIDES]
+                self.alive += held
+                self.note(*map(id, held))
+                self._all(cls.__mro__[1:])
             return
-        if not is_trusted(type(cls).__module__) or not _is_made(cls):
+        if not is_library(type(cls)) or not is_made(cls):
             raise Unseen(cls.__name__)
-        for base in cls.__mro__[1:]:
-            self.walk(base)
+        self._all(cls.__mro__[1:])
+        self.note(cls.__name__)
         for name, value in list(vars(cls).items()):
-            special = name.startswith("__") and name.endswith("__") and not isinstance(value, _CODE)
-            if name not in BESIDES and not special and not isinstance(value, _SLOTS):
+            if name not in BESIDES and not isinstance(value, _SLOTS):
                 self.note(name)
                 if name == "__repr__":  # that of a dataclass asks for the thread that it runs in
                     value = getattr(value, "__wrapped__", value)
                 self.walk(value)
+        if is_dataclass(cls):
+            self._all([dict(field.metadata) for field in fields(cls)])
+
+    def _member(self, member: Enum) -> None:
+        self.same(member)
+        self._class(type(member))
+        self._items(vars(member))
 
     def _object(self, thing: Any) -> None:
         kind = type(thing)
         self._class(kind)
         is_tuple = isinstance(thing, tuple)
-        if any(not _is_made(base) for base in kind.__mro__ if base is not object and not (base is tuple and is_tuple)):
+        if any(not is_made(base) for base in kind.__mro__ if base is not object and not (base is tuple and is_tuple)):
             raise Unseen(kind.__name__)
         if is_tuple:
             self._all(thing)
@@ -311,68 +364,12 @@ def _surroundings() -> tuple[Hashable, ...]:
     modes = map(torch._C._get_function_stack_at, range(torch._C._len_torch_function_stack()))
     if _get_current_dispatch_mode_stack() or any(type(mode) is not DeviceContext for mode in modes):
         raise Unseen("a mode of PyTorch")
+    if _has_any_global_hook() or parametrize._cache_enabled:
+        raise Unseen("hooks of all modules, or parametrizations that are kept")
     autocast = torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu")
     return torch.get_default_dtype(), torch.get_default_device(), autocast
 
 
-def is_trusted(module: str | None) -> bool:
-    """Whether the functions of a module compute by their arguments alone."""
-    return module is not None and module.partition(".")[0] in TRUSTED and not module.startswith(APART)
-
-
-@dataclass(frozen=True)
-class _Code:
-    """What a code object, with those within it, reads by name."""
-
-    code: types.CodeType
-    reads: tuple[str, ...]  # globals
-    names: frozenset[str]  # these and attributes
-
-
-_codes: dict[int, _Code] = {}
-
-
-def _code(code: types.CodeType) -> _Code:
-    known = _codes.get(id(code))
-    if known is None:
-        if len(_codes) > MOST:
-            _codes.clear()
-        reads, names = dict[str, None](), set(code.co_names)
-        for step in dis.get_instructions(code):
-            if step.opname in ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"):
-                reads[step.argval] = None
-            elif step.opname == "IMPORT_NAME" and not is_trusted(step.argval):
-                names.add("__import__")
-        for inner in code.co_consts:
-            if isinstance(inner, types.CodeType):
-                within = _code(inner)
-                reads |= dict.fromkeys(within.reads)
-                names |= within.names
-        known = _codes[id(code)] = _Code(code, tuple(reads), frozenset(names))
-    return known
-
-
-@functools.lru_cache(maxsize=4096)
-def _is_python(module: str) -> bool:
-    """Whether a module is written in Python."""
-    found = sys.modules.get(module)
-    file = getattr(found, "__file__", None)
-    in_c = module in sys.builtin_module_names if file is None else not str(file).endswith((".py", ".pyc"))
-    return found is not None and not in_c
-
-
-@functools.lru_cache(maxsize=4096)
-def _is_made(cls: type) -> bool:
-    """Whether a class is made by a program in Python: its objects know nothing that `vars` and slots don't have."""
-    if not cls.__flags__ & HEAP or not _is_python(cls.__module__):
-        return False
-    own = (value for value in vars(cls).values() if isinstance(value, _IN_C))
-    return not any(value.__objclass__ is cls for value in own)
-
-
-_OPERATIONS = torch._ops.OpOverload, torch._ops.OpOverloadPacket
-_CODE = types.FunctionType, classmethod, staticmethod, property
-_IN_C = types.MethodDescriptorType, types.WrapperDescriptorType
 _SLOT = types.MemberDescriptorType
 _SLOTS = _SLOT, types.GetSetDescriptorType, type(collections.namedtuple("_", "x").x)  # type: ignore[attr-defined]
 _WALKS: dict[type, Callable[[Facts, Any], object]] = {
@@ -380,6 +377,8 @@ _WALKS: dict[type, Callable[[Facts, Any], object]] = {
     **dict.fromkeys((dict, OrderedDict, defaultdict, types.MappingProxyType), Facts._items),
     **dict.fromkeys((list, collections.deque), Facts._all),
     **dict.fromkeys((set, frozenset), Facts._set),
+    complex: lambda facts, number: facts.note(number.real.hex(), number.imag.hex()),
+    range: lambda facts, part: facts.note(part.start, part.stop, part.step),
     slice: lambda facts, part: facts._all((part.start, part.stop, part.step)),
     types.SimpleNamespace: lambda facts, space: facts._items(vars(space)),
     types.FunctionType: Facts._function,

@@ -28,8 +28,8 @@ SHAPES = ("view", "reshape", "_unsafe_view", "unsqueeze", "squeeze", "expand", "
 LINEAR = ("add", "sub", "rsub", "neg", "full_like", "zeros_like", "ones_like")
 CURVED = (
     "mul", "div", "reciprocal", "pow", "square", "sqrt", "rsqrt", "abs", "sign", "sin", "cos", "tan", "asin", "acos",
-    "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "erf", "sigmoid", "elu",
-    "log_sigmoid_forward", "relu", "leaky_relu", "softplus", "gelu", "where", "clamp", "clamp_min", "clamp_max",
+    "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "erf", "sinc", "sigmoid",
+    "elu", "log_sigmoid_forward", "relu", "leaky_relu", "softplus", "gelu", "where", "clamp", "clamp_min", "clamp_max",
     "hardtanh", "maximum", "minimum", "lt", "le", "gt", "ge", "eq", "ne", "logical_and", "logical_or", "logical_not",
 )  # fmt: skip
 KEEPS = {f"aten.{name}" for name in SHAPES} | {"prims.convert_element_type"}
@@ -158,7 +158,7 @@ class Nets:
         places, end = self._places(first)
         numbers = torch.zeros(end - first, dtype=torch.float64, device="cpu")
         for (slot, turned), place in places.items():
-            value = known[slot].detach()
+            value = known[slot].detach().to_dense()
             part = numbers[place - first :][: value.numel()]
             part.copy_((value.T if turned else value).reshape(-1))
         return numbers
@@ -172,9 +172,7 @@ class Nets:
                 yield part, operation
             begun.add(id(part))
 
-    def call(
-        self, part: Part, known: dict[Slot, Any], first: int, precision: torch.dtype, calls: list[Call]
-    ) -> None:
+    def call(self, part: Part, known: dict[Slot, Any], first: int, precision: torch.dtype, calls: list[Call]) -> None:
         """Add a network's calls to `calls`, one a row, and its outputs, symbols, to `known`.
 
         Args:
@@ -264,11 +262,15 @@ class _Search:
         (width,) = widths
         if any(part.widths[slot] != width for slot in operation.inputs if slot in self._of):
             return
-        if any(math.prod(self._shapes[slot]) not in (1, width) or self._shapes[slot][-1:] not in ((), (1,), (width,))
-               for slot in read):  # fmt: skip
+        if not all(self._is_of_neurons(slot, width) for slot in read):
             return
         part.vectors += read
         self._add(part, operation)
+
+    def _is_of_neurons(self, slot: Slot, width: int | None) -> bool:
+        """Whether all rows are combined with the same weights: one, or one of each neuron, but not one of each row."""
+        shape = self._shapes[slot]
+        return math.prod(shape[:-1]) == 1 and shape[-1:] in ((), (1,), (width,))
 
     def _width(self, slot: Slot, rows: int) -> int | None:
         """The neurons of an array with so many rows; None of other shapes."""

@@ -80,7 +80,20 @@ _lt, _le, _gt, _ge, _eq, _ne = map(
     _comparison, (operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne)
 )
 _truediv, _floor, _fmod = _binary(operator.truediv), _unary("floor"), _binary("fmod")
-_power = _binary(operator.pow)
+
+
+def _raise(a: Any, b: Any) -> Any:
+    power = a**b
+    if not isinstance(b, _casadi().SX) or b.is_constant():
+        return power
+    # At a = 0 the derivatives b a^(b-1), b (b-1) a^(b-2) and a^b log(a) may be 0 times infinity.
+    at_zero = _choose(b > 2.0, 0.0, power)
+    for whole, value in ((2.0, a * a), (1.0, a), (0.0, 1.0)):
+        at_zero = _choose(b == whole, value, at_zero)
+    return _choose(a == 0.0, at_zero, power)
+
+
+_power = _binary(_raise)
 _sqrt = _unary("sqrt")
 _fmin, _fmax = _binary("fmin"), _binary("fmax")  # in C, NaN where one of the two is
 
@@ -148,6 +161,16 @@ def _softplus(a: np.ndarray, beta: float = 1.0, threshold: float = 20.0) -> np.n
 def _falling(a: np.ndarray) -> np.ndarray:
     """exp(-|a|), with the derivative from the right at 0."""
     return _unary("exp")(_where(_lt(a, 0.0), a, _unary(operator.neg)(a)))
+
+
+def _sinc(a: np.ndarray) -> np.ndarray:
+    # A quotient's derivatives lose all digits near 0. The series' first term left out, x^12 / 13!, is below 2^-53 here.
+    x = _mul(a, math.pi)
+    near, square = _lt(_unary("fabs")(x), 0.3), _mul(x, x)
+    series = 1.0
+    for i in (5, 4, 3, 2, 1):
+        series = _sub(1.0, _truediv(_mul(square, series), 2 * i * (2 * i + 1)))
+    return _where(near, series, _truediv(_unary("sin")(x), x))
 
 
 def _sigmoid(a: np.ndarray) -> np.ndarray:
@@ -324,6 +347,7 @@ OPERATIONS: dict[str, Callable] = {
     },
     **{f"aten.{name}": _unary(name) for name in ("exp", "expm1", "log", "log1p", "log10", "erf")},
     "aten.log2": _unary(lambda x: _casadi().log(x) / math.log(2.0)),
+    "aten.sinc": _sinc,
     "aten.atan2": _binary("atan2"),
     "aten.hypot": _binary("hypot"),
     "aten.sigmoid": _sigmoid,

@@ -78,6 +78,7 @@ class Recording(TorchDispatchMode):
         self.unfit: _Unfit | None = None  # why the function can't be recorded; its own code may have caught it
         self.captured: dict[Slot, Tensor] = {}
         self.looked = False  # whether Python code reads values of tensors from outside, which it may branch on
+        self.read: list[Slot] = []  # what it reads of them, where that is a tensor
         self._made: set[Slot] = set()  # captured tensors that the function itself makes of Python's numbers
         self._outer: set[Slot] = set()  # what depends on the others
         self.examples = list(inputs)
@@ -113,16 +114,19 @@ class Recording(TorchDispatchMode):
         kwargs = kwargs or {}
         if torch.Tag.nondeterministic_seeded in func.tags and not self.lenient:
             raise self._unfit("one that draws at random", func)
+        if torch.Tag.inplace_view in func.tags and (out_of_place := _out_of_place(func)) and self._is_own(args[0]):
+            return self._turned(func, out_of_place, args, kwargs)
         if func._schema.is_mutable and not self.lenient:  # all that can be a write into a copy has become one
             raise self._unfit("one that writes in place where that can't be followed", func)
         if not _makes_tensors(func):
             if self._follows(args, kwargs):
                 raise self._unfit("one that looks at the values of its arguments", func, _Looks)
-            self.looked |= self._is_outer(args, kwargs)
+            self.look(args, kwargs)
             return func(*args, **kwargs)  # a constant's value may be read
         if SHAPED_BY_VALUES in func.tags and self._follows(*_shaping(func, args), kwargs):
             raise self._unfit("one with shapes that depend on the values of its arguments", func, _Looks)
-        self.looked |= SHAPED_BY_VALUES in func.tags and self._is_outer(*_shaping(func, args), kwargs)
+        if SHAPED_BY_VALUES in func.tags:
+            self.look(*_shaping(func, args), kwargs)
         if name_of(func) not in OPERATIONS:
             with self:  # the parts are dispatched here in turn
                 parts = func.decompose(*args, **kwargs)
@@ -147,6 +151,22 @@ class Recording(TorchDispatchMode):
             self._outer.update(operation.outputs)
         return out
 
+    def _is_own(self, tensor: Tensor) -> bool:
+        """Whether a recorded operation has made a tensor."""
+        slot = self.slot(tensor)
+        return slot not in self.captured and slot not in self.inputs
+
+    def _turned(self, func: Any, out_of_place: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:
+        """A tensor whose own shape changes, as a product with a vector does it: recorded as a view of what it was."""
+        tensor: Tensor = args[0]
+        before, as_it_was = self.slot(tensor), torch.ops.aten.alias(tensor)
+        with self:
+            view = out_of_place(*args, **kwargs)
+        func(*args, **kwargs)
+        self._seen[id(as_it_was)] = before, as_it_was
+        self._seen[id(tensor)] = self.slot(view), tensor
+        return tensor
+
     def _unfit(self, what: str, operation: Any, kind: type[_Unfit] | None = None) -> _Unfit:
         found = (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
         self.unfit = self.unfit or found
@@ -156,6 +176,11 @@ class Recording(TorchDispatchMode):
         """Whether a tensor in `tree` depends on the function's arguments."""
         return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in _leaves(tree))
 
+    def look(self, *tree: Any) -> None:
+        """Note that Python code reads values in `tree`, or sees a shape that depends on them."""
+        found = [self.slot(leaf) for leaf in _leaves(tree) if isinstance(leaf, Tensor) and self._is_outer(leaf)]
+        self.looked |= bool(found)
+        self.read += found
 
     def _is_outer(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on one from outside that isn't an argument."""
@@ -211,6 +236,7 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", message) from theirs(error)
     recording.looked |= bool(calls.seen)
+    recording.look(calls.read)
     recording.result = recording.slot(result)
     if not _is_reproduced(recording, result):
         what = "one that changes the memory of a captured tensor or array while it runs"
@@ -265,6 +291,14 @@ def _leaves(tree: Any) -> Iterator[Any]:
             yield from _leaves(part)
     else:
         yield tree
+
+
+@cache
+def _out_of_place(operation: Any) -> Any:
+    """The operation of `OPERATIONS` that makes a tensor of what this one does in place; None where there is none."""
+    name, overload = name_of(operation).removesuffix("_"), operation._overloadname
+    packet = getattr(torch.ops.aten, name.removeprefix("aten."), None)
+    return getattr(packet, overload, None) if name in OPERATIONS else None
 
 
 @cache

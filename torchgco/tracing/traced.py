@@ -49,6 +49,7 @@ class Traced:
         shared: the `shared_numbers` when it was traced.
         pattern: see `shared_numbers`.
         is_mixed: whether numbers that differ between problems depend on `outside` tensors, too.
+        reads_own: whether Python code has read numbers that differ between problems: the trace has those of the first.
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
@@ -56,7 +57,7 @@ class Traced:
     """
 
     def __init__(
-        self, field: str, function: Callable[..., Tensor], *examples: Tensor, own: Iterable[Tensor] = ()
+        self, field: str, function: Callable[..., Tensor], *examples: Tensor, own: Sequence[Tensor] = ()
     ) -> None:
         self.field = field
         self._precision = max((example.dtype for example in examples), key=lambda dtype: torch.finfo(dtype).bits)
@@ -78,8 +79,9 @@ class Traced:
         # Where PyTorch's part ends and CasADi's begins.
         border = dict.fromkeys(slot for one in self._symbolic for slot in one.inputs) | {self._result: None}
         border = [slot for slot in border if slot not in followers]
-        own_ids = {id(tensor) for tensor in own}
-        named = [slot for slot, tensor in self._captured.items() if id(tensor) in own_ids]
+        places = {id(tensor): place for place, tensor in enumerate(own)}
+        self._named = {slot: places[id(tensor)] for slot, tensor in self._captured.items() if id(tensor) in places}
+        self._of_one_row, named = [_one_row(tensor) for tensor in own], list(self._named)
         varying = _followers(self._plain, [self._index, *named])
         self._own = [slot for slot in border if slot in varying]
         outer = [slot for slot in recording.outside if slot not in named]
@@ -99,7 +101,12 @@ class Traced:
         self._weights = {slot: _array(computed[slot]) for slot in self._nets.alone}
         outside = _followers(self._plain, outer)
         self._fixed = {slot: computed[slot].detach().clone() for slot in others if slot in outside}
-        self._again = _needed(self._plain, *shared, *self._fixed)
+        # What Python code has read is part of the trace, too; of problems' own numbers it has read a first problem's.
+        every = [one for one in recording.operations if one.outputs and not followers.issuperset(one.outputs)]
+        of_problems = _followers(every, [self._index, *named])
+        self.reads_own = not of_problems.isdisjoint(recording.read)
+        self._fixed |= self._replayed(every, [slot for slot in recording.read if slot not in of_problems])
+        self._again = _needed(every, *shared, *self._fixed)
         self.is_mixed = not outside.isdisjoint(self._own)
         learned = _followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
         self._numbers = _flat([computed[slot] for slot in self._shared])
@@ -110,6 +117,12 @@ class Traced:
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
         self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
         self._shapes = [tuple(example.shape) for example in examples]
+
+    def _replayed(self, operations: list[Operation], wanted: Sequence[Slot]) -> dict[Slot, Tensor]:
+        """What slots hold that depend on no argument, as tensors that nobody changes."""
+        known: dict[Slot, Any] = dict(self._captured)
+        replay_all(_needed(operations, *wanted), known)
+        return {slot: known[slot].detach().clone() for slot in wanted}
 
     @property
     def count(self) -> int:
@@ -126,7 +139,8 @@ class Traced:
         the last w are weights of networks.
 
         `pattern` (s,) has those of them that belong to the expressions' form, NaN for all others. None where such a
-        number, an index, or the shape or type of a tensor has changed: the function is to be traced again.
+        number, an index, what Python code has read, or the shape or type of a tensor has changed: the function is to be
+        traced again.
         """
         if not self._shared and not self._fixed and not self._nets.shapes:
             return self.shared
@@ -134,7 +148,7 @@ class Traced:
         shapes = (self._shared_shapes | self._nets.shapes).items()
         try:
             replay_all(self._again, known)
-            same = all(torch.equal(known[slot], then) for slot, then in self._fixed.items())
+            same = all(_is_same(known[slot], then) for slot, then in self._fixed.items())
         except (RuntimeError, IndexError, TypeError, ValueError):  # shapes or types that don't fit each other any more
             return None
         if not same or any((known[s].shape, known[s].dtype) != (torch.Size(shape), s.dtype) for s, shape in shapes):
@@ -169,24 +183,29 @@ class Traced:
         except RuntimeError:  # an operation that vmap can't batch
             return torch.stack([one(i) for i in index])
 
-    def rebound(self, own: Sequence[Tensor], others: Sequence[Tensor], B: int) -> Traced | None:
-        """The same function of B problems with `others` in the place of its `own` tensors; None: trace it again.
+    def rebound(self, own: Sequence[Tensor], B: int) -> Traced | None:
+        """The same function of B problems with other tensors in the place of its `own`; None: trace it again.
 
         A new trace is needed where a row that all problems share, and that isn't indexed, becomes a row per problem.
         """
-        if len(own) != len(others):
+        if len(own) != len(self._of_one_row):
             return None
-        tensors = {}
-        indexed = {id(self._captured[slot]) for slot in self._indexed if slot in self._captured}
-        for old, new in zip(own, others, strict=True):
-            if _one_row(old) and not _one_row(new) and id(old) not in indexed:
+        tensors, indexed = [], {self._named[slot] for slot in self._indexed if slot in self._named}
+        for place, (tensor, was_row) in enumerate(zip(own, self._of_one_row, strict=True)):
+            if was_row and not _one_row(tensor) and place not in indexed:
                 return None
             # The row of a single problem stands for all of its repetitions.
-            tensors[id(old)] = new.expand(B, *new.shape[1:]) if _one_row(new) and not _one_row(old) else new
+            is_spread = _one_row(tensor) and not was_row
+            tensors.append(tensor.expand(B, *tensor.shape[1:]) if is_spread else tensor)
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
-        copy._captured = {slot: tensors.get(id(tensor), tensor) for slot, tensor in self._captured.items()}
+        copy._captured = self._captured | {slot: tensors[place] for slot, place in self._named.items()}
         return copy
+
+    def forget_values(self) -> None:
+        """Let go of the numbers of all problems but the first in `own`: it is `rebound` where others are asked for."""
+        rows = {slot: self._captured[slot] for slot in self._named if self._captured[slot].dim() > 0}
+        self._captured |= {slot: tensor[:1].clone().expand_as(tensor) for slot, tensor in rows.items()}
 
     def fingerprint(self) -> str:
         """A hexadecimal digest of the computation of `__call__`, the same in every process, made without CasADi.
@@ -274,6 +293,14 @@ def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
     structural = np.isin(pattern, STRUCTURAL) & ~((pattern == 0.0) & np.signbit(pattern))
     pattern[learned.astype(bool) | ~structural] = np.nan
     return pattern
+
+
+def _is_same(one: Tensor, other: Tensor) -> bool:
+    """Whether two tensors have the same shape and numbers, be they NaN."""
+    if torch.equal(one, other):
+        return True
+    known = torch.where(one == other, one, torch.nan) if one.shape == other.shape and one.is_floating_point() else None
+    return known is not None and torch.equal(known.isnan(), one.isnan()) and torch.equal(one.isnan(), other.isnan())
 
 
 def _flat(values: Sequence[Tensor]) -> Tensor:

@@ -16,14 +16,19 @@ class Watch:
     """
 
     def __init__(self, tensors: Iterable[Tensor]) -> None:
-        self._tensors = list({id(tensor): tensor for tensor in tensors}.values())
+        self.tensors = list({id(tensor): tensor for tensor in tensors}.values())
 
     def look(self) -> tuple[Hashable, ...] | None:
-        """What can be compared; None where that takes longer than to read the tensors again."""
+        """What can be compared; None where nothing is known of a tensor's memory, as of a sparse one's."""
         seen = list[Hashable]()
-        for tensor in self._tensors:
-            if tensor.layout is not torch.strided or tensor.device.type != "cpu" or not tensor.is_contiguous():
+        for tensor in self.tensors:
+            if tensor.layout is not torch.strided or tensor.device.type != "cpu":
                 return None
-            place = tensor.data_ptr()
-            seen += place, tensor.shape, tensor.dtype, ctypes.string_at(place, tensor.nbytes)
+            place, size = tensor.data_ptr(), tensor.nbytes
+            if not tensor.is_contiguous():
+                seen.append(tensor.stride())
+                if size > 0:  # all from the first number to the last: strides are never negative
+                    steps = ((count - 1) * by for count, by in zip(tensor.shape, tensor.stride(), strict=True))
+                    size = (sum(steps) + 1) * tensor.element_size()
+            seen += place, tensor.shape, tensor.dtype, ctypes.string_at(place, size)
         return tuple(seen)

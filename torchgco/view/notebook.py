@@ -1,4 +1,4 @@
-"""A page in a notebook: `solution.show(problem)`."""
+"""A page in a notebook: `torchgco.show(problem, solution)`."""
 
 from __future__ import annotations
 

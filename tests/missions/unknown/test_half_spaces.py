@@ -5,12 +5,12 @@ from typing import Any
 import pytest
 import torch
 
+from tests.engines import engine_of
 from torchgco import ILQR, AugmentedLagrangian, ControlBounds, Problem, QuadraticCost, QuadrotorPlanning
 from torchgco.base.errors import InputError
+from torchgco.kernels import use_native, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.missions.unknown.halfspaces import HalfSpaces, stacked
-from torchgco.native.dispatch import engine_of, value
-from torchgco.native.kernels import use_native
 
 B, N, R = 2, 6, 3
 REST = [0.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 9.81]

@@ -24,8 +24,8 @@ from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, reg
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import plain
+from torchgco.kernels import use_native
 from torchgco.missions import Mission, RotorPlant
-from torchgco.native.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.solvers.memory import least_bytes

@@ -24,8 +24,7 @@ from torchgco.experiments.flying.progress import Bar
 from torchgco.judging.certificate import certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
 from torchgco.judging.judge import frame_columns, judge
-from torchgco.native.dispatch import engine_of
-from torchgco.native.kernels import use_native
+from torchgco.kernels import kernels_of, use_native
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts
 from torchgco.search.reach import short_horizons
@@ -170,7 +169,7 @@ class Flight:
         Each time memory runs out, half as many run at once. A solver that reports no pass runs all of them together.
         """
         # Building and compiling for a batch are set-up: the clock starts after them.
-        engine_of(problem)
+        kernels_of(problem)
         solver, at_once = self.solver.prepare(problem), problem.B
         if solver.in_slots(1) is not None:
             plan = plan_of(self.setup)

@@ -42,8 +42,8 @@ from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.results.success import sound, with_success
+from torchgco.kernels import native
 from torchgco.missions import Mission
-from torchgco.native.kernels import native
 from torchgco.problem.horizons import within_horizons
 from torchgco.scenarios import Layouts, Task
 

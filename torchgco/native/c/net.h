@@ -172,6 +172,16 @@ static inline void net_back(const double *M, const double *T, int k, int h, cons
     for (int j = 0; j < k; j++) v[j] += s[j];
 }
 
+/* What y adds with a slope: nothing where y is 0, as in a branch that isn't taken, be the slope infinite or NaN. */
+static inline REAL net_counted(REAL y, REAL slope) { return y != 0 ? slope * y : 0; }
+
+/* sum_i w_i s_i t_i over the neurons whose w isn't 0. */
+__attribute__((noinline)) static REAL net_sum_of_counted(int h, const REAL *w, const REAL *s, const REAL *t) {
+    REAL total = 0;
+    for (int i = 0; i < h; i++) total += net_counted(w[i], s[i] * t[i]);
+    return total;
+}
+
 /* H[a][b] += sum_i w_i s_i t_i for two tangents s, the columns a and a + 1, and up to C tangents t, b and after. */
 #define NET_PAIRS(C) \
     static void net_pairs_##C(int h, int d, const REAL *w, const REAL *s, const REAL *t, REAL *H) { \
@@ -190,7 +200,7 @@ static inline void net_back(const double *M, const double *T, int k, int h, cons
             REAL total = 0; \
             for (int l = 0; l < NET_WIDTH; l++) total += sum[a][b][l]; \
             for (int j = i; j < h; j++) total = net_fused_1(w[j] * s[a * size + j], t[b * size + j], total); \
-            H[a * d + b] += total; \
+            H[a * d + b] += total == total ? total : net_sum_of_counted(h, w, s + a * size, t + b * size); \
         } \
     }
 NET_PAIRS(6)

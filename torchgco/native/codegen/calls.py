@@ -66,7 +66,7 @@ class Ahead:
         for call, slopes in zip(self.calls, self.slopes, strict=False):
             through = ca.sparsify(ca.jacobian(expression, call.outputs, forward))
             if through.nnz():
-                total += ca.mtimes(through, slopes)
+                total += _product(through, slopes)
         return ca.sparsify(total)
 
     def hessian(self, total: Any, second: Callable[[Any, Any], Any]) -> tuple[list[Stage], Any]:
@@ -91,11 +91,34 @@ class Ahead:
                 bent[p, q] += entry
                 if p != q:
                     bent[q, p] += entry
-            total += ca.dot(back, call.inputs)
+            total += _product(back.T, call.inputs, chooses(by))
         symbols = [self.z, *(call.outputs for call in self.calls)]
         along = ca.vertcat(ca.SX.eye(self.z.numel()), *self.slopes)
         own = ca.sparsify(second(total, ca.vertcat(*symbols)))
-        return stages, ca.sparsify(bent + ca.mtimes(ca.mtimes(along.T, own), along))
+        chosen = chooses(own)
+        return stages, ca.sparsify(bent + _product(_product(own, along, chosen).T, along, chosen))
+
+
+def chooses(expression: Any) -> bool:
+    """Whether an expression drops the branch of a choice that isn't taken."""
+    import casadi as ca
+
+    function = ca.Function("chosen", ca.symvar(expression), [expression])
+    return any(function.instruction_id(i) == ca.OP_IF_ELSE_ZERO for i in range(function.n_instructions()))
+
+
+def _product(factors: Any, columns: Any, chosen: bool | None = None) -> Any:
+    """The product of two matrices, to which a factor that is 0 adds 0 where factors are `chosen`, as by default they
+    are if they have choices in them: what such a factor drops may be infinite or NaN.
+    """
+    import casadi as ca
+
+    if not (chooses(factors) if chosen is None else chosen):
+        return ca.mtimes(factors, columns)
+    product = ca.SX(factors.size1(), columns.size2())
+    for i, j, factor in zip(*factors.sparsity().get_triplet(), factors.nonzeros(), strict=True):
+        product[i, :] += ca.if_else(factor, factor * columns[j, :], 0)
+    return ca.sparsify(product)
 
 
 def _columns(of_inputs: Any) -> tuple[list[int], bool]:

@@ -53,8 +53,7 @@ def span_of_rows(problem: Problem, i: int) -> Span:
         return rows
 
     X, U = problem.x0.new_zeros(1, N + 1, n), problem.x0.new_zeros(1, N, m)
-    own = own_tensors(constraint)
-    return Span(Traced(name, value, X, U, own=own), own, n, m, N + 1, N, knots)
+    return Span(Traced(name, value, X, U, own=own_tensors(constraint)), n, m, N + 1, N, knots)
 
 
 def _code(knot: Knot, name: str) -> str:

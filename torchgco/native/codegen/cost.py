@@ -109,7 +109,7 @@ def spans_of_cost(problem: Problem) -> tuple[Span, Span]:
         examples = problem.x0.new_zeros(1, states, n), problem.x0.new_zeros(1, controls, m)
         with whole_numbers_become(problem.x0.dtype):  # as where PyTorch sums the cost
             traced = Traced(_named(name, cost), function, *examples, own=own)
-        return Span(traced, own, n, m, states, controls, range(states))
+        return Span(traced, n, m, states, controls, range(states))
 
     return span("stage", stage, N, N), span("terminal", last, 1, 0)
 

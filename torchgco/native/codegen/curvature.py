@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
 from torchgco.native import store
@@ -100,9 +100,7 @@ def _rows_code(knot: Knot, name: str) -> str:
     return "\n".join(lines)
 
 
-def _curves(
-    name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | None = None, slopes: Any = None
-) -> str:
+def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | None = None, slopes: Any = None) -> str:
     """`NAME(inputs, H)`: H += the second derivatives of `total` by the first two inputs, upper triangle.
 
     Args:
@@ -113,7 +111,8 @@ def _curves(
 
     z, stages, size = ca.vertcat(*inputs[:2]), [], inputs[0].numel() + inputs[1].numel()
     if tangents is not None and tangents.calls:
-        stages, hessian = tangents.hessian(total, lambda total, z: _hessian(total, z, ca.symvar(total)))
+        made = {symbol.element_hash() for call in tangents.calls for symbol in ca.symvar(call.outputs)}
+        stages, hessian = tangents.hessian(total, lambda total, z: _hessian(total, z, ca.symvar(total), made))
     else:
         hessian = ca.sparsify(_hessian(total, z, inputs))
     found: list[Any] = hessian.nonzeros()
@@ -136,22 +135,26 @@ def _curves(
     return "\n".join(lines)
 
 
-def _hessian(total: Any, z: Any, inputs: list[Any]) -> Any:
+def _hessian(total: Any, z: Any, inputs: list[Any], made: Container[int] = ()) -> Any:
     """Second derivatives; by forward mode alone where reverse mode could give a NaN.
+
+    `made` are inputs of one entry each that networks make, which may be infinite or NaN themselves.
 
     Reverse mode is shorter, by a factor of three for `QuadrotorPlant`, but lets a NaN of the branch not taken through
     as 0 * NaN.
     """
     import casadi as ca
 
-    if not _has_hidden_pole(ca.Function("total", inputs, [total])):
+    poles = {i for i, symbol in enumerate(inputs) if made and symbol.element_hash() in made}
+    if not _has_hidden_pole(ca.Function("total", inputs, [total]), poles):
         return ca.hessian(total, z)[0]
     forward = {"allow_reverse": False}
     return ca.jacobian(ca.jacobian(total, z, forward).T, z, forward)
 
 
-def _has_hidden_pole(function: Any) -> bool:
-    """Whether an operation whose derivatives may be infinite is needed by a branch alone, so that nothing else fails.
+def _has_hidden_pole(function: Any, poles: Container[int] = ()) -> bool:
+    """Whether an operation whose derivatives may be infinite, or one of the inputs `poles`, is needed by a branch
+    alone, so that nothing else fails.
 
     A pole that is needed without any branch, too, makes the value itself infinite or NaN, in either mode.
     """
@@ -171,7 +174,8 @@ def _has_hidden_pole(function: Any) -> bool:
         else:
             written[function.instruction_output(i)[0]] = i
     always, ever = (_reached(function, needs, outputs, through) for through in (False, True))
-    return any(function.instruction_id(i) not in smooth for i in ever - always)
+    hidden = [(function.instruction_id(i), function.instruction_input(i)) for i in ever - always]
+    return any(what not in smooth or (what == ca.OP_INPUT and read[0] in poles) for what, read in hidden)
 
 
 def _reached(function: Any, needs: list[list[int]], outputs: list[int], through: bool) -> set[int]:

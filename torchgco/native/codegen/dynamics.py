@@ -46,7 +46,6 @@ class DynamicsSource:
     values: tuple[float, ...]  # 0.0 where the entry is computed
     key: str  # says what `code` computes, the same in every process
     traced: Traced = field(repr=False, compare=False)
-    own: list[Tensor] = field(repr=False, compare=False)  # the model's tensors per problem
 
     @property
     def computed(self) -> int:
@@ -66,7 +65,7 @@ class DynamicsSource:
         """
         if of is None or self.count == 0:
             return self.traced.parameters_of(index)
-        traced = self.traced.rebound(self.own, own_tensors(of), len(index))
+        traced = self.traced.rebound(own_tensors(of), len(index))
         return (traced or trace_dynamics(of, self.n, self.m, device=index.device).traced).parameters_of(index)
 
 
@@ -93,13 +92,13 @@ def trace_dynamics(
     n, m = n or dynamics.n, m or dynamics.m
     x, u = (torch.zeros(1, size, dtype=dtype, device=device) for size in (n, m))
     dynamics = apart(dynamics)
-    own = own_tensors(dynamics)
-    traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
+    step = lambda i, x, u: dynamics.take(i).step(x, u)
+    traced = Traced("dynamics.step", step, x, u, own=own_tensors(dynamics))
     key = "model", traced.fingerprint(), *makers()
     parts = store.made(key, lambda _: _made(traced, n, m), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
     code = emit.checked(traced.field, parts.content["code"])
-    return DynamicsSource(n, m, traced.count, code, **lists, key=parts.key, traced=traced, own=own)
+    return DynamicsSource(n, m, traced.count, code, **lists, key=parts.key, traced=traced)
 
 
 def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:

@@ -27,13 +27,9 @@ from torchgco.tracing.nets import Call
 
 @dataclass(frozen=True)
 class Span:
-    """A traced function of X (1, states, n), U (1, controls, m) whose rows (1, K[, p]) belong to K `knots`.
-
-    `own` are the tensors that may differ from problem to problem.
-    """
+    """A traced function of X (1, states, n), U (1, controls, m) whose rows (1, K[, p]) belong to K `knots`."""
 
     traced: Traced
-    own: Sequence[Tensor]
     n: int
     m: int
     states: int
@@ -93,7 +89,7 @@ class KnotSource:
         fixed = torch.cat((torch.from_numpy(self.span.traced.constants), shared))
         if not self._is_own:
             return fixed[self.places - self.span.traced.count].unsqueeze(0)
-        traced = self.span.traced.rebound(self.span.own, own, B)
+        traced = self.span.traced.rebound(own, B)
         if traced is None:
             traced = again().traced
             if traced.fingerprint() != self.span.traced.fingerprint():

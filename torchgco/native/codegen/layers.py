@@ -89,8 +89,8 @@ class NetSource:
 
         layer, derived = self.net.layers[i - 1], self._derived[i - 1]
         assert isinstance(layer, Neurons) and derived is not None
-        symbols = layer.function.sx_in()
-        entries = [layer.function(*symbols), *self._computed(derived.slopes), *derived.curvatures.values()]
+        symbols, form = _form(layer)
+        entries = [form, *self._computed(derived.slopes), *derived.curvatures.values()]
         return ca.Function("derived", symbols, [ca.cse(ca.densify(ca.vertcat(*entries)))])
 
     @staticmethod
@@ -185,20 +185,24 @@ class NetSource:
         return "\n".join([*lines, *self._copied("o"), "}"])
 
     def _slope(self, i: int, j: int, at: str) -> str:
-        """The slope of neuron `at` of layer i by its source j, as a factor."""
+        """The slope of neuron `at` of layer i by its source j; empty: 1."""
         derived = self._derived[i - 1]
         assert derived is not None
         slope = derived.slopes[j]
         if not slope.is_constant():
-            return f"kept->d{i}_{j}[{at}] * "
-        return "" if float(slope) == 1.0 else f"(REAL){emit.literal(float(slope))} * "
+            return f"kept->d{i}_{j}[{at}]"
+        return "" if float(slope) == 1.0 else f"(REAL){emit.literal(float(slope))}"
 
     def _tangents(self, i: int) -> str:
         layer = self.net.layers[i - 1]
         assert isinstance(layer, Neurons)
         at = f"c * NET_SIZE({layer.h}) + i"
-        total = " + ".join(f"{self._slope(i, j, 'i')}t{source}[{at}]" for j, source in enumerate(layer.sources))
-        return f"    for (int c = 0; c < {self.d}; c++) for (int i = 0; i < {layer.h}; i++) t{i}[{at}] = {total};"
+        slopes = [self._slope(i, j, "i") for j in range(len(layer.sources))]
+        parts = [f"{slope}{' * ' if slope else ''}t{j}[{at}]" for slope, j in zip(slopes, layer.sources, strict=True)]
+        total = " + ".join(parts)
+        return (
+            f"    for (int c = 0; c < {self.d}; c++) for (int i = 0; i < {layer.h}; i++) t{i}[{at}] = {total or '0'};"
+        )
 
     def _backward(self) -> str:
         sizes = self.net.sizes
@@ -223,13 +227,15 @@ class NetSource:
         assert derived is not None
         for a, b in derived.curvatures:
             lines.append(f"    {{ REAL by[{layer.h}];")
-            lines.append(f"    for (int i = 0; i < {layer.h}; i++) by[i] = kept->c{i}_{a}_{b}[i] * v{i}[i];")
+            factor = f"net_counted(v{i}[i], kept->c{i}_{a}_{b}[i])"
+            lines.append(f"    for (int i = 0; i < {layer.h}; i++) by[i] = {factor};")
             for p, q in sorted({(a, b), (b, a)}):
                 s, t = layer.sources[p], layer.sources[q]
                 lines.append(f"    net_congruence({layer.h}, {self.d}, by, kept->t{s}, kept->t{t}, H);")
             lines.append("    }")
         for j, source in enumerate(layer.sources):
-            lines.append(f"    for (int i = 0; i < {layer.h}; i++) v{source}[i] += {self._slope(i, j, 'i')}v{i}[i];")
+            part = f"net_counted(v{i}[i], {self._slope(i, j, 'i') or '1'})"
+            lines.append(f"    for (int i = 0; i < {layer.h}; i++) v{source}[i] += {part};")
         return lines
 
     # All lanes
@@ -254,12 +260,19 @@ def _matrices(layer: Linear) -> str:
     return f"w + {layer.matrix}, w + {layer.turned}"
 
 
-def _derived(layer: Neurons) -> Derivatives:
+def _form(layer: Neurons) -> tuple[list[Any], Any]:
+    """The symbols that a neuron is a function of, none where it is a constant, and its expression."""
     import casadi as ca
 
     symbols = layer.function.sx_in()
-    sources = symbols[: len(layer.sources)]
-    form, forward = layer.function(*symbols), {"allow_reverse": False}
+    return symbols, ca.SX(layer.function.call(symbols)[0])
+
+
+def _derived(layer: Neurons) -> Derivatives:
+    import casadi as ca
+
+    symbols, form = _form(layer)
+    sources, forward = symbols[: len(layer.sources)], {"allow_reverse": False}
     # Forward mode only: in reverse mode, a NaN of the branch not taken would come through as 0 * NaN.
     slopes = [ca.densify(ca.jacobian(form, source, forward)) for source in sources]
     curvatures = {}
@@ -305,10 +318,11 @@ __attribute__((noinline)) static void tgco_net_KEY_back(
     const double *w, const tgco_net_KEY_kept *kept, const V *y, V *v, V *H) {
     for (I left = SET(0.0) == SET(0.0), same; tgco_any(left); left &= ~same) {
         int l = net_first(left), at = (int)kept->of[0][l];
-        REAL b[COUNT_R], out[COUNT_K], made[COUNT_E * COUNT_E] = {0};
+        REAL b[COUNT_R], out[COUNT_K] = {0}, made[COUNT_E * COUNT_E] = {0};
+        int counts = 0; /* all is 0 where y is, be the network's derivatives NaN: of a branch that isn't taken */
         same = left & (kept->of[0] == SET(at));
-        for (int i = 0; i < COUNT_R; i++) { same &= net_alike(y[i], l); b[i] = y[i][l]; }
-        tgco_net_KEY_back_one(w, kept->at + at, b, out, made);
+        for (int i = 0; i < COUNT_R; i++) { same &= net_alike(y[i], l); b[i] = y[i][l]; counts |= b[i] != 0; }
+        if (counts) tgco_net_KEY_back_one(w, kept->at + at, b, out, made);
         for (int i = 0; i < COUNT_K; i++) v[i] = tgco_choose(same, SET(out[i]), v[i]);
         for (int p = 0, e = 0; p < COUNT_D; p++) for (int q = p; q < COUNT_D; q++, e++)
             H[e] = tgco_choose(same, SET(made[p * COUNT_E + q]), H[e]);

@@ -44,7 +44,7 @@ def trace_model(problem: Problem) -> DynamicsSource:
     lists["places"] = lists.pop("places_of_entries")
     count = source.places.shape[1]
     return StagesSource(
-        model.n, model.m, count, source.code, **lists, key=source.key, traced=span.traced, own=list(span.own),
+        model.n, model.m, count, source.code, **lists, key=source.key, traced=span.traced,
         stage=source,
     )  # fmt: skip
 
@@ -56,7 +56,7 @@ def _span(model: Dynamics, N: int) -> Span:
     X, U = (torch.zeros(1, N, size, dtype=torch.float64) for size in (model.n, model.m))
     with whole_numbers_become(X.dtype):  # 0.3 * k as for a single stage, where k is an int
         traced = Traced("dynamics.step", lambda i, X, U: model.take(i).at(stages).step(X, U), X, U, own=own)
-    return Span(traced, own, model.n, model.m, N, N, range(N))
+    return Span(traced, model.n, model.m, N, N, range(N))
 
 
 def _parts(knot: Knot, _: str) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from torchgco.base.options import Count, NonNegative, Positive, check_options
 from torchgco.base.shapes import computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import copied, put
+from torchgco.kernels import chord_clearance, current, measured
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, binding
-from torchgco.native.dispatch import chord_clearance, current, measured
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution

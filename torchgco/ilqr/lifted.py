@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.rollout import closed_loop
+from torchgco.ilqr.line_search import Rollouts
+from torchgco.ilqr.riccati import backward
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.native.dispatch import engine_of
-from torchgco.solvers.line_search import Rollouts
-from torchgco.solvers.riccati import backward
 
 LIFTED_STEPS = 20  # steps at most
 GAIN = 1e-2  # share of L_M by which a rollout must lower it
@@ -46,16 +45,6 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
         going = ~found.accepted[rows] & ~step.failed & torch.isfinite(X).flatten(1).all(-1)
         rows, X, U = rows[going], X[going], U[going]
     return found
-
-
-def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
-    """`lifted_search` by the native library."""
-    engine = engine_of(lagrangian.problem)
-    assert engine is not None
-    state = {name: t.clone(memory_format=torch.contiguous_format) for name, t in (("X", X), ("U", U), ("merit", merit))}
-    state["cost"] = state["merit"].clone()
-    accepted = engine.lift(lagrangian, state, LIFTED_STEPS, GAIN)
-    return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted)
 
 
 def _keep(found: Rollouts, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:

@@ -6,16 +6,14 @@ import torch
 from torch import Tensor
 
 from torchgco.base.status import Status
+from torchgco.ilqr import lifted
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import goal_tolerance
+from torchgco.lagrangian.state import PassEnd, State
 from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import Engine
-from torchgco.native.structures import End, Outer
+from torchgco.native.structures import End, Options, Outer
 from torchgco.problem.problem import Problem
-from torchgco.solvers.caught import StopWhenCaught
-from torchgco.solvers.ilqr import ILQR, native_options
-from torchgco.solvers.lifted import GAIN, LIFTED_STEPS
-from torchgco.solvers.state import PassEnd, State
 
 FLAGS, NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
 
@@ -24,34 +22,36 @@ class NativeOuter:
     """Passes over the problems of a state, in place in its tensors, which it makes contiguous.
 
     Args:
+        options: of the inner solves.
         problem: the b running problems, `s` their state.
-        stop: where a caught iterate ends its problem's solve; None: nowhere.
+        phr: the form of inequalities' terms, as of a `Lagrangian`.
         base: (b,) outer iterations before this solve.
+        by_arrival: an iterate that has arrived at the goal is preferred to any that hasn't.
         limits: options and constants of the outer loop by name; see `structures.Outer`.
     """
 
     def __init__(
         self,
         engine: Engine,
-        inner: ILQR,
+        options: Options,
         problem: Problem,
         s: State,
-        stop: StopWhenCaught | None,
+        phr: bool,
         base: Tensor,
         by_arrival: bool,
         **limits: float,
     ) -> None:
         self.engine, self.state, self.b = engine, s, problem.B
         _make_contiguous(s)
-        b, rules = problem.B, inner.rules
+        b = problem.B
         self.out = {name: torch.zeros(b, dtype=torch.int32) for name in FLAGS}
         self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in NUMBERS}
         self.outcome = torch.zeros(b, dtype=torch.int64)
-        m, best, after = s.multipliers, s.best, None if stop is None else stop.single_contact_after
+        m, best = s.multipliers, s.best
         packed = engine.terms(
-            Lagrangian(problem, m, s.penalty, rules.phr), best.multipliers, X=s.X, U=s.U, cost=s.cost, merit=s.merit,
+            Lagrangian(problem, m, s.penalty, phr), best.multipliers, X=s.X, U=s.U, cost=s.cost, merit=s.merit,
             regularisation=s.regularisation, inner=s.inner, iterations=s.iterations, rung=s.rung, **self.out,
-            options=native_options(inner), limit=inner.max_iterations, replicas=1,
+            options=options, limit=options.max_iterations, replicas=1,
         )  # fmt: skip
         near = goal_tolerance(problem) if by_arrival else None
         goal = {} if near is None or problem.goal is None else {"goal": problem.goal.position, "near": near}
@@ -62,8 +62,7 @@ class NativeOuter:
             best_X=best.X, best_U=best.U, best_mu=best.multipliers.mu, best_cost=best.cost,
             best_violation=best.violation, base=base.contiguous(),
             **{name: part.contiguous() for name, part in goal.items()},
-            passes=1, single_after=-1 if after is None else after, ends=rules.ends, stops=stop is not None,
-            lifted_steps=LIFTED_STEPS, lifted_gain=GAIN, **limits,
+            passes=1, lifted_steps=lifted.LIFTED_STEPS, lifted_gain=lifted.GAIN, **limits,
         )  # fmt: skip
 
     def run(self, passes: int) -> None:

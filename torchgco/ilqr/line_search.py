@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchgco.base.options import Natural, check_options
 from torchgco.dynamics.rollout import closed_loop
+from torchgco.ilqr.riccati import BackwardPass
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.solvers.riccati import BackwardPass
 
 SIDE_BY_SIDE = 256  # rollouts that cost little more than one
 PARALLEL = 4  # least number of rungs tried together, by problems that refused the first

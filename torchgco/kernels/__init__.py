@@ -1,0 +1,17 @@
+"""What solvers compute with: one interface (`base.Kernels`), in C and in PyTorch, chosen once per form of problems."""
+
+from torchgco.kernels.choice import EagerWarning as EagerWarning
+from torchgco.kernels.choice import current as current
+from torchgco.kernels.choice import expect_interior as expect_interior
+from torchgco.kernels.choice import kernels_of as kernels_of
+from torchgco.kernels.choice import used as used
+from torchgco.kernels.switch import native as native
+from torchgco.kernels.switch import use_native as use_native
+from torchgco.kernels.verbs import chord_clearance as chord_clearance
+from torchgco.kernels.verbs import cost_unit as cost_unit
+from torchgco.kernels.verbs import followed as followed
+from torchgco.kernels.verbs import interior_of as interior_of
+from torchgco.kernels.verbs import measured as measured
+from torchgco.kernels.verbs import open_loop as open_loop
+from torchgco.kernels.verbs import reproducible as reproducible
+from torchgco.kernels.verbs import value as value

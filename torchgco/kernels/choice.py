@@ -1,0 +1,110 @@
+"""Which kernels serve a problem: in C where they can, PyTorch's elsewhere. One choice and one warning per form."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Hashable
+
+import torch
+
+from torchgco.base.errors import InputError
+from torchgco.kernels.base import Kernels
+from torchgco.kernels.in_c import NativeKernels
+from torchgco.kernels.in_pytorch import TorchKernels
+from torchgco.kernels.switch import native
+from torchgco.native.compiler import NativeError, find_compiler
+from torchgco.native.engine import Engine
+from torchgco.native.identity import signature
+from torchgco.native.interior import begin_interior
+from torchgco.native.store import trim
+from torchgco.problem.border import check_eager
+from torchgco.problem.problem import Problem
+from torchgco.tracing import Facts
+
+KEPT = 64  # engines, the most recent ones
+CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
+
+
+class EagerWarning(UserWarning):
+    """Native kernels can't be used for a problem; PyTorch's are, which takes longer."""
+
+
+def current(problem: Problem) -> Problem:
+    """The problem as its parts are now: nothing is kept from an earlier solve but code of the same computation.
+
+    Every solve begins with this call: the tensors, numbers and modules that a user's code captures may have changed.
+    Within a solve, subsets and other forms of the problem share the kernels of its beginning.
+    """
+    if problem.known.current:
+        return problem
+    fresh = problem.renewed()
+    fresh.known.current, fresh.known.warned = True, problem.known.warned
+    return fresh
+
+
+def kernels_of(problem: Problem) -> Kernels:
+    """The kernels for problems of this form; those in C are compiled at the first call.
+
+    PyTorch's are used on a GPU, in single precision, where the process has chosen them (`use_native`), and where a part
+    can't be traced or nothing compiles, which an EagerWarning explains.
+    """
+    known = problem.known
+    if native() and problem.x0.dtype == torch.float64 and problem.x0.device.type == "cpu":
+        if known.in_c is None:
+            known.in_c = _natively(problem) or False
+        if known.in_c:
+            return known.in_c
+    if known.in_pytorch is None:
+        check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
+        known.in_pytorch = TorchKernels()
+    return known.in_pytorch
+
+
+def _natively(problem: Problem) -> NativeKernels | None:
+    warned = problem.known.warned
+    try:
+        return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
+    except (InputError, NativeError) as error:
+        check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
+        _warn(warned, error)
+        return None
+
+
+def _warn(warned: set[str], error: Exception) -> None:
+    """Say once why PyTorch's kernels are used."""
+    reason = str(error).splitlines()[0]
+    if reason not in warned:
+        warned.add(reason)
+        warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=5)
+
+
+def used(problem: Problem) -> str:
+    """The name of the kernels that have worked on problems of this form."""
+    return NativeKernels.name if problem.known.in_c and native() else TorchKernels.name
+
+
+def expect_interior(problem: Problem) -> None:
+    """Have the interior point's library compiled beside the first one, where that isn't made yet."""
+    problem.known.expects_interior = True
+
+
+def _engine(problem: Problem) -> Engine:
+    """The engine of an earlier solve where nothing that its code depends on has changed, else a new one."""
+    before, ahead = signature(problem), begin_interior if problem.known.expects_interior else None
+    if before is None:
+        return Engine(problem, ahead)
+    key = before.key, find_compiler()
+    known = _engines.pop(key, None)
+    if known is not None and (shared := known[0].captured.read()) is not None:
+        _engines[key] = known  # the most recent one is the last
+        return known[0].with_shared(shared.copy())
+    engine, after = Engine(problem, ahead), signature(problem)
+    # Code that has changed what it reads, a counter for instance, does so at every solve.
+    if after is not None and after.key == before.key and after.covers(engine.captured.traces):
+        engine.forget_values()
+        _engines[key] = engine, after.facts
+        trim(_engines, KEPT, CAPTURED, lambda kept: kept[0].captured.nbytes)
+    return engine.with_shared(engine.shared.copy())  # a compiled problem writes into it
+
+
+_engines: dict[Hashable, tuple[Engine, Facts]] = {}  # the facts hold what their key names by identity

@@ -1,0 +1,83 @@
+"""What solvers ask of a problem's kernels, whichever these are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchgco.dynamics import rollout
+from torchgco.kernels.base import InteriorKernels
+from torchgco.kernels.choice import kernels_of
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.obstacles.base import TOUCH
+from torchgco.problem.problem import Problem
+
+
+def open_loop(problem: Problem, U: Tensor) -> Tensor:
+    """X (B, N+1, n) from controls U (B, N, m)."""
+    return kernels_of(problem).open_loop(problem, U)
+
+
+def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """The rollout, X and U, that brings the problem's start back to X (B, N+1, n) by the feedback u = U + K (x - X).
+
+    Free components of the start are those of X.
+    Gains K (B, N, m, n) that aren't finite count as 0.
+    """
+    start = problem.start_in(X[:, 0])
+    K, away = K.nan_to_num(0.0, 0.0, 0.0), start - X[:, 0]
+    U = torch.cat((U[:, :1] + (K[:, 0] * away.unsqueeze(1)).sum(-1).unsqueeze(1), U[:, 1:]), dim=1)
+    return kernels_of(problem).closed_loop(problem, torch.cat((start.unsqueeze(1), X[:, 1:]), dim=1), U, K)
+
+
+def reproducible(problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """X (B, N+1, n) and U (B, N, m) of a problem's kernels, mended where PyTorch's rollout of U would not give X.
+
+    The two kinds of kernels differ in the last bits. Where unstable dynamics amplify this, as a rollout of slightly
+    different controls shows, PyTorch tracks X with the `gains` (b, N, m, n) of these rows (b,), and X and U of that
+    rollout are returned.
+    """
+    rows = kernels_of(problem).differing(problem, X, U)
+    if rows.numel() == 0:
+        return X, U
+    K = gains(rows)
+    G = torch.cat((K, torch.zeros_like(K[..., :1])), dim=-1).nan_to_num(0.0).transpose(0, 1)
+    X, U, alpha = X.clone(), U.clone(), torch.zeros_like(X[rows, 0, 0])
+    X[rows], U[rows] = rollout.closed_loop(problem.dynamics.take(rows), X[rows], U[rows], G.contiguous(), alpha)
+    return X, U
+
+
+def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+    """J_var (B,) and L_M (B,)."""
+    return kernels_of(lagrangian.problem).value(lagrangian, X, U)
+
+
+def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
+    """The largest violation (B,) of trajectories, of all constraints or of `obstacles` alone (geometric ones)."""
+    return kernels_of(problem).violation(problem, X, U, obstacles)
+
+
+def cost_unit(problem: Problem) -> Tensor:
+    """`problem.cost_unit` (B,), computed without autodiff where compiled code can; the problem keeps its scale."""
+    kernels_of(problem).scale(problem)
+    return problem.cost_unit
+
+
+def chord_clearance(problem: Problem, X: Tensor, share: float = TOUCH) -> Tensor:
+    """Smallest distance (B,) from the straight lines between knots to obstacles, m, negative in contact.
+
+    Counted from a `share` of an obstacle's margin beneath its surface, by default from where bodies touch; infinite
+    without obstacles and positions that keep a distance.
+    """
+    return kernels_of(problem).chord_clearance(problem, X, share)
+
+
+def interior_of(problem: Problem) -> InteriorKernels:
+    """The interior point's kernels for problems of this form.
+
+    Raises:
+        InputError: rows that join knots.
+    """
+    return kernels_of(problem).interior(problem)
