@@ -14,12 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchgco.dynamics.base import WrappedDynamics
+from torchgco.base.autodiff import jacobian
+from torchgco.dynamics.base import Dynamics, WrappedDynamics
 from torchgco.dynamics.unicycle import Unicycle
 from torchgco.problem.problem import Problem
 
 Array = NDArray[np.float64]
-Driver = Callable[[Problem, "Track"], tuple[Array, Array]]
+Driver = Callable[[Problem, "Track"], Array]
 
 TURNING = 3.0  # rad/s of turn rate per rad of error in the heading
 WITHIN = 0.95  # share of the range of the controls that is used
@@ -57,21 +58,44 @@ class Track:
 
 def driver_of(problem: Problem) -> Driver | None:
     """The controller for the model of these problems; None where there is none."""
-    model = problem.dynamics
+    if isinstance(own_model(problem.dynamics), Unicycle):
+        return drive_unicycle
+    return drive_point if is_point(problem) else None
+
+
+def own_model(model: Dynamics) -> Dynamics:
+    """The model as the user gave it."""
     while isinstance(model, WrappedDynamics):
         model = model.model
-    if isinstance(model, Unicycle) and problem.n == model.n:
-        return drive_unicycle
-    return None if push_of(problem) is None else drive_point
+    return model
 
 
-def drive_unicycle(problem: Problem, track: Track) -> tuple[Array, Array]:
-    """States (N+1, 4) and controls (N, 2) of a unicycle, for a batch of one: it slows down where it has to turn."""
+def is_point(problem: Problem) -> bool:
+    """Whether the controls choose the position's velocity or, where they don't change it at once, its acceleration.
+
+    In every direction about equally well, for the first problem at its start and at rest.
+    """
+    one = problem.take(torch.arange(1, device=problem.x0.device))
+    model = own_model(one.dynamics.at(0))
+    x = one.x0[:, : model.n].nan_to_num(0.0, 0.0, 0.0)  # a bad start says nothing about the model
+    u = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
+    integrated = getattr(model, "integrator", "none") != "none"
+    A, B = jacobian(model.field if integrated else model.step, x, u)
+    at = one.position
+    orders = [_numbers(part[0, at]) for part in (B, A @ B)]
+    first = next((push for push in orders if push.any()), orders[0])
+    if not np.isfinite(first).all() or min(first.shape) < len(first):
+        return False
+    strength = np.linalg.svd(first, compute_uv=False)
+    return bool(strength[-1] > EVENLY * strength[0])
+
+
+def drive_unicycle(problem: Problem, track: Track) -> Array:
+    """Controls (N, 2) of a unicycle, for a batch of one: it slows down where it has to turn."""
     dt, stages = float(problem.dynamics.dt), int(problem.stages[0])
     low, high = bounds_of(problem)
-    x, y, heading, speed = problem.x0[0].tolist()
-    X, U = np.tile(problem.x0[0].numpy(), (problem.N + 1, 1)), np.zeros((problem.N, 2))
-    nearest = 0
+    x, y, heading, speed = problem.x0[0, :4].tolist()
+    U, nearest = np.zeros((problem.N, 2)), 0
     for k in range(stages):
         nearest, aim, wanted = track.target(np.array([x, y]), nearest)
         error = math.remainder(math.atan2(aim[1] - y, aim[0] - x) - heading, 2.0 * math.pi)
@@ -82,16 +106,11 @@ def drive_unicycle(problem: Problem, track: Track) -> tuple[Array, Array]:
         middle, along = heading + 0.5 * dt * turn, dt * (speed + 0.5 * dt * push)
         x, y = x + along * math.cos(middle), y + along * math.sin(middle)
         heading, speed = heading + dt * turn, speed + dt * push
-        X[k + 1] = x, y, heading, speed
-    X[stages + 1 :] = X[stages]
-    return X, U
+    return U
 
 
-def push_of(problem: Problem) -> Array | None:
-    """How far controls of a few stages push the position of the first problem at its start, (d, m); None: no point.
-
-    A point can be pushed in every direction about equally well.
-    """
+def push_of(problem: Problem) -> Array:
+    """How far controls, held for a few stages, push the position of the first problem at its start, (d, m)."""
     one = problem.take(torch.arange(1, device=problem.x0.device))
     x, u = one.x0, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
     total = x.new_zeros(1, one.n, one.m)
@@ -99,37 +118,28 @@ def push_of(problem: Problem) -> Array | None:
         model = one.dynamics.at(k)
         fx, fu = model.jacobians(x, u)
         total, x = fx @ total + fu, model.step(x, u)
-    push = total[0, one.position].double().cpu().numpy()
-    if not np.isfinite(push).all():
-        return None
-    strength = np.linalg.svd(push, compute_uv=False)
-    return push if len(strength) == len(push) and strength[-1] > EVENLY * strength[0] else None
+    return _numbers(total[0, one.position])
 
 
-def drive_point(problem: Problem, track: Track) -> tuple[Array, Array]:
-    """States (N+1, n) and controls (N, m) of a point, for a batch of one.
+def drive_point(problem: Problem, track: Track) -> Array:
+    """Controls (N, m) of a point, for a batch of one.
 
     The controls take the place after a few stages to where the wanted speed would.
     """
     push, stages, at = push_of(problem), int(problem.stages[0]), problem.position
-    assert push is not None
     low, high = bounds_of(problem)
     rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
     inverse, time = np.linalg.pinv(push), AHEAD * float(problem.dynamics.dt)
-    X, U = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1), rest.clone()
-    nearest = 0
+    x, U, nearest = problem.x0, rest.clone(), 0
     for k in range(stages):
-        x = X[:, k]
-        nearest, aim, wanted = track.target(x[0, at].numpy(), nearest)
-        away = aim - x[0, at].numpy()
-        far = float(np.linalg.norm(away))
-        goal = x[0, at].numpy() + away * min(1.0, wanted * time / max(far, 1e-12))
-        change = inverse @ (goal - _after(problem, x, rest, k)[0, at].numpy())
-        u = np.clip(rest[0, k].numpy() + change, low[k], high[k])
-        U[0, k] = torch.from_numpy(u)
-        X[:, k + 1] = problem.dynamics.at(k).step(x, U[:, k])
-    X[:, stages + 1 :] = X[:, stages : stages + 1]
-    return X[0].numpy(), U[0].numpy()
+        p = _numbers(x[0, at])
+        nearest, aim, wanted = track.target(p, nearest)
+        far = float(np.linalg.norm(aim - p))
+        goal = p + (aim - p) * min(1.0, wanted * time / max(far, 1e-12))
+        change = inverse @ (goal - _numbers(_after(problem, x, rest, k)[0, at]))
+        U[0, k] = U.new_tensor(np.clip(_numbers(rest[0, k]) + change, low[k], high[k]))
+        x = problem.dynamics.at(k).step(x, U[:, k])
+    return _numbers(U[0])
 
 
 def _after(problem: Problem, x: Tensor, rest: Tensor, k: int) -> Tensor:
@@ -145,7 +155,11 @@ def bounds_of(problem: Problem) -> tuple[Array, Array]:
     if bounds is None:
         wide = np.full((problem.N, problem.m), np.inf)
         return -wide, wide
-    lower, upper = (part[0].double().cpu().numpy() for part in bounds.over(problem.N))
+    lower, upper = (_numbers(part[0]) for part in bounds.over(problem.N))
     slack = np.where(np.isfinite(upper - lower), 0.5 * (1.0 - WITHIN) * (upper - lower), 0.0)
     wide = np.ones((problem.N, 1))
     return (lower + slack) * wide, (upper - slack) * wide
+
+
+def _numbers(value: Tensor) -> Array:
+    return value.double().cpu().numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Natural, NonNegative, Positive, Share, check_options
+from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive, check_options
 from torchgco.base.tree import put, take
-from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of
+from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_model
 from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.lagrangian.state import SolveEnd
@@ -65,8 +66,8 @@ class PathPursuit(Solver):
     weight: NonNegative = 2.0
     smoothing: NonNegative = 2.0
     lookahead: Positive = 2.4
-    share: Share = 0.75
-    solver: InteriorPoint = InteriorPoint(initial_barrier=1e-3, warm_barrier=1e-4)
+    share: Annotated[float, Above(0), AtMost(1)] = 0.75
+    solver: InteriorPoint = InteriorPoint(max_iterations=3000, initial_barrier=1e-3, warm_barrier=1e-4)
     rounds: Natural = 4
 
     def __post_init__(self) -> None:
@@ -80,38 +81,35 @@ class PathPursuit(Solver):
         """Find a path for each problem, pursue it, and solve."""
         session, admitted = Session(call, RAW), self.solver.admitted(call.problem)
         held = session.call
-        X, U, found = self.guess(held.problem, held.U0)
+        U, found = self.guess(held.problem, held.U0)
         held = replace(held, U0=U)
-        end = self._cleared(held, self.solver.no_worse(held, self.solver.solved(held, X)))
+        end = self._cleared(held, self.solver.no_worse(held, self.solver.solved(held)))
         solution = session.finished(least_violated(held, end, admitted), admitted)
         return replace(solution, guided=found.long())
 
-    def guess(self, problem: Problem, U0: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """States (B, N+1, n) and controls (B, N, m) along the paths, and where (B,) there is one; else U0.
+    def guess(self, problem: Problem, U0: Tensor) -> tuple[Tensor, Tensor]:
+        """Controls (B, N, m) along the paths, and where (B,) there is one; else U0.
 
         Raises:
             InputError: as the class says.
         """
         driver, scene = self._checked(problem)
-        X, U = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1), U0.clone()
-        found = torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
-        for b in range(problem.B):
+        U, found = U0.clone(), torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
+        sound = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
+        for b in sound.nonzero().flatten().tolist():
             row = torch.tensor([b], device=problem.x0.device)
             one = problem.take(row)
             track = self._track(one, None if scene is None else scene.take(row))
-            if track is None:
-                X[b] = torch.nan  # the interior point then begins with its start held
-                continue
-            states, controls = driver(one, track)
-            X[b], U[b, : int(one.stages[0])] = U.new_tensor(states), U.new_tensor(controls)[: int(one.stages[0])]
-            found[b] = True
-        return X, U, found
+            if track is not None:
+                last = int(one.stages[0])
+                U[b, :last], found[b] = U.new_tensor(driver(one, track)[:last]), True
+        return U, found
 
     def _checked(self, problem: Problem) -> tuple[Driver, Scene | None]:
         """The controller, and start, goal and obstacles; None where there are no obstacles."""
         if problem.dynamics.position is None or (driver := driver_of(problem)) is None:
             expected = "a Unicycle, or a model whose position can be pushed in every direction, for path_pursuit"
-            raise InputError("problem.dynamics", expected, type(problem.dynamics).__name__)
+            raise InputError("problem.dynamics", expected, type(own_model(problem.dynamics)).__name__)
         if problem.goal is None:
             raise InputError("problem.goal", "a Goal, to which path_pursuit seeks a way", "none")
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))

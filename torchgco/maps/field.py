@@ -194,7 +194,8 @@ class BoundField(Obstacles):
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """As for all obstacles; where the field's bound says no, each cell, or point, near the start is measured."""
         clear = super().start_is_clear(x0)
-        for b in (~clear).nonzero().flatten().tolist():
+        finite = torch.isfinite(x0[:, self.position]).all(-1)
+        for b in (~clear & finite).nonzero().flatten().tolist():
             least = CONTACT_FACTOR * float(self.vehicle_radius[b])
             p = x0[b, self.position].double().cpu().numpy()
             field = self.field

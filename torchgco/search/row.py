@@ -66,7 +66,7 @@ class Passes(tuple[Row, ...]):
 
     def __new__(cls, rows: Mapping[str, Row] | Iterable[Row] = ()) -> Self:
         if isinstance(rows, Mapping):
-            names, rows = list[str](rows), tuple(rows.values())
+            names, rows = [str(name) for name in rows], tuple(rows.values())
         else:
             known = rows.names if isinstance(rows, Passes) else None
             rows = tuple(rows)
