@@ -45,7 +45,7 @@ _parse_once()
 # kernels or of many solves, are skipped then.
 COMPILED = (
     "native", "compiled", "search", "missions", "benchmarks", "experiments", "notebooks", "golden", "fuzz", "solvers",
-    "view", "cluster", "test_horizons.py",
+    "view", "cluster", "test_horizons.py", "test_scale.py", "test_presets.py", "roadmap",
 )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from torchgco import (
     AugmentedLagrangian,
     ControlBounds,
     FunctionConstraint,
+    FunctionDynamics,
     InputError,
     Planar,
     Problem,
@@ -22,6 +23,7 @@ from torchgco import (
     Solution,
     StateBounds,
     Status,
+    solve,
 )
 from torchgco.baselines import CasADiSolver, Hold
 from torchgco.constraints import Constraint
@@ -287,3 +289,15 @@ def test_a_flight_in_a_study() -> None:
     with tqdm(total=2, disable=True) as bar:
         rows, U = Flight(setup, layouts, "fatrop", setup.solver, bar).fly()
     assert rows["status"].tolist() == ["CONVERGED"] * 2 and U.shape == (2, 20, 2) and bool(rows["feasible"].all())
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "hold"])
+def test_rows_that_are_nan_are_not_called_feasible(solver: str) -> None:
+    """The cost is finite at states where a row has no value."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, 0.1)
+    cost = QuadraticCost(Q=[1.0, 1.0], R=[0.01], Qf=[50.0, 50.0], x_ref=[1.0, 0.0])
+    rows = [ControlBounds(-2.0, 2.0), FunctionConstraint(lambda x: x[..., :1].sqrt() - 0.6)]
+    x0 = torch.tensor([[0.1, 0.0], [-5.0, 0.0]], dtype=torch.float64)
+    found = solve(Problem(model, cost, rows, x0, 12), solver=solver)
+    assert found.statuses[1] == Status.NON_FINITE and bool(found.violation[1].isnan())
+    assert found.statuses[0] in (Status.CONVERGED, Status.FEASIBLE)

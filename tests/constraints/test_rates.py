@@ -224,8 +224,8 @@ def test_obstacles_are_searched_as_without_rates() -> None:
     near = FunctionConstraint(lambda x: x[..., 1:2] - 1.5, geometric=True)
     cost = QuadraticCost(Q=[0.01] * 6, R=[0.01] * 2, Qf=[200.0, 200, 0, 1, 1, 0], x_ref=[2.0, 0, 0, 0, 0, 0])
     parts = [wall, near, ControlBounds(-20, 20)]
-    model, x0 = Planar(turn_gain=10.0, turn_drag=1.0, drag=1.0), torch.zeros(5, 6, dtype=D)
-    x0[:, 1] = torch.linspace(-0.1, 0.1, 5)
+    model, x0 = Planar(turn_gain=10.0, turn_drag=1.0, drag=1.0), torch.zeros(16, 6, dtype=D)
+    x0[:, 1] = torch.linspace(-0.1, 0.1, 16)
     free = torchgco.solve(Problem(model, cost, parts, x0, 60))
     problem = Problem(model, cost, [*parts, RateBounds(-0.6, 0.6)], x0, 60)
     with warnings.catch_warnings():
@@ -234,7 +234,7 @@ def test_obstacles_are_searched_as_without_rates() -> None:
     assert float(changes(free.U).abs().max()) > 0.7
     assert float(changes(slow.U).abs().max()) <= 0.6001
     assert bool(judge(Problem(model, cost, parts, x0, 60), free.U).reached.all())
-    assert int(judge(problem, slow.U).reached.sum()) >= 3
+    assert int(judge(problem, slow.U).reached.sum()) >= 11  # 42 of 48 by three seeds: below this once in a hundred
 
 
 @compiled

@@ -225,3 +225,49 @@ def test_the_time_is_looked_at_in_every_iteration() -> None:
     with by_pytorch():
         solution = InteriorPoint().solve(cart(), torch.zeros(3, 12, 1, dtype=D), max_seconds=1e-9)
         assert set(solution.statuses) <= {Status.TIME_LIMIT, Status.FEASIBLE} and int(solution.iterations.max()) <= 1
+
+
+# Branches that aren't taken -------------------------------------------------------------------------------------------
+
+BRANCHES = {  # with places where the other branch has no slopes, or infinite ones
+    "sqrt": lambda z: torch.where(z > 0, 0.1 * z.sqrt() + z, 0.2 * z),
+    "log": lambda z: torch.where(z > 0.1, z.log(), z),
+    "quotient": lambda z: torch.where(z != 0, z.sin() / z, 1.0),
+    "asin": lambda z: torch.where(z.abs() < 0.5, z.asin(), z),
+    "net": lambda z: torch.where(z > 0, torch.tanh(torch.stack((z.sqrt(), 1.0 - z), dim=-1)).sum(-1), 0.2 * z),
+}
+
+
+@pytest.mark.parametrize("way", [by_reverse, by_forward])
+@pytest.mark.parametrize("name", BRANCHES)
+def test_derivatives_of_a_branch_not_taken_do_not_count(name: str, way) -> None:
+    z = torch.tensor([-1.0, 0.0, 0.05, 0.3, 0.8], dtype=D)
+    branch = BRANCHES[name]
+    flat_at = lambda z: branch(z) if name != "quotient" else torch.where(z == 0, 1.0, branch(z))
+    w, weights = torch.stack((z, z.flip(0)), dim=-1).unsqueeze(0), torch.ones(1, 5, 1, dtype=D)
+    J, H = way(lambda w: branch(w[..., :1]) * (1.0 + w[..., 1:]), w, weights)
+    assert bool(torch.isfinite(J).all()) and bool(torch.isfinite(H).all())
+    inner = (z.abs() > 1e-3) & ((z.abs() - 0.5).abs() > 1e-3)  # differences don't cross from branch to branch
+    h, other = 1e-4, 1.0 + z.flip(0)
+    slope, bend = (flat_at(z + h) - flat_at(z - h)) / (2 * h), (flat_at(z + h) - 2 * flat_at(z) + flat_at(z - h)) / h**2
+    torch.testing.assert_close(J[0, inner, 0, 0], (slope * other)[inner], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(J[0, :, 0, 1], branch(z))
+    torch.testing.assert_close(H[0, inner, 0, 0], (bend * other)[inner], rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(H[0, inner, 0, 1], slope[inner], rtol=1e-4, atol=1e-6)
+
+
+@compiled
+@pytest.mark.parametrize("place", ["dynamics", "cost", "row"])
+def test_branches_not_taken_end_as_with_native_kernels(place: str) -> None:
+    branch = BRANCHES["sqrt"]
+    drag = branch if place == "dynamics" else torch.zeros_like
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u - 0.3 * drag(x[..., :1])), dim=-1), 2, 1, 0.1)
+    off = (lambda x: branch(x[..., 0])) if place == "cost" else lambda x: x[..., 0] - 1.0
+    cost = FunctionCost(lambda x, u: 0.01 * u[..., 0].square() + off(x).square(), lambda x: 50 * off(x).square())
+    rows = [FunctionConstraint(lambda x: branch(x[..., :1]) - 0.6)] if place == "row" else []
+    x0 = torch.tensor([[-1.0, 0.0], [0.0, 0.0], [0.3, 0.0]], dtype=D)
+    problem = Problem(model, cost, [ControlBounds(-2.0, 2.0), *rows], x0, 10)
+    for solver in (InteriorPoint(), torchgco.AugmentedLagrangian()):
+        native, eager = both(problem, solver=solver)
+        assert eager.statuses == native.statuses == [Status.CONVERGED] * 3
+        torch.testing.assert_close(eager.cost, native.cost, rtol=1e-6, atol=1e-9)

@@ -150,3 +150,13 @@ def test_changes_of_tensors_of_any_layout_are_seen(layout: str) -> None:
     (numbers[2:] if layout == "strided" else tensor).mul_(2.0)
     assert before is None or watch.look() != before
     assert (before is None) == (layout == "sparse")
+
+
+def test_a_sparse_tensor_that_is_kept_leaves_other_problems_alone() -> None:
+    """Each new trace is weighed against those that are kept."""
+    sparse = torch.eye(2, dtype=D).to_sparse()
+    after(made(lambda v: v @ sparse.to_dense()))
+    found, kept = after(made(lambda v: 0.5 * v))
+    assert kept and bool(torch.isfinite(found).all())
+    found, kept = after(made(lambda v: (sparse @ v.reshape(-1, 2).mT).mT.reshape(v.shape)))
+    assert bool(torch.isfinite(found).all())

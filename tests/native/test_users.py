@@ -199,6 +199,14 @@ class Jerky(Smooth):
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         return super().total(X, U) + U.diff(dim=1).square().sum((-1, -2))
 
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        super().expand(X, U, H)
+        n, ends = X.shape[-1], U.new_zeros(U.shape[0], 1, U.shape[-1])
+        change = torch.cat((ends, 2.0 * U.diff(dim=1), ends), dim=1)
+        slope = change[:, :-1] - change[:, 1:]
+        H[:, :-1, n + 1 :, n] += slope
+        H[:, :-1, n, n + 1 :] += slope
+
 
 class FirstIsFree(Smooth):
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:

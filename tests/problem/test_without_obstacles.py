@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import torchgco
+from tests.engines import compiled
 from tests.problems import planar_batch, quick_gco
 from tests.search.rows import proposed
 from torchgco import (
@@ -96,6 +97,7 @@ def test_no_path_is_proposed(kind: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # 0.1 s between knots is long
+@compiled
 def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
     problem, U0 = planar_batch(B=2, N=25, obstacles=6, seed=4)
     more = Problem(problem.dynamics, problem.cost, [EMPTY["shared"], *problem.constraints], problem.x0, problem.N)

@@ -111,11 +111,46 @@ def gradients_at_once(function: Callable[..., Tensor], *args: Tensor) -> tuple[T
 
 
 def gradient_and_hessian(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient (..., s) and Hessian (..., s, s) of function(z) (...), which maps each row of z (..., s) to a number."""
+    """Gradient (..., s) and Hessian (..., s, s) of function(z) (...), which maps each row of z (..., s) to a number.
+
+    By forward over reverse differentiation; where that isn't finite, by forward differentiation alone.
+    """
     gradient = torch.func.grad(lambda rows: function(rows).sum())
 
     def along(direction: Tensor) -> Tensor:
         return torch.func.jvp(gradient, (z,), (direction.expand_as(z),))[1]
 
     basis = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
-    return gradient(z), torch.func.vmap(along)(basis).movedim(0, -1)
+    g, H = gradient(z), torch.func.vmap(along)(basis).movedim(0, -1)
+    if lost := not_finite(g, function(z)):
+        g = torch.where(torch.isfinite(g), g, jacobian(lambda z: function(z).unsqueeze(-1), z)[0].squeeze(-2))
+    if lost or not_finite(H, function(z)):
+        H = torch.where(torch.isfinite(H), H, hessian_forward(function, z))
+    return g, H
+
+
+def not_finite(derivatives: Tensor, values: Tensor) -> bool:
+    """Whether derivatives aren't finite, though all values are or at least some."""
+    return not bool(torch.isfinite(derivatives).all()) and bool(torch.isfinite(values).any())
+
+
+def hessian_forward(function: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
+    """The Hessian (..., s, s) of `gradient_and_hessian` by forward over forward differentiation; NaN if it has none.
+
+    Reverse differentiation multiplies the slopes of a branch that `torch.where` doesn't take by 0, which is NaN where
+    they are infinite or NaN, as those of `where(x > 0, x.sqrt(), x)` at x <= 0; forward differentiation leaves them
+    out. It takes s times as long.
+    """
+    basis = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
+
+    def slope(z: Tensor, i: int) -> Tensor:
+        return torch.func.jvp(function, (z,), (basis[i].expand_as(z),))[1]
+
+    def row(i: int) -> Tensor:
+        along = lambda direction: torch.func.jvp(lambda z: slope(z, i), (z,), (direction.expand_as(z),))[1]
+        return torch.func.vmap(along)(basis).movedim(0, -1)
+
+    try:
+        return torch.stack([row(i) for i in range(z.shape[-1])], dim=-2)
+    except RuntimeError:  # an operation without such derivatives
+        return torch.full((*z.shape, z.shape[-1]), torch.nan, dtype=z.dtype, device=z.device)

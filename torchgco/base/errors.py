@@ -21,6 +21,11 @@ class InputError(ValueError):
         return type(self), (self.field, self.expected, str(self.got))  # so that a worker process can return it
 
 
+def undefined(part: object, name: str) -> InputError:
+    """The error of a class that leaves out a method which what is asked for needs."""
+    return InputError(f"{type(part).__name__}.{name}", "a method of this name, which is needed here", "none")
+
+
 def shown(value: object) -> str:
     """A value as an error shows it: its repr where that fits on a line, else its type."""
     try:

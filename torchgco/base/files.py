@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import stat
 import tempfile
 import zipfile
 from collections.abc import Callable, Collection
@@ -45,6 +46,18 @@ def write_whole(
         Path(part).unlink(missing_ok=True)  # gone already after a move
 
 
+def regular(path: str | os.PathLike[str]) -> Path:
+    """The path of a file that has an end.
+
+    Raises:
+        OSError: there is none, or it is a device, a pipe or a folder: reading `/dev/zero`, to which a link in a run's
+            folder may lead, takes all memory, and a pipe waits for ever.
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise OSError("no regular file")
+    return Path(path)
+
+
 def read_arrays(
     path: str | os.PathLike[str],
     field: str,
@@ -68,7 +81,7 @@ def read_arrays(
         raise InputError(field, f"the path of {kind}", repr(path))
     try:
         # Opened here, because np.load leaves a damaged file open.
-        with open(path, "rb") as file:
+        with open(regular(path), "rb") as file:
             size = npz_size(file)
             if size > room:
                 expected = f"arrays that fit into the {room / 1e9:.3g} GB {limit}"

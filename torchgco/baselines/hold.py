@@ -46,7 +46,7 @@ def rolled_out(problem: Problem, U: Tensor, violation_tolerance: float, iteratio
     status = torch.full((problem.B,), int(Status.FEASIBLE), device=U.device)
     status[worst > violation_tolerance] = Status.INFEASIBLE
     status[~problem.start_is_clear] = Status.INVALID_START
-    status[~torch.isfinite(cost)] = Status.NON_FINITE
+    status[~(torch.isfinite(cost) & torch.isfinite(worst))] = Status.NON_FINITE
     none = torch.zeros_like(status)
     return Solution(
         X=X, U=U.clone(), K=U.new_zeros(*U.shape, problem.n), d=torch.zeros_like(U),

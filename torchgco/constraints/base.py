@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
-from torchgco.base.errors import InputError, shown, theirs
+from torchgco.base.errors import InputError, shown, theirs, undefined
 from torchgco.base.mixing import foreign, why
 from torchgco.base.options import check_options
 from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
@@ -44,15 +44,15 @@ class Constraint(PerElement):
 
     def bind(self, dims: Dimensions) -> Self:
         """The constraint checked and shaped for one problem; called once, by Problem."""
-        raise NotImplementedError
+        raise undefined(self, "bind")
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         """c (B, K, p) along X (B, N+1, n), U (B, N, m)."""
-        raise NotImplementedError
+        raise undefined(self, "value")
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         """Add sum_i g_i dc_i and sum_i h_i dc_i' dc_i (Gauss-Newton) to H (B, N+1, s, s); g, h are (B, K, p)."""
-        raise NotImplementedError
+        raise undefined(self, "accumulate")
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """By how much each row is violated, (B, K, p) >= 0: lengths in metres, all else in the units of c."""
@@ -66,7 +66,7 @@ class Constraint(PerElement):
 
     def at(self, x: Tensor, k: int) -> Tensor:
         """Rows (B, S, p) for samples x (B, S, n) of one knot; geometric constraints only."""
-        raise NotImplementedError
+        raise undefined(self, "at")
 
     def holds_at(self, k: int) -> bool:
         """Whether the constraint applies to knot k."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchgco.base.autodiff import jacobian
+from torchgco.base.autodiff import hessian_forward, jacobian, not_finite
 from torchgco.base.shapes import MISTAKES
 
 AT_ONCE = 2**20  # numbers of w, over all directions, that are differentiated together: bounds the memory
@@ -24,7 +24,7 @@ def by_reverse(function: Function, w: Tensor, weights: Tensor) -> tuple[Tensor, 
 
     Returns:
         The Jacobians, (b, K', p, v) or (b, K, p, v), and the Hessians of the weighted sums of a knot's rows,
-        (b, K', v, v).
+        (b, K', v, v), or (b, K, v, v) where those are not finite.
     """
     with torch.enable_grad():
         z = w.detach().clone().requires_grad_()
@@ -34,7 +34,19 @@ def by_reverse(function: Function, w: Tensor, weights: Tensor) -> tuple[Tensor, 
         (slopes,) = torch.autograd.grad((weights * value).sum(), z, create_graph=True)
         J = _rows(value, z) if value.shape[-1] <= 2 * w.shape[-1] else jacobian(function, w)[0]
         H = _rows(slopes, z) if slopes.requires_grad else w.new_zeros(*w.shape, w.shape[-1])
-    return J.detach(), H.detach()
+    return _finite(function, w, weights, value.detach(), J.detach(), H.detach())
+
+
+def _finite(
+    function: Function, w: Tensor, weights: Tensor, value: Tensor, J: Tensor, H: Tensor
+) -> tuple[Tensor, Tensor]:
+    """J and H, by forward differentiation alone where they aren't finite: `hessian_forward` says why."""
+    if not_finite(J, value):
+        J = jacobian(function, w)[0]
+    if not_finite(H, value):
+        other = hessian_forward(lambda w: (weights * function(w)).sum(-1), w)
+        H = torch.where(torch.isfinite(H), H, other) if other.shape == H.shape else other
+    return J, H
 
 
 def _rows(values: Tensor, z: Tensor) -> Tensor:
@@ -61,7 +73,7 @@ def by_forward(function: Function, w: Tensor, weights: Tensor) -> tuple[Tensor, 
 
     basis = torch.eye(w.shape[-1], dtype=w.dtype, device=w.device)
     H, J = torch.func.vmap(along, chunk_size=max(1, AT_ONCE // max(1, w.numel())))(basis)
-    return J.movedim(0, -1), H.movedim(0, -1)
+    return _finite(function, w, weights, function(w), J.movedim(0, -1), H.movedim(0, -1))
 
 
 def flat(function: Function, w: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -153,7 +153,7 @@ class Group:
         J, curvature = self.expansion(function, w, self.place.of(lam))
         if not is_function(self.part):
             J = J if J.shape[1] == self.place.K else J[:, self.place.knots]
-            curvature = curvature[:, self.place.knots]
+            curvature = curvature if curvature.shape[1] == self.place.K else curvature[:, self.place.knots]
         H[(slice(None), *_square(self.place.knots, self.place.columns))] += curvature
         return Dense(self.place, J)
 

@@ -63,8 +63,8 @@ class Captured:
 
     @property
     def nbytes(self) -> int:
-        """The size of all these tensors."""
-        return sum(tensor.nbytes for tensor in self._watch.tensors)
+        """The size of all these tensors, of sparse ones as if they were dense."""
+        return sum(tensor.numel() * tensor.element_size() for tensor in self._watch.tensors)
 
     def is_still(self, last: Shared | None) -> bool:
         """Whether `read` would give what it gave before, `last`; done without PyTorch's operations."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.brief import brief
-from torchgco.base.errors import ScaleWarning
+from torchgco.base.errors import ScaleWarning, undefined
 from torchgco.base.shapes import MISTAKES
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
@@ -115,7 +115,7 @@ class Obstacles(Constraint):
     @property
     def margins(self) -> Tensor:
         """Lengths (B, M), m: bodies touch at (1 - CONTACT_FACTOR) times these beneath the full surface."""
-        raise NotImplementedError
+        raise undefined(self, "margins")
 
     @property
     def sizes(self) -> Tensor:
@@ -124,14 +124,14 @@ class Obstacles(Constraint):
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
         """Distances (B, K, M), m, of points p (B, K, d), m, at times t (K,), s."""
-        raise NotImplementedError
+        raise undefined(self, "signed_distance")
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         """Smallest distances (B, E, M), m, of the straight segments from a to b (B, E, d), from obstacles at t = 0.
 
         A lower bound will do where it exceeds the smallest of the problem by more than its largest margin.
         """
-        raise NotImplementedError
+        raise undefined(self, "segment_clearance")
 
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
@@ -139,7 +139,7 @@ class Obstacles(Constraint):
 
     def chosen(self, at: Tensor) -> Obstacles:
         """The same kind with the obstacles at places (B, M') alone; -1 stands for an absent one."""
-        raise NotImplementedError
+        raise undefined(self, "chosen")
 
     def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
         """Smallest distance (B,) from the straight lines between knots to obstacles, m; negative inside of them.
@@ -164,7 +164,7 @@ class Obstacles(Constraint):
 
     def stopping_at(self, knots: Tensor) -> Self:
         """The same obstacles, which don't count, and don't move, after each problem's knot (B,)."""
-        raise NotImplementedError
+        raise undefined(self, "stopping_at")
 
     def times(self, X: Tensor) -> Tensor:
         """t = k dt (K,) at the constraint's knots, s."""

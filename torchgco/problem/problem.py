@@ -22,6 +22,7 @@ from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.obstacles.base import Obstacles, warn_of_small
+from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import chooses_position, moved_inside, start_mask
 from torchgco.problem.goal import Goal
@@ -73,10 +74,10 @@ class Problem:
 
     def _bind(self) -> None:
         dims, dynamics, cost, constraints = self._dimensions(self.x0), self.dynamics, self.cost, self.constraints
-        object.__setattr__(self, "dynamics", dynamics.bind(dims))
+        object.__setattr__(self, "dynamics", bound(dynamics, dims, "dynamics", Dynamics))
         self._check_dynamics()
-        object.__setattr__(self, "cost", cost.bind(dims))
-        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in constraints))
+        object.__setattr__(self, "cost", bound(cost, dims, "cost", Cost))
+        object.__setattr__(self, "constraints", _all_bound(constraints, dims))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
         rows = zip(constraints, self.constraints, strict=True)
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
@@ -290,28 +291,30 @@ class Problem:
         if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
             raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
         with computing_on(x0.device):
-            model = self.dynamics if dynamics is None else dynamics.bind(self._dimensions(x0, dynamics))
+            model = self.dynamics
+            if dynamics is not None:
+                model = bound(dynamics, self._dimensions(x0, dynamics), "dynamics", Dynamics)
             dims = self._dimensions(x0, model)
-            bound = tuple(constraint.bind(dims) for constraint in constraints)
-            for i, part in enumerate(bound):
+            rows = _all_bound(constraints, dims)
+            for i, part in enumerate(rows):
                 if not isinstance(part, Obstacles):
                     continue
                 if part.position != dims.position or (part.moving and part.dt != dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
                     raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
-            if [type(part) for part in bound] != [type(part) for part in self.constraints]:
+            if [type(part) for part in rows] != [type(part) for part in self.constraints]:
                 kinds = ", ".join(type(part).__name__ for part in self.constraints)
-                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
-            parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, bound), "constraints": bound}
+                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in rows))
+            parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, rows), "constraints": rows}
             if dynamics is not None:
                 parts["dynamics"] = model
             if cost is not None:
-                parts["cost"] = cost.bind(dims)
+                parts["cost"] = bound(cost, dims, "cost", Cost)
                 if self.goal is None or self.goal.assumed:
                     parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
             known = set(map(id, self.constraints))
-            new = [pair for pair in zip(constraints, bound, strict=True) if id(pair[0]) not in known]
+            new = [pair for pair in zip(constraints, rows, strict=True) if id(pair[0]) not in known]
             model = None if dynamics is None else (dynamics, parts["dynamics"])
             check_code(dims, started.x0, model, None if cost is None else (cost, parts["cost"]), new)
         return started
@@ -430,6 +433,10 @@ def _check_constraints(constraints: Any) -> None:
     rates = sum(isinstance(constraint, RateBounds) for constraint in constraints)
     if rates > 1:
         raise InputError("constraints", "one RateBounds at most", rates)
+
+
+def _all_bound(constraints: Sequence[Constraint], dims: Dimensions) -> tuple[Constraint, ...]:
+    return tuple(bound(part, dims, f"constraints[{i}]", Constraint) for i, part in enumerate(constraints))
 
 
 def _named(part: object) -> str:

@@ -18,7 +18,7 @@ import pyarrow.compute
 import pyarrow.parquet
 
 from torchgco.base.errors import InputError
-from torchgco.base.files import npz_size
+from torchgco.base.files import npz_size, regular
 from torchgco.base.memory import limited
 from torchgco.missions.tables import STATES
 from torchgco.scenarios import Layouts, Vehicle
@@ -39,7 +39,7 @@ def read_npz(path: Path, trust: bool = False) -> dict[str, np.ndarray]:
         InputError: they take more than they may.
         Exception: nearly any, where the file is damaged.
     """
-    with open(path, "rb") as file:
+    with open(regular(path), "rb") as file:
         if not trust and (size := npz_size(file)) > LARGEST:
             refuse(path, f"arrays of {size / 1e9:.3g} GB")
         with np.load(file, allow_pickle=False) as held:
@@ -67,6 +67,7 @@ def read_table(path: Path, trust: bool = False, **options: Any) -> pd.DataFrame:
         InputError: it takes more than it may.
         Exception: nearly any, where the file is damaged or has other columns.
     """
+    regular(path)
     if trust:
         return _table(path, options)
     try:

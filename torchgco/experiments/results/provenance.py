@@ -37,6 +37,7 @@ from typing import Any
 
 import torch
 
+from torchgco.base.files import regular
 from torchgco.base.version import PACKAGE, VERSION
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.flight import Plan
@@ -96,7 +97,7 @@ def _entry(setup: Setup, plan: Plan, command: Sequence[str]) -> dict[str, Any]:
 def _held(path: Path) -> list[dict[str, Any]]:
     """The entries of earlier starts; none where they can't be read."""
     try:
-        held = json.loads(path.read_bytes())
+        held = json.loads(regular(path).read_bytes())
     except (OSError, ValueError, RecursionError):
         return []
     return held if isinstance(held, list) else []

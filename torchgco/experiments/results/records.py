@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 
 from torchgco.base.errors import InputError
-from torchgco.base.files import PART
+from torchgco.base.files import PART, regular
 from torchgco.experiments.results.files import checksum, create, damaged, write
 from torchgco.experiments.results.identity import Manifest, difference
 from torchgco.experiments.results.limits import read_npz, read_table
@@ -242,7 +242,7 @@ class Records:
 def read_manifest(path: Path, whole: bool = False) -> Manifest:
     """The manifest in a study.json; InputError where it is damaged, with `whole` also where a group is missing."""
     try:
-        manifest = Manifest.from_json(path.read_bytes())
+        manifest = Manifest.from_json(regular(path).read_bytes())
         if whole:
             manifest.check_whole()
         return manifest
@@ -253,7 +253,7 @@ def read_manifest(path: Path, whole: bool = False) -> Manifest:
 def read_checksums(path: Path) -> dict[str, list[str]]:
     """The valid checksums of each file of a finished study; InputError where its mark is damaged."""
     try:
-        sums = json.loads(path.read_bytes())
+        sums = json.loads(regular(path).read_bytes())
         if not all(isinstance(held, list) for held in sums.values()):
             raise ValueError("no checksums")
         return sums

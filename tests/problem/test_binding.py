@@ -1,0 +1,203 @@
+"""A user's class whose own methods would never be called, or that lacks one, is refused in one line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import (
+    Boxes,
+    Constraint,
+    ControlBounds,
+    Cost,
+    FunctionConstraint,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Spheres,
+    StateBounds,
+)
+from torchgco.base.shapes import Dimensions
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.kernels import use_native
+from torchgco.obstacles import Obstacles
+
+D, N = torch.float64, 10
+WEIGHTS = {"Q": [1.0] * 6, "R": [0.1] * 2, "Qf": [10.0] * 6, "x_ref": [1.0, 0, 0, 0, 0, 0]}
+
+
+def problem(*constraints: Constraint, cost: Cost | None = None, dynamics: Any = None) -> Problem:
+    cost = QuadraticCost(**WEIGHTS) if cost is None else cost
+    return Problem(dynamics or Planar(dt=0.05), cost, list(constraints), torch.zeros(2, 6, dtype=D), N)
+
+
+@dataclass(frozen=True)
+class Effort(QuadraticCost):
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return u.abs().sum(-1)
+
+
+@dataclass(frozen=True)
+class Waypoint(QuadraticCost):
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        return (X[:, 5, :2] - 0.3).square().sum(-1)
+
+
+@dataclass(frozen=True)
+class Soft(Spheres):
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return X[:, 1:, :1] - 5.0
+
+
+@dataclass(frozen=True)
+class Plain(Boxes):
+    geometric = False
+
+
+@dataclass(frozen=True)
+class SofterStill(Soft):
+    """The method is one of a class between."""
+
+
+LOST = {
+    "cost.stage": lambda: problem(cost=Effort(**WEIGHTS)),
+    "cost.total": lambda: problem(cost=Waypoint(**WEIGHTS)),
+    "constraints[0].value": lambda: problem(Soft([[0.5, 0.5]], [0.1], 0.05)),
+    "constraints[0].geometric": lambda: problem(Plain([[0.5, 0.5]], [[0.1, 0.1]], vehicle_radius=0.05)),
+    "constraints[1].value": lambda: problem(ControlBounds(-1, 1), SofterStill([[0.5, 0.5]], [0.1], 0.05)),
+}
+
+
+@pytest.mark.parametrize("field", LOST)
+def test_methods_that_would_never_be_called_are_refused(field: str) -> None:
+    with pytest.raises(InputError, match="own methods are called: Bound") as told:
+        LOST[field]()
+    assert told.value.field == field
+
+
+def test_new_parts_of_a_problem_are_looked_at_as_well() -> None:
+    given = problem()
+    with pytest.raises(InputError, match=r"cost\.stage: .* one of Effort"):
+        given.started_at(given.x0, [], cost=Effort(**WEIGHTS))
+
+
+@dataclass(frozen=True)
+class Late(FunctionConstraint):
+    """Its class stays what it is: its own rows are those that hold."""
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().value(X, U) - 0.1
+
+
+@dataclass(frozen=True)
+class Scaled(QuadraticCost):
+    """A field, a method and a `bind` of its own: nothing is lost."""
+
+    factor: float = 2.0
+
+    def bind(self, dims: Dimensions) -> Cost:
+        return QuadraticCost(**WEIGHTS | {"R": self.weights()}).bind(dims)
+
+    def weights(self) -> list[float]:
+        return [self.factor * w for w in self.R]
+
+
+def test_classes_that_keep_their_methods_pass() -> None:
+    late = problem(Late(lambda x: x[..., :1] - 0.5))
+    rows = late.constraints[0].value(*late.at_rest)
+    assert float((rows + 0.6).abs().max()) < 1e-12
+    scaled = problem(cost=Scaled(**WEIGHTS))
+    assert isinstance(scaled.cost, BoundQuadratic) and bool((scaled.cost.R == 0.2).all())
+
+
+@dataclass(frozen=True)
+class NoBind(Constraint):
+    pass
+
+
+@dataclass(frozen=True)
+class NoKnots(Constraint):
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return X[:, 1:, :1] - 0.5
+
+
+@dataclass(frozen=True)
+class ReturnsNone(NoKnots):
+    def bind(self, dims: Dimensions) -> Any:
+        return None
+
+
+@dataclass(frozen=True)
+class NoValue(Constraint):
+    knots = slice(1, N + 1)
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+
+@dataclass(frozen=True)
+class NoSlopes(NoValue):
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return X[:, 1:, :1] - 0.5
+
+
+@dataclass(frozen=True)
+class NoObstacles(Obstacles):
+    pass
+
+
+@dataclass(frozen=True)
+class Nothing(Planar):
+    def bind(self, dims: Dimensions) -> Any:
+        return None
+
+
+@dataclass(frozen=True)
+class OtherSum(Cost):
+    """Its own sum has a term that `stage` doesn't know, and no derivatives."""
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return 0.1 * u.square().sum(-1)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return (x[..., 0] - 1.0).square()
+
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().total(X, U) + 3.0 * (X[:, 5, 0] - 0.9).square()
+
+
+MISSING = {
+    "NoBind.bind": lambda: problem(NoBind()),
+    "NoObstacles.bind": lambda: problem(NoObstacles()),
+    "constraints[0].knots": lambda: problem(NoKnots()),
+    "constraints[1].bind": lambda: problem(StateBounds(-9.0, 9.0), ReturnsNone()),
+    "NoValue.value": lambda: problem(NoValue()),
+    "dynamics.bind": lambda: problem(dynamics=Nothing(dt=0.05)),
+    "cost.expand": lambda: problem(cost=OtherSum()),
+}
+
+
+@pytest.mark.parametrize("field", MISSING)
+def test_what_a_class_leaves_out_is_named(field: str) -> None:
+    with pytest.raises(InputError) as told:
+        MISSING[field]()
+    assert told.value.field == field
+
+
+@pytest.mark.parametrize("solver", ["al_ilqr", "ilqr", "interior_point", "gco"])
+def test_slopes_that_a_solver_needs_are_asked_for(solver: str) -> None:
+    use_native(False)
+    try:
+        with pytest.raises(InputError, match=r"NoSlopes\.accumulate: "):
+            torchgco.solve(problem(NoSlopes()), solver=solver)
+    finally:
+        use_native(True)
