@@ -123,7 +123,7 @@ def _xy(X: Tensor) -> np.ndarray:
 def _edges(problem: Problem) -> list[np.ndarray]:
     """Segments of the edges of the roadmap."""
     scene = scene_of(problem.in_cost_units(), problem.at_rest[1])
-    roadmap: Roadmap = presets.gco(problem).passes[3].roadmaps[0]  # type: ignore[union-attr]
+    roadmap: Roadmap = presets.gco(problem).passes.paths.roadmap
     assert scene is not None
     search = TorchSearch(scene.obstacles.reduced(roadmap.max_overlap), MARGIN)
     cube = halton(roadmap.num_halton, 2).to(scene.start)

@@ -15,7 +15,6 @@ from torchgco import (
     AugmentedLagrangian,
     Boxes,
     ControlBounds,
-    PathProposals,
     Planar,
     Problem,
     QuadraticCost,
@@ -25,6 +24,7 @@ from torchgco import (
     Spheres,
     presets,
 )
+from torchgco.search import Tube
 
 FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
 HOVER = [0.0, 0.0, 0.0, 9.81]
@@ -105,20 +105,13 @@ def quick_gco(problem: Problem, local: AugmentedLagrangian | None = None) -> Res
     local  makes the solves instead of the preset's, with the same guidance
     """
     solver = presets.gco(problem)
-    usual = next(one for one in solver.passes if isinstance(one, PathProposals))
-
-    def quick(one: PathProposals) -> PathProposals:
-        follow = tuple(replace(way, initial_offsets=way.initial_offsets[:2]) for way in one.follow)
-        top = 2 if one.refine == usual.refine else 4
-        return replace(
-            one, num_paths=2 if one.num_paths == usual.num_paths else 4, follow=follow, relax_iterations=20,
-            relax_top=None, refine=replace(one.refine, top=top),
-        )  # fmt: skip
-
+    paths = solver.passes.paths
+    follow = replace(paths.follow, initial_offsets=paths.follow.initial_offsets[:2])
+    paths = replace(paths, num_paths=2, follow=follow, relax_iterations=20, relax_top=None, refined=2)
     guidance = solver.local.guidance
     assert isinstance(guidance, GCO)
     guidance = replace(guidance, sampler=replace(guidance.sampler, samples=48, rounds=4))
-    passes = tuple(quick(one) if isinstance(one, PathProposals) else one for one in solver.passes)
+    passes = solver.passes.changed(paths=paths, maps=Tube("maps", 2), tube=Tube("bodies", 2))
     return replace(solver, local=replace(local or solver.local, guidance=guidance), passes=passes)
 
 

@@ -11,7 +11,10 @@ import torch
 import torchgco
 from tests.problems import planar_batch
 from torchgco import InputError, Problem, QuadraticCost, judge, presets, solve
+from torchgco.experiments.config.groups import _tree
+from torchgco.experiments.results.identity import flat
 from torchgco.presets import PRESETS
+from torchgco.search import Passes, Starts
 from torchgco.solvers.interior import InteriorPoint
 
 MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest"), "unicycle": (2, "yard")}
@@ -36,14 +39,21 @@ def test_solve_gives_the_bits_of_the_configuration_gco(model: str) -> None:
 
 
 def test_an_option_on_the_command_line_changes_that_option_alone() -> None:
-    setup = torchgco.compose(["solver.passes.3.num_paths=3", "solver.local.inner.max_iterations=7"])
+    setup = torchgco.compose(["solver.passes.paths.num_paths=3", "solver.local.inner.max_iterations=7"])
     solver = presets.gco(3)
     inner = replace(solver.local.inner, max_iterations=7)
     assert setup.solver.local == replace(solver.local, inner=inner)
-    assert setup.solver.passes[3] == replace(solver.passes[3], num_paths=3) != solver.passes[3]
-    assert setup.solver.passes[:3] == solver.passes[:3] and setup.solver.passes[4:] == solver.passes[4:]
-    with pytest.raises(InputError, match=r"^solver\.passes\[3\]\.num_path: .*such as num_paths"):
-        torchgco.compose(["solver.passes.3.num_path=3"])
+    changed = replace(solver.passes.paths, num_paths=3)
+    assert changed != solver.passes.paths and setup.solver.passes.names == solver.passes.names
+    assert setup.solver.passes == solver.passes.changed(paths=changed)
+    with pytest.raises(InputError, match=r"^solver\.passes\.paths\.num_path: .*such as num_paths"):
+        torchgco.compose(["solver.passes.paths.num_path=3"])
+
+
+def test_a_row_is_left_out_on_the_command_line() -> None:
+    setup = torchgco.compose(["~solver.passes.samples"])
+    assert setup.solver.passes == presets.gco(3).passes.changed(samples=None)
+    assert "samples" not in setup.solver.passes.names
 
 
 def changed(value: Any, place: str, words: list[str]) -> Any:
@@ -51,6 +61,8 @@ def changed(value: Any, place: str, words: list[str]) -> Any:
     if is_dataclass(value):
         names = [field.name for field in fields(value)]
         return replace(value, **{name: changed(getattr(value, name), f"{place}.{name}", words) for name in names})
+    if isinstance(value, Passes):
+        return Passes({name: changed(row, f"{place}.{name}", words) for name, row in value.items()})
     if isinstance(value, tuple) and any(map(is_dataclass, value)):
         return tuple(changed(item, f"{place}.{number}", words) for number, item in enumerate(value))
     new = other(value)
@@ -72,13 +84,22 @@ def listed(value: Any) -> str:
 
 
 @pytest.mark.parametrize("model", ["planar", "quadrotor"])
-def test_every_number_of_a_row_changes_by_the_index_of_its_row(model: str) -> None:
+def test_every_number_of_a_row_changes_by_the_name_of_its_row(model: str) -> None:
     space, scenario = MODELS[model]
     words: list[str] = []
     passes = changed(presets.gco(space).passes, "solver.passes", words)
     setup = torchgco.compose([f"model={model}", f"scenario={scenario}", *words])
     assert setup.solver == replace(presets.gco(space), passes=passes)
-    assert len(words) > 60 and any(".follow.1.stiffness=[" in word for word in words)
+    assert len(words) > 15 and any(".paths.follow.stiffness=[" in word for word in words)
+
+
+def test_the_table_of_the_default_is_short() -> None:
+    """What a person can read in a minute, and change: kinds of rows, and options of rows and solvers."""
+    for space in (2, 3):
+        solver = presets.gco(space)
+        assert len({type(row) for row in solver.passes}) <= 6 and len(solver.passes) <= 8
+        assert len([name for name in flat(_tree(solver)) if not name.endswith("_target_")]) <= 60
+        assert all(row.problems not in ("", "none") for row in solver.passes)
 
 
 @pytest.mark.slow
@@ -95,19 +116,15 @@ def test_more_effort_costs_no_more() -> None:
 def test_the_most_thorough_preset_has_the_rows_of_the_default_and_more() -> None:
     for space in (2, 3):
         usual, more = presets.gco(space), presets.gco_max(space)
-        begin, end = usual.passes[:-4], (*usual.passes[-4:-1], replace(usual.passes[-1], when="all"))
+        begin, end = usual.passes[:-2], (*usual.passes[-2:], Starts(when="all"))
         assert more.local == usual.local and len(more.passes) > len(usual.passes)
-        assert more.passes[: len(begin)] == begin and more.passes[-4:] == end
+        assert more.passes[: len(begin)] == begin and more.passes[-3:] == end
 
 
 def test_the_exact_preset_has_the_rows_of_the_default_with_tighter_ends() -> None:
     for space in (2, 3):
         usual, exact = presets.gco(space), presets.gco_exact(space)
-        assert exact.local == usual.local and len(exact.passes) == len(usual.passes)
-        tight = {type(row).__name__ for row, old in zip(exact.passes, usual.passes, strict=True) if row != old}
-        assert tight == {"Converge", "ClearChords", "Starts"}
-        for row, old in zip(exact.passes, usual.passes, strict=True):
-            assert row == old or row == replace(old, solver=InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9))
+        assert exact == replace(usual, interior=InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9)) != usual
 
 
 def test_a_problem_without_a_position_gets_the_planar_settings() -> None:

@@ -48,12 +48,12 @@ CASES: dict[str, list[Callable[[], object]]] = {
     "model": [lambda: compose(["model=5"])],
     "a": [lambda: compose(["a=b=c"])],
     "model.vehicle": [lambda: compose(["model.vehicle=5"])],
-    "samples.redraws": [lambda: compose(["solver.passes.11.redraws=1.5"])],
+    "samples.redraws": [lambda: compose(["solver.passes.samples.redraws=1.5"])],
     "solver.guidance": [
         lambda: compose(["solver=gco_paper", "solver.guidance=5"]), lambda: AugmentedLagrangian(guidance=MPPI),  # type: ignore
     ],
-    "solver.passes.14": [lambda: compose(["~solver.passes.14"])],
-    "solver.passes[2]": [lambda: compose(["solver.passes.2=3"])],
+    "study.baselines.0": [lambda: compose(["study.baselines=[al_ilqr]", "~study.baselines.0"])],
+    "solver.passes.paths": [lambda: compose(["solver.passes.paths=3"])],
     "solver.passes": [
         lambda: compose(["solver.passes=a"]), lambda: GuidedCasADi(passes=None), lambda: GuidedCasADi(passes=()),  # type: ignore
     ],

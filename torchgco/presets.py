@@ -17,19 +17,23 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search import (
     ClearChords,
-    Converge,
-    Finish,
+    FirstSolve,
     Follow,
     FromProposal,
     FromSamples,
     IntoGoal,
+    Join,
     MultiStart,
-    PathProposals,
+    Passes,
+    Paths,
     Refine,
     Restarts,
-    Solve,
+    Samples,
     Starts,
+    Tighten,
+    Tube,
 )
+from torchgco.search.rows import closer
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.ilqr import ILQR
@@ -44,77 +48,43 @@ OFFSETS = (
 
 
 def gco(space: Space) -> Restarts:
-    """The default: AL-iLQR with restarts along paths of several homotopy classes, and from samples."""
-    solve, proposals, samples = _parts(space)
-    more = 2 * proposals.num_paths
-    closer = _closer(proposals.follow[0])
-    known = replace(proposals, when="unproposed", roadmaps=(), relax_top=None)
-    rough = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)
-    plane = _in_the_plane(space)
-    # Obstacles may bar the way from rest to the path, such as a wall between the two.
-    followed_closer = replace(known, follow=(closer, replace(closer, obstacles=0.0)))
-    if not plane:  # a costly problem: repairing candidates that cut deep into an obstacle is worth its time
-        followed_closer = replace(followed_closer, refine=rough, max_penetration=0.5)
-    costly = replace(
-        proposals, when="costly", roadmaps=_denser(proposals.roadmaps), num_paths=more,
-        follow=(proposals.follow[0], closer), relax_top=None if plane else 12, refine=rough, max_penetration=0.5,
-        max_gap=None if plane else 0.15,
-    )  # fmt: skip
-    thorough = replace(
-        proposals, when="far", num_paths=more, follow=(_longer(proposals.follow[0]),), relax_top=None,
-        refine=Refine(top=more),
-    )  # fmt: skip
+    """The default: AL-iLQR and an interior point, with restarts along paths of several homotopy classes and samples."""
     return Restarts(
         local=replace(_local(space), guidance=_guidance(space)),
-        passes=(
-            Converge(when="first"),
-            replace(solve, until="end", when="pathless"),
-            solve,
-            proposals,
-            costly,
-            followed_closer,
-            FromProposal(),
-            IntoGoal(),
-            thorough,
-            FromProposal(),
-            FromSamples("unproposed"),
-            samples,
-            IntoGoal(),
-            Converge(when="mapped"),
-            _finish(space),
-            ClearChords(),
-            Converge(),
-            Starts(),
-        ),
-    )
+        passes=Passes({
+            "guess": FirstSolve(single_contact_after=3 if _in_the_plane(space) else 6),
+            "maps": Tube(among="maps"),
+            "paths": _paths(space),
+            "tube": Tube(among="bodies"),
+            "samples": Samples(redraws=2 if _in_the_plane(space) else 3),
+            "clear": ClearChords(),
+            "tighten": Tighten(),
+        }),
+    )  # fmt: skip
 
 
 def gco_fast(space: Space) -> Restarts:
     """One attempt along the shortest path, tracked from rest."""
-    solve, proposals, _ = _parts(space)
     guidance = _guidance(space)
-    follow = replace(_from_rest(space, proposals.follow[0]), iterations=10)
-    one = replace(proposals, num_paths=1, follow=(follow,), relax_iterations=0, relax_top=None, refine=Refine())
-    closer = replace(one, when="unproposed", roadmaps=(), follow=(_closer(follow),))
+    follow = replace(_from_rest(space, _paths(space).follow), iterations=10)
+    first = replace(_paths(space).proposals, num_paths=1, follow=(follow,), relax_top=None, refine=Refine())
+    one = replace(first, relax_iterations=0)
     guidance = replace(guidance, sampler=replace(guidance.sampler, samples=64, rounds=10))
     return Restarts(
         local=replace(_local(space), guidance=guidance),
-        passes=(
-            Converge(when="first"),
-            replace(solve, until="end", when="pathless"),
-            solve,
-            one,
-            closer,
-            FromProposal(),
-            IntoGoal(),
-            FromSamples("unproposed"),
-            IntoGoal(),
-            Converge(when="mapped"),
-            _finish(space),
-            ClearChords(),
-            Converge(),
-        ),
-    )
+        passes=Passes({
+            "guess": gco(space).passes.guess,
+            "path": one,
+            "closer": replace(one, when="unproposed", roadmaps=(), follow=(closer(follow),)),
+            "attempt": FromProposal(),
+            "into_goal": IntoGoal(),
+            "samples": FromSamples("unproposed"),
+            "again_into_goal": IntoGoal(),
+            "joined": Join(),
+            "clear": ClearChords(),
+            "tighten": Tighten(starts=0),
+        }),
+    )  # fmt: skip
 
 
 def gco_max(space: Space) -> Restarts:
@@ -122,14 +92,17 @@ def gco_max(space: Space) -> Restarts:
 
     Without obstacles: more starts.
     """
-    solver = gco(space)
-    *_, proposals, samples = _parts(space)
-    many = replace(proposals, when="caught", num_paths=16, relax_top=None, refine=Refine(top=16))
-    closer = replace(many, when="unproposed", roadmaps=(), follow=(_closer(many.follow[0]),))
-    more = (many, closer, FromProposal(), IntoGoal(), replace(samples, when="caught"), IntoGoal())
-    *begin, finish, chords, converge, starts = solver.passes
+    solver, first = gco(space), _paths(space).proposals
+    many = replace(first, when="caught", num_paths=16, relax_top=None, refine=Refine(top=16))
+    near = replace(many, when="unproposed", roadmaps=(), follow=(closer(many.follow[0]),))
+    samples = FromSamples("caught", redraws=solver.passes.samples.redraws)
+    *begin, (_, chords), tighten = solver.passes.items()
     # What `gco` would return is cleared first: a cheaper trajectory that can't be cleared gives way to it again.
-    return replace(solver, passes=(*begin, chords, *more, finish, chords, converge, replace(starts, when="all")))
+    more = {
+        "clear_first": chords, "many": many, "many_closer": near, "attempt": FromProposal(), "into_goal": IntoGoal(),
+        "more_samples": samples, "again_into_goal": IntoGoal(), "clear": chords,
+    }  # fmt: skip
+    return replace(solver, passes=Passes({**dict(begin), **more, **dict([tighten]), "starts": Starts(when="all")}))
 
 
 def gco_exact(space: Space) -> Restarts:
@@ -138,11 +111,7 @@ def gco_exact(space: Space) -> Restarts:
     The tolerance of the interior point is smaller: it counts in units of the cost's steepest slope or curvature, while
     a residual is a share of the terms that cancel in a control's slope, which may be far smaller.
     """
-    solver, exact = gco(space), InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9)
-    ends = Converge | ClearChords | Starts
-    return replace(
-        solver, passes=tuple(replace(row, solver=exact) if isinstance(row, ends) else row for row in solver.passes)
-    )
+    return replace(gco(space), interior=InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9))
 
 
 def gco_paper(space: Space) -> AugmentedLagrangian:
@@ -202,15 +171,15 @@ def fatrop(space: Space) -> CasADiSolver:
 
 def fatrop_guided(space: Space) -> GuidedCasADi:
     """FATROP from the cheapest of four tracked candidates; guesses that penetrate an obstacle are accepted."""
-    _, proposals, _ = _parts(space)
+    proposals = _paths(space).proposals
     relaxed = 0 if _in_the_plane(space) else 20  # in the plane, relaxed candidates fall back into the trap
     follow = replace(_from_rest(space, proposals.follow[0]), pace=None)
     first = replace(
         proposals, num_paths=4, follow=(follow,), relax_iterations=relaxed, relax_top=None, refine=Refine(),
         max_penetration=1.0,
     )  # fmt: skip
-    closer = replace(first, when="unproposed", roadmaps=(), follow=(_closer(follow),))
-    return GuidedCasADi(fatrop(space), (first, closer))
+    near = replace(first, when="unproposed", roadmaps=(), follow=(closer(follow),))
+    return GuidedCasADi(fatrop(space), (first, near))
 
 
 PRESETS: dict[str, Callable[[Space], Solver]] = {
@@ -242,18 +211,13 @@ def named(name: str, space: Space) -> Solver:
     return PRESETS[name](space)
 
 
-def _parts(space: Space) -> tuple[Solve, PathProposals, FromSamples]:
-    """The passes of `gco` that the others are made of: the first solve, the first proposals, and samples."""
+def _paths(space: Space) -> Paths:
+    """The row of `gco` that the others' proposals are made of."""
     if _in_the_plane(space):
         follow = Follow(initial_offsets=OFFSETS, depart=0.1, arrive=0.6, stiffness=(200.0,))
-        roadmaps = (Roadmap(max_overlap=0.02),)
-        proposals = PathProposals(
-            roadmaps=roadmaps, num_paths=6, follow=(follow,), relax_iterations=40, refine=Refine(top=8)
-        )
-        return Solve(single_contact_after=3), proposals, FromSamples(redraws=2)
+        return Paths(roadmap=Roadmap(max_overlap=0.02), follow=follow, relax_iterations=40, refined=8)
     follow = Follow(arrive=0.9, pace=1.75, smoothing=0.16, tube=None, stiffness=(200.0,), iterations=10)
-    proposals = PathProposals(roadmaps=(Roadmap(num_halton=128),), num_paths=6, follow=(follow,), relax_top=3)
-    return Solve(single_contact_after=6), proposals, FromSamples(redraws=3)
+    return Paths(roadmap=Roadmap(num_halton=128), follow=follow, relax_top=3, max_gap=0.15)
 
 
 def _from_rest(space: Space, follow: Follow) -> Follow:
@@ -261,29 +225,6 @@ def _from_rest(space: Space, follow: Follow) -> Follow:
     if _in_the_plane(space):
         follow = replace(follow, initial_offsets=(), arrive=0.8, stiffness=(20.0, 200.0))
     return follow
-
-
-def _closer(follow: Follow) -> Follow:
-    """Follows the same paths closer, where candidates leave them for a trap.
-
-    A spring gives way to the cost: it gets stiffer, and then takes more iterations to reach the path. So does a tube
-    around sharper corners.
-    """
-    spring = follow.tube is None
-    return replace(
-        follow, smoothing=follow.smoothing / 4.0, iterations=(3 if spring else 2) * follow.iterations,
-        stiffness=(10.0 * follow.stiffness[-1],) if spring else follow.stiffness,
-    )  # fmt: skip
-
-
-def _longer(follow: Follow) -> Follow:
-    """Follows paths to the end of the horizon, with more iterations, where the attempt along the best one failed."""
-    return replace(follow, iterations=3 * follow.iterations, pace=None)
-
-
-def _denser(roadmaps: tuple[Roadmap, ...]) -> tuple[Roadmap, ...]:
-    """The searches, and the same with twice the points: other paths, but not always better ones."""
-    return *roadmaps, *(replace(roadmap, num_halton=2 * roadmap.num_halton) for roadmap in roadmaps)
 
 
 def _guidance(space: Space) -> GCO:
@@ -306,17 +247,6 @@ def _local(space: Space) -> AugmentedLagrangian:
     penalty, iterations = (2.0, 20) if _in_the_plane(space) else (0.09, 10)
     inner = ILQR(tolerance=5e-6, max_iterations=iterations)
     return AugmentedLagrangian(inner, initial_penalty=penalty, max_outer_iterations=20)
-
-
-def _finish(space: Space) -> Finish:
-    """The local solver with limits that only the slowest of ordinary problems reach, and an end where nothing changes.
-
-    Penalties grow tenfold where the violation doesn't fall by half: costs without states, whose unit is small, begin
-    with a penalty that is far too low.
-    """
-    local = _local(space)
-    inner = replace(local.inner, max_iterations=200, damp_below=0.125)
-    return Finish(replace(local, inner=inner, max_outer_iterations=100, stalled_growth=10.0, patience=8))
 
 
 def _printed_sampler(space: Space) -> MPPI:

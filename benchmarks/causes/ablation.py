@@ -31,6 +31,7 @@ from torchgco import compose, judge, presets
 from torchgco.base.errors import InputError
 from torchgco.judging.judge import near_best
 from torchgco.scenarios.vehicle import Task
+from torchgco.search import Passes
 
 ROOMS = ("search", "guidance", "solvers", "lagrangian", "roadmap")
 # Not changed: sizes of batches and what memory holds, codes, random keys, and what only PyTorch's kernels read.
@@ -108,6 +109,8 @@ def options(node: Any) -> Iterator[tuple[str, Any]]:
 
 def with_option(node: Any, name: str, change: str) -> Any:
     """The solver with an option changed wherever it stands and admits the change."""
+    if isinstance(node, Passes):
+        return Passes({key: with_option(row, name, change) for key, row in node.items()})
     if isinstance(node, tuple):
         return tuple(with_option(part, name, change) for part in node)
     if not is_dataclass(node):
@@ -130,8 +133,8 @@ def variants() -> dict[Variant, str]:
     """All variants, with the value before the change."""
     found: dict[Variant, str] = {("", "default", ""): ""}
     solvers: dict[int, Any] = {2: presets.gco(2), 3: presets.gco(3)}
-    for number, row in enumerate(solvers[3].passes):
-        found["row", f"{number + 1} {type(row).__name__}", "left out"] = ""
+    for name in solvers[3].passes.names:
+        found["row", name, "left out"] = ""
     for solver in solvers.values():
         for name, value in options(solver):
             for change in ("doubled", "halved") if is_number(value) else ("none",):
@@ -151,8 +154,7 @@ def solver_of(dimension: int, variant: Variant) -> Any:
     if kind == "option":
         return with_option(solver, name, change)
     if kind == "row":
-        number = int(name.split()[0]) - 1
-        return replace(solver, passes=solver.passes[:number] + solver.passes[number + 1 :])
+        return replace(solver, passes=solver.passes.changed(**{name: None}))
     return solver
 
 

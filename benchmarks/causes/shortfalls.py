@@ -36,7 +36,7 @@ from torchgco.search.proposals import Round
 from torchgco.solution import Comparison, Fate, SearchRecord
 
 PAGE = RESULTS / "shortfalls.md"
-COSTLY = next(row for row in presets.gco(3).passes if isinstance(row, PathProposals) and row.when == "costly")
+COSTLY = next(row for row in presets.gco(3).passes.steps if isinstance(row, PathProposals) and row.when == "costly")
 PATHS = COSTLY.num_paths  # of each of the two searches where the best candidate is costly
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",

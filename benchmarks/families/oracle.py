@@ -29,14 +29,14 @@ from torchgco.scenarios import Layouts
 # Solver configurations with overrides. `paths` refines 32 candidates along up to 24 paths, `early` at another pace; the
 # rows are those that gco_max has more than gco.
 PATHS = (
-    "solver=gco_max", "solver.passes.15.refine.top=32", "solver.passes.15.num_paths=24",
-    "solver.passes.15.roadmaps.0.num_halton=256", "solver.passes.16.refine.top=32",
+    "solver=gco_max", "solver.passes.many.refine.top=32", "solver.passes.many.num_paths=24",
+    "solver.passes.many.roadmaps.0.num_halton=256", "solver.passes.many_closer.refine.top=32",
 )  # fmt: skip
 SEARCH = {
     "gco": ["solver=gco"],
     "gco_max": ["solver=gco_max"],
     "paths": [*PATHS],
-    "early": [*PATHS, "solver.passes.15.follow.0.arrive=0.6", "solver.passes.16.follow.0.arrive=0.6"],
+    "early": [*PATHS, "solver.passes.many.follow.0.arrive=0.6", "solver.passes.many_closer.follow.0.arrive=0.6"],
     "multistart": ["solver=multistart"],
     "gco_paper": ["solver=gco_paper"],
     "fatrop": ["solver=fatrop"],

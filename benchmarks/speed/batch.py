@@ -21,7 +21,7 @@ from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.config.build import Setup
 from torchgco.kernels import kernels_of
 from torchgco.scenarios import Task
-from torchgco.search import FromProposal, FromSamples, PathProposals, Restarts
+from torchgco.search import FromProposal, FromSamples, PathProposals, Restarts, Row, Tube
 
 SECTION, SOLVER = "batch", "gco"
 WORLDS = ("woods40", "woods60")  # where a problem takes most time and memory
@@ -92,12 +92,13 @@ def _task(setup: Setup, start: int, batch: int) -> Task:
 
 def limited(solver: Restarts) -> Restarts:
     """Two outer iterations, and one attempt: neither a second round of proposals nor other draws of samples."""
-    again = [one for one in solver.passes if isinstance(one, FromProposal)][1:]
-    passes = tuple(
-        one for one in solver.passes
-        if not any(one is other for other in again) and not (isinstance(one, PathProposals) and one.when == "far")
-        and not (isinstance(one, FromSamples) and one.when != "unproposed")
-    )  # fmt: skip
+    passes, attempted = list[Row](), False
+    for one in solver.passes.steps:
+        again = isinstance(one, Tube) or (isinstance(one, FromProposal) and attempted)
+        again |= isinstance(one, PathProposals) and one.when == "far"
+        again |= isinstance(one, FromSamples) and one.when != "unproposed"
+        attempted |= isinstance(one, FromProposal)
+        passes += [] if again else [one]
     return replace(solver, local=replace(solver.local, max_outer_iterations=2), passes=passes)
 
 

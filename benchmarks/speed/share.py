@@ -13,11 +13,12 @@ SECTION = "share"
 # A phase lasts while one of its functions runs, except for phases inside it; the rest is the outer loop.
 PHASES = {
     "paths sought": ("torchgco.roadmap.roadmap.Roadmap.paths",),
-    "paths tracked": ("torchgco.search.following.Follow.track",),
+    "paths tracked": ("torchgco.search.following.Follow.along",),
     "candidates relaxed": ("torchgco.search.proposals.PathProposals.relax",),
     "candidates refined": ("torchgco.search.candidates.Candidates.refined",),
     "rest of the proposal": ("torchgco.search.proposals.PathProposals.improve",),
     "plans sampled": ("torchgco.guidance.mppi.MPPI.improve",),
+    "tubes solved": ("torchgco.search.tube.Tube._solved",),
     "tightened": ("torchgco.search.converge.Converge.run", "torchgco.search.chords.ClearChords.run"),
     "verdict": ("torchgco.solvers.session.Session.finished",),
     "packed for C": ("torchgco.native.engine.Engine.packed", "torchgco.native.engine.Engine.terms"),

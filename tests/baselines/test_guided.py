@@ -95,7 +95,7 @@ def test_the_configuration_serves_every_model(model: str) -> None:
     """FATROP has the settings of `fatrop`, and the paths those of `gco`, but for the fields below."""
     solvers = [compose([*model.split(), f"solver={name}"]).solver for name in ("fatrop_guided", "fatrop", "gco")]
     guided, fatrop, gco = solvers
-    first = next(row for row in gco.passes if isinstance(row, PathProposals))
+    first = gco.passes.paths.proposals
     plane = model.endswith("planar")  # each path once, so later and in two solves
     own = dict(
         num_paths=4, initial_offsets=(), arrive=0.8 if plane else 0.9, stiffness=(20.0, 200.0) if plane else (200.0,),

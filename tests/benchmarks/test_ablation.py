@@ -5,6 +5,7 @@ import pytest
 from benchmarks.causes import ablation
 from benchmarks.causes.ablation import changed, noticed, options, table, variants, with_constant, with_option
 from torchgco import presets
+from torchgco.baselines import pursuit
 from torchgco.search import ClearChords, chords
 
 
@@ -24,11 +25,12 @@ def test_an_option_is_changed_wherever_it_stands_and_nothing_else(space: int) ->
 
 
 def test_a_value_that_cannot_be_doubled_comes_nearer_to_one() -> None:
-    assert with_option(presets.gco(3), "Follow.arrive", "doubled").passes[3].follow[0].arrive == 0.95
+    assert with_option(presets.gco(3), "Follow.arrive", "doubled").passes.paths.follow.arrive == 0.95
 
 
 def test_a_constant_is_changed_where_it_is_read(monkeypatch) -> None:
-    monkeypatch.setattr(chords, "MARGIN", chords.MARGIN)  # is put back
+    for module in (chords, pursuit):  # are put back
+        monkeypatch.setattr(module, "MARGIN", chords.MARGIN)
     with_constant("torchgco.search.chords.MARGIN", "halved")
     assert chords.MARGIN == 0.55
 

@@ -200,10 +200,10 @@ def test_the_largest_seed_and_the_current_folder_are_accepted(run, tmp_path) -> 
 @pytest.mark.usefixtures("without_report")
 def test_a_solver_is_compared_with_its_own_former_settings(run, tmp_path) -> None:
     words = ["study.layouts=1", "scenario.stages=5", "scenario.num_obstacles=2", "study.workers=1"]
-    words += ["hydra.run.dir=out", "solver.passes.14.change=0.2", "study.baselines=[gco]"]
+    words += ["hydra.run.dir=out", "solver.passes.clear.rounds=5", "study.baselines=[gco]"]
     code, _, err = run(*words)
     line = "solver.name: expected another name, as the baseline gco has other settings: solver.name=gco_changed, got"
-    assert code == 2 and line in problem_line(err) and "passes.14.change is 0.1 there, 0.2 here" in err
+    assert code == 2 and line in problem_line(err) and "passes.clear.rounds is 4 there, 5 here" in err
     assert run(*words, "solver.name=gco_changed")[0] == 0
     table = pd.read_parquet(tmp_path / "out" / "trials.parquet")
     assert table["solver"].tolist() == ["gco_changed", "gco"] and table["settings_digest"].nunique() == 2

@@ -63,7 +63,7 @@ def test_it_tells_each_pass_that_worked_and_what_it_gave(recorded: Solution) -> 
         assert sorted([*told, *map(int, re.findall(r"\d+", idle))]) == list(range(1, len(search.passes) + 1))
         kept = int(re.findall(r"returned is the trajectory of pass (\d+)", "\n".join(lines))[0])
         after = [None if one is None else float(one.cost[one.rows.tolist().index(b)]) for one in search.standings]
-        changes = [i + 1 for i in range(1, len(after)) if after[i] != after[i - 1]]
+        changes = [i + 1 for i in range(len(after)) if i == 0 or after[i] != after[i - 1]]
         assert kept == changes[-1]
 
 
@@ -74,7 +74,7 @@ def test_costs_in_the_record_are_the_users(recorded: Solution) -> None:
     torch.testing.assert_close(last.cost, recorded.cost, rtol=1e-9, atol=0.0)
     torch.testing.assert_close(last.violation, recorded.violation, rtol=0.0, atol=1e-9)
     names = [name for _, name, _ in search.passes]
-    after = search.standings[names.index("FromProposal")]
+    after = search.standings[names.index("paths")]
     assert after is not None
     for one in search.comparisons:
         chosen = (one.fate == Fate.PROPOSED) & torch.isfinite(one.cost)

@@ -29,7 +29,7 @@ from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import Margin
 from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.obstacles.spheres import BoundSpheres
-from torchgco.search import Finish, Solve
+from torchgco.search import Solve, Tighten
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 
@@ -85,9 +85,9 @@ def test_the_first_plan_is_the_solvers_own_solution() -> None:
 def test_plans_are_not_finished_beyond_the_limits_of_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a limit cuts off, the next plan continues: longer limits would only make this one late."""
     made = []
-    monkeypatch.setattr(Finish, "run", lambda *words: made.append(words))
+    monkeypatch.setattr(Tighten, "run", lambda *words: made.append(words))
     problem = varied()
-    whole = Restarts(replace(SOLVER, max_outer_iterations=1), (Solve(), Finish(SOLVER)))
+    whole = Restarts(replace(SOLVER, max_outer_iterations=1), (Solve(), Tighten()))
     first_plan(Planner(whole), problem)
     assert not made
     whole.solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))

@@ -243,7 +243,7 @@ def test_the_default_roadmap_finds_the_holes_of_the_walls() -> None:
     setup = compose(["scenario=walls", "seed=5"])
     problem = setup.task(setup.layouts(8)).problem
     found = scene_of(problem, problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m)))
-    paths, arrives = setup.solver.passes[3].roadmaps[0].paths(found, 1)
+    paths, arrives = setup.solver.passes.paths.roadmap.paths(found, 1)
     lengths = [path_length(path) for path in paths[:, 0].numpy()]
     assert arrives.all() and max(lengths) < 25.0
 
@@ -253,6 +253,6 @@ def test_a_way_through_several_doors_is_found() -> None:
     setup = compose(["scenario=mazes", "scenario.loose=0", "study.layouts=8", "solver=gco"])
     problem = setup.task(setup.layouts()).problem
     found = scene_of(problem, problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m)))
-    paths, arrives = setup.solver.passes[3].roadmaps[0].paths(found, 1)
+    paths, arrives = setup.solver.passes.paths.roadmap.paths(found, 1)
     lengths = [path_length(path) for path in paths[:, 0].numpy()]
     assert arrives.all() and max(lengths) < 40.0  # around the walls: over 55

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
-from torchgco import GCO, AugmentedLagrangian, PathProposals, Problem, Restarts, presets
-from torchgco.search import ClearChords, Follow, FromProposal, FromSamples, IntoGoal, Refine, Solve
-from torchgco.search.passes import Pass
+from torchgco import GCO, AugmentedLagrangian, PathProposals, Problem, Restarts
+from torchgco.search import ClearChords, Follow, FromProposal, FromSamples, IntoGoal, Refine, Row, Solve
+from torchgco.search import rows as table
 from torchgco.search.proposals import Proposal, propose
 
 
@@ -22,14 +22,14 @@ def varied(proposals: PathProposals, **changes: Any) -> PathProposals:
 
 def closer(proposals: PathProposals) -> PathProposals:
     """The row after `proposals`: the same paths, followed closer where they led to no proposal."""
-    follow = tuple(map(presets._closer, proposals.follow))
+    follow = tuple(map(table.closer, proposals.follow))
     return replace(proposals, when="unproposed", roadmaps=(), follow=follow, relax_top=None)
 
 
 def without(solver: Restarts, *kinds: type) -> Restarts:
-    """The solver without its rows of these kinds."""
-    left = tuple(one for one in solver.passes if not isinstance(one, kinds))
-    assert len(left) < len(solver.passes)
+    """The solver with the steps of its rows one by one, without those of these kinds."""
+    left = tuple(one for one in solver.passes.steps if not isinstance(one, kinds))
+    assert len(left) < len(solver.passes.steps)
     return replace(solver, passes=left)
 
 
@@ -41,7 +41,7 @@ def rounds(proposals: PathProposals) -> tuple[PathProposals, PathProposals]:
 def thorough(proposals: PathProposals) -> PathProposals:
     """More paths, followed longer, for the problems where an attempt along the best path failed."""
     more = 2 * proposals.num_paths
-    follow = tuple(map(presets._longer, proposals.follow))
+    follow = tuple(replace(way, iterations=3 * way.iterations, pace=None) for way in proposals.follow)
     top = max(more, proposals.refine.top)
     return replace(proposals, when="far", num_paths=more, follow=follow, relax_top=None, refine=Refine(top=top))
 
@@ -57,7 +57,7 @@ def restarts(
     guidance: GCO | None = None,
     attempts: int = 4,
     every: bool = False,
-    last: Sequence[Pass] = (ClearChords(),),
+    last: Sequence[Row] = (ClearChords(),),
     after: int | None = 3,
 ) -> Restarts:
     """A table like the default's: along paths, more thoroughly where that fails, then from samples.
@@ -67,7 +67,7 @@ def restarts(
     after     outer iterations after which a single contact counts as caught, where there is guidance
     """
     when, first = "caught" if every else "unarrived", Solve(single_contact_after=None if guidance is None else after)
-    passes: list[Pass] = [Solve("end", "pathless"), first]
+    passes: list[Row] = [Solve("end", "pathless"), first]
     if proposals is not None:
         passes += [*rounds(replace(proposals, when=when)), FromProposal(), IntoGoal()]
         passes += [*rounds(thorough(proposals)), FromProposal()] if attempts > 1 else []

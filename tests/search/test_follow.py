@@ -270,7 +270,7 @@ def test_how_deep_points_lie_against_brute_force() -> None:
 def test_a_path_through_doors_is_followed_closer_where_no_candidate_arrives() -> None:
     setup = compose(["scenario=mazes", "scenario.walls=2", "solver=gco", "study.layouts=4"])
     problem = setup.task(setup.layouts()).problem
-    first, _, closer = [one for one in setup.solver.passes[:6] if isinstance(one, PathProposals)]
+    first, _, closer, _ = [one for one in setup.solver.passes.steps if isinstance(one, PathProposals)]
     close, once = propose([first, closer], problem), propose([first], problem)
     assert int(once.found.sum()) < int(close.found.sum())
     assert torch.equal(close.U[once.found], once.U[once.found])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any, get_args
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,8 +15,8 @@ from tests.search.rows import closer, restarts, thorough, varied
 from tests.search.test_chords import corners
 from tests.search.test_finish import brachistochrone, parking
 from torchgco import (
-    ILQR,
     AugmentedLagrangian,
+    Field,
     InputError,
     PathProposals,
     Problem,
@@ -24,22 +25,45 @@ from torchgco import (
     Spheres,
     presets,
 )
-from torchgco.search import ClearChords, Converge, Finish, FromProposal, FromSamples, IntoGoal, Refine, Solve, Starts
-from torchgco.search.passes import Pass
+from torchgco.maps import OccupancyGrid
+from torchgco.roadmap.roadmap import Roadmap
+from torchgco.search import (
+    ClearChords,
+    Converge,
+    Direct,
+    FirstSolve,
+    Follow,
+    FromProposal,
+    FromSamples,
+    IntoGoal,
+    Join,
+    Paths,
+    Refine,
+    Row,
+    Samples,
+    Solve,
+    Starts,
+    Tighten,
+    Tube,
+)
 from torchgco.search.table import COLUMNS
 from torchgco.solvers.interior import InteriorPoint
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
+KINDS = (
+    Solve, PathProposals, FromProposal, IntoGoal, FromSamples, Converge, ClearChords, Starts, Tube, Direct, Join,
+    FirstSolve, Paths, Samples, Tighten,
+)  # fmt: skip
 DRAWN = FromSamples("caught", redraws=1)
 COSTLY = replace(PATHS, when="costly", num_paths=2, refine=Refine(top=2, needed=True), max_gap=1e-3)
 
 
-def at_gates(*passes: Pass, weight: float = 6.0) -> Solution:
+def at_gates(*passes: Row, weight: float = 6.0) -> Solution:
     """Four problems that need different attempts, by a table; samples are those of the local solver's guidance."""
     return Restarts(replace(LOCAL, guidance=SAMPLING), passes).solve(*gates(weight), seed=3)
 
 
-def among_moving(*passes: Pass) -> Solution:
+def among_moving(*passes: Row) -> Solution:
     """Problems among moving obstacles, where no path can be sought."""
     problem, U0 = planar_batch(B=4, N=40, obstacles=8, seed=4)
     moving = Spheres([[0.1, 0.1], [0.1, 0.3]], [0.2, 0.2], 0.06, velocities=torch.zeros(2, 2, dtype=torch.float64))
@@ -47,68 +71,112 @@ def among_moving(*passes: Pass) -> Solution:
     return Restarts(replace(LOCAL, guidance=SAMPLING), passes).solve(problem, U0, seed=3)
 
 
-def around_one(*passes: Pass) -> Solution:
+def around_one(*passes: Row) -> Solution:
     """A sphere that a trajectory touches alone."""
     problem, U0 = planar_batch(B=1, N=60, obstacles=1, seed=1)
     problem = replace(problem, constraints=[Spheres([[[0.0, 0.2]]], [[0.2]], 0.1), problem.constraints[1]])
     return Restarts(replace(LOCAL, guidance=SAMPLING), passes).solve(problem, U0)
 
 
-def unfinished(*passes: Pass, problem: Problem | None = None, limit: int = 20) -> Solution:
+def unfinished(*passes: Row, problem: Problem | None = None, limit: int = 20) -> Solution:
     """The fastest slide to a point, which the local solver's limits cut off; or another problem."""
     problem = brachistochrone() if problem is None else problem
     local = replace(presets.gco(problem).local, guidance=None, max_outer_iterations=limit)
     return Restarts(local, passes).solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
 
 
-def cut_off(*passes: Pass) -> Solution:
-    """The slide with half of the outer iterations."""
-    return unfinished(*passes, limit=10)
-
-
-def parked(*passes: Pass) -> Solution:
+def parked(*passes: Row) -> Solution:
     """A car at rest that should stand next to its place, where only other controls help."""
     return unfinished(*passes, problem=parking())
 
 
-def around_corners(*passes: Pass) -> Solution:
+def parked_once(*passes: Row) -> Solution:
+    """The same, with one outer iteration."""
+    return unfinished(*passes, problem=parking(), limit=1)
+
+
+def around_corners(*passes: Row) -> Solution:
     """Boxes whose corners are cut between two knots."""
     problem = corners()
     local = presets.gco(problem).local
     return Restarts(local, passes).solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
 
 
-AGAIN, FIRST = Starts(2, "all"), (Converge(when="first"), Solve())
-LONG = Finish(AugmentedLagrangian(ILQR(max_iterations=50), max_outer_iterations=30, patience=8))
+AGAIN, FIRST = Starts(2, "all"), (Converge("free"), Solve())
 ALONG = (Solve(), PATHS, FromProposal())
 # For every field: the problems, the rows before, the row, another value, the rows after.
-FIELDS: dict[tuple[type, str], tuple[Any, tuple[Pass, ...], Pass, Any, tuple[Pass, ...]]] = {
+FIELDS: dict[tuple[type, str], tuple[Any, tuple[Row, ...], Row, Any, tuple[Row, ...]]] = {
     (Solve, "until"): (at_gates, (), Solve(), "end", (DRAWN,)),
-    (Solve, "when"): (at_gates, (Solve("end"),), Solve(), "pathless", (DRAWN,)),
+    (Solve, "among"): (at_gates, (Solve("end"),), Solve(), "pathless", (DRAWN,)),
     (Solve, "single_contact_after"): (around_one, (), Solve(), 1, (DRAWN,)),
     (PathProposals, "when"): (at_gates, ALONG, PATHS, "far", (FromProposal(),)),
     (PathProposals, "max_gap"): (at_gates, (Solve(), PATHS), COSTLY, 1e9, (FromProposal(),)),
     (FromSamples, "when"): (at_gates, ALONG, FromSamples("unproposed", redraws=1), "caught", ()),
+    (IntoGoal, "among"): (at_gates, ALONG, IntoGoal(), "pathless", ()),
     (FromSamples, "redraws"): (at_gates, (Solve(),), DRAWN, 2, ()),
     (Starts, "count"): (parked, FIRST, AGAIN, 3, ()),
     (Starts, "when"): (unfinished, FIRST, AGAIN, "unsolved", ()),
     (Starts, "bend"): (unfinished, FIRST, AGAIN, 0.3, ()),
     (Starts, "change"): (parked, FIRST, AGAIN, 0.2, ()),
-    (Starts, "solver"): (parked, FIRST, AGAIN, InteriorPoint(initial_barrier=1.0), ()),
-    (Converge, "solver"): (unfinished, (Solve(),), Converge(), InteriorPoint(tolerance=1e-2), ()),
-    (Converge, "when"): (unfinished, (Solve(),), Converge(), "first", ()),
-    (Finish, "solver"): (cut_off, (Solve(),), LONG, replace(LONG.solver, penalty_growth=5.0), ()),
-    (Finish, "change"): (parked, (Solve(),), LONG, 0.3, ()),
-    (ClearChords, "solver"): (around_corners, (Solve("end"),), ClearChords(), InteriorPoint(tolerance=1e-2), ()),
+    (Converge, "among"): (unfinished, (Solve(),), Converge(), "free", ()),
+    (Direct, "gap"): (around_one, (Solve(single_contact_after=1),), Direct(), 1e9, (DRAWN,)),
+    (Direct, "most"): (around_one, (Solve(single_contact_after=1),), Direct(), 0, (DRAWN, Join())),
+    (Tube, "among"): (at_gates, (Solve(),), Tube(num_paths=2), "maps", ()),
+    (Tube, "num_paths"): (at_gates, (Solve(),), Tube(num_paths=1), 3, ()),
+    (FirstSolve, "single_contact_after"): (around_one, (), FirstSolve(), 1, (DRAWN,)),
+    (Samples, "redraws"): (at_gates, (Solve(),), Samples(1), 2, ()),
+    (Tighten, "starts"): (parked_once, FIRST, Tighten(1), 3, ()),
     (ClearChords, "rounds"): (around_corners, (Solve("end"),), ClearChords(), 1, ()),
 }
+
+
+# Another value of every field of `Paths`, and what it changes among the fields of its steps.
+PATHS_FIELDS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "num_paths": (9, ("num_paths", "relax_top", "refine")), "roadmap": (Roadmap(num_halton=99), ("roadmaps",)),
+    "follow": (Follow(iterations=3), ("follow",)), "relax_iterations": (7, ("relax_iterations",)),
+    "relax_top": (2, ("relax_top",)), "refined": (5, ("refine", "max_penetration")),
+    "max_penetration": (0.3, ("max_penetration",)), "max_gap": (0.4, ("max_gap",)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PATHS_FIELDS)
+def test_every_option_of_paths_is_handed_on(name: str) -> None:
+    row = Paths(max_gap=0.2)
+    value, changes = PATHS_FIELDS[name]
+    other = replace(row, **{name: value})
+    pairs = [pair for pair in zip(row.steps, other.steps, strict=False) if pair[0] != pair[1]]
+    assert pairs
+    for old, new in pairs:
+        differs = {field.name for field in fields(old) if getattr(old, field.name) != getattr(new, field.name)}
+        assert isinstance(old, PathProposals) and differs <= set(changes)
+    assert set(PATHS_FIELDS) == {field.name for field in fields(Paths)}
+
+
+def test_the_steps_of_paths_follow_from_its_options() -> None:
+    first, more, again, attempt, into, far, last = Paths(max_gap=0.2).steps
+    assert (first.when, more.when, again.when, far.when) == ("unarrived", "costly", "unproposed", "far")
+    assert far.num_paths == far.refine.top == 12 and far.follow[0].iterations == 3 * first.follow[0].iterations
+    assert last == attempt
+    assert more.num_paths == 2 * first.num_paths and [r.num_halton for r in more.roadmaps] == [64, 128]
+    assert again.roadmaps == () and [way.obstacles == 0 for way in again.follow] == [False, True]
+    assert (attempt, into) == (FromProposal(), IntoGoal())
+    assert [type(step) for step in Paths(refined=4).steps] == [PathProposals] * 2 + [FromProposal, IntoGoal]
+    assert Paths(refined=4).steps[1].refine == Refine(top=4) != Paths().steps[1].refine
 
 
 def differ(one: Solution, other: Solution) -> bool:
     return not (torch.equal(one.U, other.U) and torch.equal(one.iterations, other.iterations))
 
 
-LONGEST = (ClearChords, "solver"), (ClearChords, "rounds")
+def test_rows_solve_by_the_interior_point_of_their_table() -> None:
+    problem = brachistochrone()
+    solver = Restarts(replace(presets.gco(problem).local, guidance=None), (Converge("free"), Solve(), Starts(2, "all")))
+    U0 = problem.x0.new_zeros(1, problem.N, problem.m)
+    other = replace(solver, interior=InteriorPoint(tolerance=1e-2))
+    assert differ(solver.solve(problem, U0), other.solve(problem, U0))
+
+
+LONGEST = ((ClearChords, "rounds"),)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +200,9 @@ def test_a_first_solve_runs_to_its_end_where_no_path_can_be_sought_alone() -> No
 def test_no_field_is_forgotten_above() -> None:
     """Those of paths and how they are followed are read in test_paths."""
     there = {field.name for field in fields(PathProposals)} - {"when", "max_gap"}
-    every = {(kind, field.name) for kind in get_args(Pass) for field in fields(kind)}
-    assert set(FIELDS) == every - {(PathProposals, name) for name in there}
+    every = {(kind, field.name) for kind in KINDS for field in fields(kind)}
+    handed_on = {(Paths, field.name) for field in fields(Paths)}  # to its steps; see below
+    assert set(FIELDS) == every - {(PathProposals, name) for name in there} - handed_on
 
 
 @pytest.mark.parametrize(
@@ -164,10 +233,14 @@ def test_a_list_of_rows_is_a_table() -> None:
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: Solve(until="late"), "solve.until"), (lambda: Solve(when="far"), "solve.when"),
+        (lambda: Solve(until="late"), "solve.until"), (lambda: Solve(among="far"), "solve.among"),
         (lambda: Solve(single_contact_after=1.5), "solve.single_contact_after"),
         (lambda: FromSamples(when="far"), "samples.when"), (lambda: FromSamples(redraws=-1), "samples.redraws"),
-        (lambda: Finish(change=0.0), "finish.change"), (lambda: Finish(solver=ILQR()), "finish.solver"),
+        (lambda: IntoGoal("free"), "into_goal.among"),
+        (lambda: Tube(among="all"), "tube.among"), (lambda: Tube(num_paths=0), "tube.num_paths"),
+        (lambda: Direct(gap=-1.0), "direct.gap"), (lambda: FirstSolve(0), "guess.single_contact_after"),
+        (lambda: Paths(refined=0), "paths.refined"), (lambda: Samples(-1), "samples.redraws"),
+        (lambda: Tighten(-1), "tighten.starts"), (lambda: Converge("first"), "converge.among"),
         (lambda: ClearChords(rounds=0), "chords.rounds"), (lambda: Starts(count=0), "starts.count"),
         (lambda: Starts(when="solved"), "starts.when"), (lambda: Starts(bend=0.0), "starts.bend"),
     ],
@@ -185,29 +258,34 @@ def test_the_table_shows_every_pass(name: str, space: int) -> None:
     assert isinstance(solver, Restarts)
     table = solver.table()
     assert table["pass"].tolist() == [type(one).__name__ for one in solver.passes]
+    assert table["name"].tolist() == list(solver.passes.names)
     assert table.columns.tolist() == list(COLUMNS) and table.index.tolist() == [*range(1, len(solver.passes) + 1)]
     assert all(isinstance(text, str) for text in table.to_numpy().flatten())
     assert table["problems"].ne("").all()
-    rows = [one for one in solver.passes if isinstance(one, PathProposals) and (one.when != "costly" or one.max_gap)]
-    shown = table[(table["pass"] == "PathProposals") & (table["problems"] != "none")]
-    for row, text in zip(rows, shown["how they are followed"], strict=True):
+    rows = [one for one in solver.passes if isinstance(one, PathProposals)]
+    shown = table[table["pass"] == "PathProposals"]
+    for row, text in zip(rows, shown["what it does"], strict=True):
         assert all(f"{follow.iterations} iterations" in text for follow in row.follow)
-    assert (shown["paths"] == "the same").tolist() == [not row.roadmaps for row in rows]
+        assert text.startswith("the same paths") == (not row.roadmaps)
 
 
 def test_rows_that_differ_are_shown_differently() -> None:
     """Of every field of a row that says what it does, at least with a value far from the present one."""
     follow = PATHS.follow[0]
     rows = [
-        Solve(), Solve("end"), Solve(when="pathless"), Solve(single_contact_after=4), PATHS,
+        Solve(), Solve("end"), Solve(among="pathless"), Solve(single_contact_after=4), PATHS,
         replace(PATHS, when="far"), replace(PATHS, num_paths=7), replace(PATHS, relax_top=2),
         replace(PATHS, relax_iterations=0), replace(PATHS, refine=Refine(top=5)), replace(PATHS, max_penetration=0.2),
         replace(PATHS, roadmaps=(*PATHS.roadmaps, *PATHS.roadmaps)), COSTLY, replace(COSTLY, max_gap=0.4),
-        replace(COSTLY, max_gap=None), closer(PATHS), thorough(PATHS), replace(PATHS, follow=(follow, follow)),
+        closer(PATHS), thorough(PATHS), replace(PATHS, follow=(follow, follow)),
         varied(PATHS, tube=None), varied(PATHS, arrive=(0.9, 0.8)), varied(PATHS, smoothing=0.3),
         varied(PATHS, stiffness=(7.0,)),
-        FromSamples(), FromSamples(redraws=2), FromSamples("caught"), Finish(), LONG, ClearChords(), ClearChords(9),
-        FromProposal(), IntoGoal(), Starts(), Starts(4), Starts(when="all"), Starts(bend=0.1), Starts(change=0.3),
+        FromSamples(), FromSamples(redraws=2), FromSamples("caught"), ClearChords(), ClearChords(9),
+        FromProposal(), IntoGoal(), IntoGoal("pathless"),
+        Starts(), Starts(4), Starts(when="all"), Starts(bend=0.1), Starts(change=0.3),
+        Tube(), Tube("maps"), Tube(num_paths=2), Direct(), Direct(0.5), Direct(most=2), Join(), FirstSolve(),
+        FirstSolve(9), Paths(), Paths(num_paths=9), Paths(refined=4), Paths(max_gap=0.3), Paths(relax_top=2),
+        Samples(), Samples(7), Tighten(), Tighten(0), Converge(), Converge("free"),
     ]  # fmt: skip
     table = Restarts(passes=(Solve(), PATHS, *rows)).table().iloc[2:]
     assert len(table) == len(rows) and not table.duplicated().any()
@@ -217,10 +295,26 @@ def test_rows_that_differ_are_shown_differently() -> None:
 def test_rows_run_in_their_order_and_only_where_they_apply(attempts: int, monkeypatch) -> None:
     """PASSES arrives along a path; SHORT is attracted to the goal; no row is left out or made twice."""
     made = []
-    for kind in get_args(Pass):
+    for kind in KINDS:
         run = kind.run
         monkeypatch.setattr(kind, "run", lambda self, search, run=run: made.append(self) or run(self, search))
     solver = restarts(LOCAL, PATHS, SAMPLING, attempts=attempts)
     solution = solver.solve(*gates(), seed=3)
     assert made == list(solver.passes)
     assert solution.guided[[PASSES, SHORT]].tolist() == [1, 1]
+
+
+def test_a_problem_has_the_rows_of_its_kind() -> None:
+    bodies = planar_batch(B=1, N=10)[0]
+    moving = Spheres([[0.1, 0.1]], [0.2], 0.06, velocities=torch.zeros(1, 2, dtype=torch.float64))
+    bounds = bodies.constraints[1]
+    field = Field(OccupancyGrid(np.zeros((20, 20), bool), [-1.0, -1.0], 0.1), 0.05)
+    kinds = {"bodies": bodies.constraints, "moving": [moving, bounds], "free": [bounds], "maps": [field, bounds]}
+    rows = {
+        "free": ["guess", "tighten"], "moving": ["guess", "samples", "clear", "tighten"],
+        "maps": ["guess", "maps", "paths", "samples", "clear", "tighten"],
+        "bodies": ["guess", "paths", "tube", "samples", "clear", "tighten"],
+    }  # fmt: skip
+    for kind, constraints in kinds.items():
+        problem = replace(bodies, constraints=constraints)
+        assert presets.gco(problem).table(problem)["name"].tolist() == rows[kind]

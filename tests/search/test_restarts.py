@@ -202,7 +202,10 @@ def test_every_option_is_read(name: str, whole: Solution) -> None:
 
 
 def test_no_option_is_forgotten_above() -> None:
-    assert {f.name for f in fields(Restarts)} == set(CHANGES)  # for the fields of passes see test_passes
+    assert {f.name for f in fields(Restarts)} == {
+        *CHANGES,
+        "interior",
+    }  # see also test_passes
 
 
 def test_a_single_contact_counts_as_caught_from_the_given_iteration(solves: list[Solve]) -> None:

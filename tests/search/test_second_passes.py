@@ -29,7 +29,7 @@ def woods() -> Problem:
     return setup.task(setup.layouts(LAYOUTS)).problem
 
 
-ROWS = [one for one in presets.gco(3).passes if isinstance(one, PathProposals)]
+ROWS = [one for one in presets.gco(3).passes.steps if isinstance(one, PathProposals)]
 FIRST, COSTLY, CLOSER = (replace(one, num_paths=one.num_paths // 2) for one in ROWS[:3])
 
 

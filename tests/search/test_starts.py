@@ -11,7 +11,17 @@ from torch import Tensor
 import torchgco
 from tests.search.rows import without
 from tests.search.test_finish import bryson_denham, effort, ends_at, parking
-from torchgco import ControlBounds, FunctionDynamics, Problem, Restarts, Solution, StateBounds, Status, presets
+from torchgco import (
+    ControlBounds,
+    FunctionDynamics,
+    Problem,
+    QuadraticCost,
+    Restarts,
+    Solution,
+    StateBounds,
+    Status,
+    presets,
+)
 from torchgco.search import Converge, Solve, Starts
 
 D = torch.float64
@@ -90,7 +100,7 @@ def test_guesses_differ_by_seed_and_id() -> None:
 def test_nothing_is_done_where_the_first_solve_succeeds() -> None:
     """`gco` has starts for the others alone."""
     problem = bryson_denham()
-    assert presets.gco(problem).passes[-1] == Starts()
+    assert presets.gco(problem).passes.steps[-1] == Starts()
     assert same(torchgco.solve(problem), solved(problem))
     assert not same(torchgco.solve(problem, solver="gco_max"), solved(problem))
 
@@ -109,7 +119,7 @@ def test_a_saddle_at_rest_is_left() -> None:
     problem = parking()
     assert not bool((torchgco.solve(problem, solver="interior_point").status == Status.CONVERGED).any())
     local = presets.gco(problem).local
-    passes = (Converge(when="first"), Solve(), Starts())
+    passes = (Converge("free"), Solve(), Starts())
     found = torchgco.solve(problem, solver=Restarts(replace(local, max_outer_iterations=1), passes))
     assert found.status.tolist() == [Status.CONVERGED] * problem.B
 
@@ -135,3 +145,21 @@ def test_a_start_that_is_no_number_keeps_its_status() -> None:
 def test_no_time_is_left_for_them() -> None:
     ended = solved(SWINGS, ALL, max_seconds=1e-6)
     assert bool(torch.isfinite(ended.U).all())
+
+
+def test_a_start_that_is_best_held_is_held() -> None:
+    """A pendulum near its upright rest: the guess falls, and the optimum from there swings around once more."""
+
+    def field(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return torch.stack((x[..., 1], 9.81 * x[..., 0].sin() - 0.1 * x[..., 1] + u[..., 0]), dim=-1)
+
+    cost = QuadraticCost(Q=[1, 0.1], R=[0.1], Qf=[100, 10], x_ref=[0.0, 0.0])
+    x0 = torch.tensor([[0.0123, 0.0], [0.1, 0.0], [0.3, 0.0], [0.5, 0.0]], dtype=D)
+    model = FunctionDynamics(field, 2, 1, 0.05, "rk4")
+    problem = Problem(model, cost, [ControlBounds([-5.0], [5.0])], x0, 60)
+    found = torchgco.solve(problem)
+    best = torch.tensor([0.01022, 0.6745, 6.007, 24.57], dtype=D)
+    torch.testing.assert_close(found.cost, best, rtol=1e-3, atol=0)
+    assert bool((found.cost < 0.2 * torchgco.solve(problem, solver="interior_point").cost).all())
+    warm = torchgco.solve(problem, warm=torchgco.solve(problem, solver="interior_point"))
+    assert bool((warm.cost > 200).all())  # a guess that was given is kept

@@ -69,9 +69,9 @@ def test_the_scale_of_the_cost_changes_no_iterate(factor: float) -> None:
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
-@pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
-def test_the_scale_of_the_cost_changes_no_iterate_with_guidance(batch, factor: float) -> None:
-    problem = batch(B=2, N=25, obstacles=6, seed=4)[0]
+@pytest.mark.parametrize(("batch", "seed"), [(planar_batch, 4), (quadrotor_batch, 2)])
+def test_the_scale_of_the_cost_changes_no_iterate_with_guidance(batch, seed: int, factor: float) -> None:
+    problem = batch(B=2, N=25, obstacles=6, seed=seed)[0]
     one, other = (solve(p, solver=quick_gco(p)) for p in (problem, scaled(problem, factor)))
     assert torch.equal(one.iterations, other.iterations) and one.statuses == other.statuses
     assert torch.equal(one.guided, other.guided) and int(one.guided.sum()) > 0
@@ -190,7 +190,7 @@ def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
 
     def note_call(self, problem, U0, **options):
         calls.append((self, U0, options))
-        return whole(replace(self, passes=self.passes[:3]), problem, U0, **options)
+        return whole(replace(self, passes=self.passes[:1]), problem, U0, **options)
 
     monkeypatch.setattr(Restarts, "solve", note_call)
     problem, U0 = planar_batch(B=2, N=25)
@@ -208,8 +208,11 @@ def test_offsets_are_for_two_controls() -> None:
     )  # fmt: skip
     solver = presets.gco(problem)
     suited, lost = suited_paths(solver.passes, problem)
-    given, kept = ([row.follow for row in rows if isinstance(row, PathProposals)] for rows in (solver.passes, suited))
-    assert all(way.initial_offsets != () for ways in given for way in ways) and len(given) == len(kept) > 3
+    given, kept = (
+        [step.follow for row in rows if row for step in row.steps if isinstance(step, PathProposals)]
+        for rows in (solver.passes, suited)
+    )
+    assert all(way.initial_offsets != () for ways in given for way in ways) and len(given) == len(kept) > 1
     assert all(way.initial_offsets == () for ways in kept for way in ways) and lost is None
     assert solve(problem).statuses == [Status.CONVERGED]
 

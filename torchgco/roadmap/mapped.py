@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter1d, map_coordinates
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -31,6 +31,8 @@ from torchgco.roadmap.search import DIVERSITY, HOPS
 # may fit between its knots.
 SEARCHES = ((2**18, 0.5, True), (2**18, 0.5, False), (2**18, 0.0, False), (2**21, 0.0, False))
 MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
+WIDE = 4.0  # the same of a path that keeps clear, which takes the middle of doors up to eight units wide
+AVERAGED = 0.8  # units: the standard deviation over which the corners of such a path are averaged
 LEAST = 1e-6  # of the price: no edge may cost nothing
 LONGEST = 2.0  # times as dear as the cheapest one other paths may be
 TRIED = 3  # candidates per path in space that are drawn taut, and compared with those before
@@ -51,6 +53,21 @@ Price = Callable[[Array], Array]  # per metre at points (V, d)
 
 def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Tensor]:
     """As `Roadmap.paths`, where there are maps among the obstacles."""
+    return _in_each(scene, count, overlap, partial(paths, count=count, corners=HOPS + 1))
+
+
+def clear_path_in_maps(scene: Scene, overlap: float) -> tuple[Tensor, Tensor]:
+    """A path of each problem that keeps clear of obstacles as far as its way allows: as `Roadmap.paths`, with one.
+
+    It isn't drawn taut, as a taut path turns at the very corners; a vehicle that turns slowly has to stop there.
+    """
+    return _in_each(scene, 1, overlap, _clear_path)
+
+
+def _in_each(
+    scene: Scene, count: int, overlap: float, search: Callable[[Lattice, Array, Price, float, float], list[Array]]
+) -> tuple[Tensor, Tensor]:
+    """The paths (B, count, HOPS+1, d) that a search of each problem finds, and whether it finds any, (B,)."""
     start, goal = scene.start, scene.goal
     corners = torch.stack((start, goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1).repeat(1, count, 1, 1)
     found = torch.zeros_like(start[:, 0], dtype=torch.bool)
@@ -66,7 +83,7 @@ def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Ten
         with computing_on(torch.device("cpu")):  # the search is of NumPy's arrays, wherever the problem lies
             lattice = lattice_of(obstacles.maps, obstacles.kinds, ends)
             radius = float(obstacles.maps[0].vehicle_radius[0])
-            ways = list(paths(lattice, ends, price, count, radius, float(obstacles.largest), HOPS + 1))
+            ways = list(search(lattice, ends, price, radius, float(obstacles.largest)))
         for k, path in enumerate(ways):
             corners[b, k, : len(path)] = start.new_tensor(path)
             if k == 0:
@@ -94,13 +111,13 @@ class Ways:
     Args:
         ends: start and goal, (2, d), m.
         price: per metre.
-        unit: m, of closeness to obstacles.
+        margin: m; closer to obstacles than this a way costs up to double.
     """
 
-    def __init__(self, blocks: Blocks, ends: Array, price: Price, unit: float, least: float = 0.0) -> None:
+    def __init__(self, blocks: Blocks, ends: Array, price: Price, margin: float, least: float = 0.0) -> None:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
         self.least = least_at(blocks.lattice, ends)
-        close = 1.0 + np.clip(1.0 - blocks.clearance / (MARGIN * unit), 0.0, 1.0)
+        close = 1.0 + np.clip(1.0 - blocks.clearance / margin, 0.0, 1.0)
         rate = _smoothed(price, self.points, blocks.counts)
         usable = (blocks.clearance > least) & np.isfinite(rate)
         self.weight = np.where(usable, np.maximum(rate, 0.0) * close + LEAST, np.inf)
@@ -173,17 +190,29 @@ def _smoothed(price: Price, points: Array, counts: tuple[int, ...]) -> Array:
 
 
 def paths(
-    lattice: Lattice, ends: Array, price: Price, count: int, radius: float, unit: float, corners: int
+    lattice: Lattice, ends: Array, price: Price, radius: float, unit: float, count: int, corners: int
 ) -> list[Array]:
     """Up to `count` taut paths (P, d), P <= corners, between two points (2, d), the cheapest first."""
-    ways = _ways(lattice, ends, price, radius, unit)
+    ways = _ways(lattice, ends, price, radius, MARGIN * unit)
     if ways is None:
         return []
     found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
     return [path for path in found if len(path) <= corners]
 
 
-def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> Ways | None:
+def _clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
+    """The cheapest path (HOPS+1, d) where all that is near obstacles is dear, its corners averaged; none, or one."""
+    ways = _ways(lattice, ends, price, radius, WIDE * unit)
+    if ways is None:
+        return []
+    path = ways.path(int(ways.total.argmin()))
+    step = max(lattice.spacing, length(path) / (HOPS * WIDE))
+    even = _even(path, max(2, int(np.ceil(length(path) / step)) + 1))
+    inner = gaussian_filter1d(even, AVERAGED * unit / step, axis=0, mode="nearest")
+    return [_even(np.concatenate((ends[:1], inner[1:-1], ends[1:])), HOPS + 1)]
+
+
+def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, margin: float) -> Ways | None:
     """The ways of the first search that finds any; None where none does."""
     for number, (most, share, merged) in enumerate(SEARCHES):
         if number == 1 and not lattice.may_join(ends):
@@ -192,7 +221,7 @@ def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, unit: floa
         blocks = blocks_of(lattice, radius, most, least, merged and lattice.d == 3)
         if len(blocks.nodes) == 0:
             continue
-        ways = Ways(blocks, ends, price, unit, least)
+        ways = Ways(blocks, ends, price, margin, least)
         if np.isfinite(ways.total).any():
             return ways
     return None
@@ -259,8 +288,13 @@ def _beside(ways: Ways, found: list[Array], count: int, unit: float) -> list[Arr
 
 def _spread(path: Array) -> Array:
     """Points (COMPARED, d) at equal shares of a path's length."""
+    return _even(path, COMPARED)
+
+
+def _even(path: Array, count: int) -> Array:
+    """Points (count, d) at equal shares of a path's length."""
     along = np.concatenate(([0.0], np.sqrt((np.diff(path, axis=0) ** 2).sum(1)).cumsum()))
-    share = np.linspace(0.0, along[-1], COMPARED)
+    share = np.linspace(0.0, along[-1], count)
     return np.stack([np.interp(share, along, x) for x in path.T], axis=1)
 
 

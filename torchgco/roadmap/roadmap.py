@@ -20,7 +20,7 @@ from torchgco.base.tree import take
 from torchgco.roadmap import native as roadmap
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
-from torchgco.roadmap.mapped import paths_in_maps
+from torchgco.roadmap.mapped import clear_path_in_maps, paths_in_maps
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import DIVERSITY, HOPS, TorchSearch
 
@@ -85,6 +85,16 @@ class Roadmap:
                 corners[place[course.rows]] = torch.stack(course.paths[:count], dim=1)
                 found[place[course.rows]] = course.found
         return corners, found
+
+    def clear_path(self, scene: Scene) -> tuple[Tensor, Tensor]:
+        """One more path of each problem, weighted by clearance, where there are maps: as `paths` with one.
+
+        Elsewhere none: edges of the graph keep to the middle between neighbours.
+        """
+        if scene.obstacles.maps:
+            return clear_path_in_maps(scene, self.max_overlap)
+        straight = torch.stack((scene.start, scene.goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1)
+        return straight, torch.zeros_like(scene.start[:, 0], dtype=torch.bool)
 
     def repeats(self, other: Roadmap, scene: Scene) -> bool:
         """Whether another search finds the same paths: those among maps need no points all over the scene."""

@@ -28,5 +28,5 @@ def shortest_way(field: DistanceField, radius: float, start: Any, goal: Any) -> 
     bound = Field(field, radius).bind(Dimensions(1, 1, field.d, 0, None, slice(0, field.d), like))
     assert isinstance(bound, BoundField)
     lattice, unit = lattice_of([bound], [], ends), float(bound.sizes.max())
-    found = paths(lattice, ends, lambda points: np.ones(len(points)), 1, radius, unit, POINTS)
+    found = paths(lattice, ends, lambda points: np.ones(len(points)), radius, unit, 1, POINTS)
     return float(length(torch.from_numpy(found[0])[None])[0]) if found else None

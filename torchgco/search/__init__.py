@@ -1,9 +1,10 @@
-"""Search above the local solver: passes along paths and from samples, or restarts from random guesses."""
+"""Search above the local solver: a table of rows, along paths and from samples; or restarts from random guesses."""
 
 from torchgco.search.candidates import Refine as Refine
 from torchgco.search.chords import ClearChords as ClearChords
 from torchgco.search.converge import Converge as Converge
-from torchgco.search.finish import Finish as Finish
+from torchgco.search.direct import Direct as Direct
+from torchgco.search.direct import Join as Join
 from torchgco.search.following import Follow as Follow
 from torchgco.search.multistart import MultiStart as MultiStart
 from torchgco.search.passes import FromProposal as FromProposal
@@ -12,4 +13,11 @@ from torchgco.search.passes import IntoGoal as IntoGoal
 from torchgco.search.passes import Solve as Solve
 from torchgco.search.proposals import PathProposals as PathProposals
 from torchgco.search.restarts import Restarts as Restarts
+from torchgco.search.row import Passes as Passes
+from torchgco.search.row import Row as Row
+from torchgco.search.rows import FirstSolve as FirstSolve
+from torchgco.search.rows import Paths as Paths
+from torchgco.search.rows import Samples as Samples
+from torchgco.search.rows import Tighten as Tighten
 from torchgco.search.starts import Starts as Starts
+from torchgco.search.tube import Tube as Tube

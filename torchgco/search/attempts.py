@@ -19,10 +19,12 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.candidates import unwatched
 from torchgco.search.proposals import PathProposals, Round
+from torchgco.search.row import Row
 from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress, RowEnd
 from torchgco.solvers.history import Recorder
+from torchgco.solvers.interior import InteriorPoint
 
 CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
 
@@ -156,6 +158,7 @@ class Search:
     Args:
         call: in the units that the solver works in.
         passes: None for those that can't serve.
+        interior: the interior point of the table.
         guidance: of attempts from samples; None: none can serve.
         recorder: of every iteration; None: nothing is recorded.
     """
@@ -164,18 +167,21 @@ class Search:
         self,
         call: Call,
         solver: AugmentedLagrangian,
-        passes: Sequence[object],
+        passes: Sequence[Row | None],
         guidance: Guidance | None,
+        interior: InteriorPoint,
         recorder: Recorder | None = None,
     ) -> None:
         self.call, self.solver, self.guidance, self.recorder = call, solver, guidance, recorder
+        self.interior = interior
         # Whether there is anything to do where a trajectory is caught, and whether that includes paths.
-        self.guided = guidance is not None or any(isinstance(one, PathProposals) for one in passes)
+        self.guided = guidance is not None or any(row.seeks_paths for row in passes if row is not None)
         self.has_paths = self.guided and has_paths(call.problem)
         self.record = None if recorder is None else SearchRecord()
         self._best: Best | None = None
         self._caught: SolveEnd | None = None
         self._round: tuple[Tensor, Round] | None = None
+        self.waiting: list[tuple[Tensor, SolveEnd]] = []  # rows and results that compete at the end
         self.proposed = torch.zeros_like(call.ids, dtype=torch.bool)  # (B,): whether there was ever a proposal
         self.rejected = torch.full_like(call.U0[:, 0, 0], torch.nan)  # (B,): mu of the proposals rejected so far
 
@@ -236,6 +242,12 @@ class Search:
         self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
         self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
         return self.record.in_costs(unit, constant)
+
+    def join(self) -> None:
+        """Let the results that wait compete with the best trajectories."""
+        for rows, end in self.waiting:
+            self.best.keep(rows, end)
+        self.waiting.clear()
 
     def rows(self, when: str) -> Tensor:
         """The problems (b,) that a word describes, all among those that were caught.

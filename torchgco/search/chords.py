@@ -7,6 +7,7 @@ step, the straight line between two knots may come closer than both.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,15 +19,16 @@ from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.search.attempts import Search
-from torchgco.search.converge import continued
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.search.converge import continued, mapped
+from torchgco.search.row import Row
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
+GROWN_BARRIER = 1e-4  # of warm solves among grown obstacles, which lie deeper than rounding
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
 
 
 @dataclass(frozen=True)
-class ClearChords:
+class ClearChords(Row):
     """Replaces feasible trajectories that touch an obstacle between two knots by ones that keep clear of it.
 
     Obstacles grow by 1.1 times the clearance that the last solve missed, or a little more, and the solve continues from
@@ -36,17 +38,25 @@ class ClearChords:
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before.
-        solver: ends each of them.
 
     Raises:
         InputError: a field out of its range.
     """
 
     rounds: Count = 4
-    solver: InteriorPoint = InteriorPoint()
+
+    kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
 
     def __post_init__(self) -> None:
         check_options(self, "chords")
+
+    @property
+    def problems(self) -> str:
+        return "touching an obstacle between two knots"
+
+    @property
+    def does(self) -> str:
+        return f"AL-iLQR and interior point among larger obstacles, {self.rounds} rounds; accepted with more clearance"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -62,9 +72,16 @@ class ClearChords:
             old = take(best.end.best, rows)
             call = search.call.take(rows)
             call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
+            if mapped(call.problem):  # along whose one row per knot AL-iLQR takes many short steps
+                grown = replace(search.interior, warm_barrier=GROWN_BARRIER)
+                new = tight = continued(grown, replace(call, callback=None), old)
+                serves, now[rows] = self._kept(search, rows, new, clearance[rows])
+                clearance[rows] = torch.where(serves, now[rows], clearance[rows])
+                rows = rows[clearance[rows] < 0]
+                continue
             new = best.attempt(call)
             serves, now[rows] = self._kept(search, rows, new, clearance[rows])
-            tight = continued(self.solver, replace(call, callback=None), new.best)
+            tight = continued(search.interior, replace(call, callback=None), new.best)
             least = torch.where(serves & is_over(tight.status), now[rows].clamp(max=0.0), torch.inf)
             too, clear = self._kept(search, rows, tight, least)
             now[rows] = torch.where(too, clear, now[rows])

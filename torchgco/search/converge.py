@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from torchgco.base.options import check_options
-from torchgco.base.status import Status, is_over
+from torchgco.base.status import SOLVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.kernels import chord_clearance
 from torchgco.lagrangian.quality import has_arrived, is_preferred
@@ -18,29 +18,30 @@ from torchgco.maps.field import BoundField
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.nearby import Nearby
+from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
+from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
 
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
 
 @dataclass(frozen=True)
-class Converge:
-    """Solves by the interior point, to its own tight tolerance.
+class Converge(Row):
+    """Solves by the interior point of the table, to its own tight tolerance.
 
     Args:
-        solver: of these solves.
-        when: "first": problems without obstacles, from the given guess; by AL-iLQR where that fails. "mapped": those
-            with maps where a limit has ended the solve of the best trajectory, from there: a map has one row per knot,
-            along which AL-iLQR takes many short steps. "last": all that are not yet solved as tightly, from the best
-            trajectory; where that leads to none that is feasible, from the given guess.
+        among: "free": problems without obstacles, from the given guess, once more from the start held where holding it
+            would cost less than what is found, and by AL-iLQR where the interior point fails. "all": those that are not
+            yet solved as tightly, from the best trajectory; where that leads to none that is feasible, from the guess.
 
     Raises:
         InputError: a field out of its range.
     """
 
-    solver: InteriorPoint = InteriorPoint()
-    when: Literal["first", "mapped", "last"] = "last"
+    among: Literal["free", "all"] = "all"
+
+    last: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_options(self, "converge")
@@ -50,17 +51,43 @@ class Converge:
         problem = search.call.problem
         if problem.B == 0 or not self.worth(problem):
             return
-        if self.when == "last":
+        if self.among == "all":
             self._tighten(search)
-        elif self.when == "mapped":
-            if _mapped(problem):
-                self._continue(search, search.best.limited)
         elif self.begins(problem) and not search.begun:
-            search.begin(self.solver.solved(search.call))
+            search.begin(search.interior.solved(search.call))
             if search.record is not None:
                 search.record.passes[-1][2].extend(search.call.rows.tolist())
+            self._from_rest(search)
             rows = _unsolved(search)
             search.best.improve(rows, search.call.take(rows))
+
+    @property
+    def problems(self) -> str:
+        return "without obstacles" if self.among == "free" else "not solved as tightly yet"
+
+    @property
+    def does(self) -> str:
+        start = "the guess, or the start held" if self.among == "free" else "the best trajectory"
+        return f"interior point from {start}"
+
+    @staticmethod
+    def _from_rest(search: Search) -> None:
+        """Solve again from the start held, where that costs less, though no step may hold it, than what was found.
+
+        The rollout of a guess may fall far away from an upright pendulum, and the solve stay there.
+        """
+        call, best = search.call, search.best.end.best
+        if call.warm is not None or call.X0 is not None:  # a guess that was chosen
+            return
+        X, U = call.problem.at_rest
+        held = call.problem.cost.total(X, U)
+        rows = (
+            torch.isfinite(held) & ~(best.cost <= held) & (search.best.end.status != Status.INVALID_START)
+        ).nonzero()
+        rows = rows.flatten()
+        if rows.numel() > 0:
+            again = search.interior.solved(replace(call.take(rows), U0=U[rows], callback=None), X[rows])
+            keep_tight(search, rows, again)
 
     @staticmethod
     def worth(problem: Problem) -> bool:
@@ -79,12 +106,12 @@ class Converge:
         lost = best.end.best.violation[rows] > search.solver.violation_tolerance
         lost = rows[lost & ~is_over(best.end.status[rows])]
         if lost.numel() > 0:
-            self._keep(search, lost, self.solver.solved(whole.take(lost)))
+            self._keep(search, lost, search.interior.solved(whole.take(lost)))
 
     def _continue(self, search: Search, rows: Tensor) -> None:
         if rows.numel() > 0:
             call = replace(search.call.take(rows), callback=None)  # a few iterations: not worth a report
-            self._keep(search, rows, continued(self.solver, call, take(search.best.end.best, rows)))
+            self._keep(search, rows, continued(search.interior, call, take(search.best.end.best, rows)))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.
@@ -101,9 +128,27 @@ class Converge:
         search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
 
 
-def _mapped(problem: Problem) -> bool:
+def mapped(problem: Problem) -> bool:
     """Whether there are maps among the obstacles."""
     return any(isinstance(part, BoundField) for part in problem.geometric)
+
+
+def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
+    """Keep results of the interior point that are better than the best by more than rounding, and as feasible.
+
+    A result is better that is feasible where the best isn't, or cheaper by more than a stationary trajectory may leave
+    to save.
+    """
+    old, new = take(search.best.end.best, rows), end.best
+    admitted = search.interior.admitted(search.call.problem)
+    # A solve that failed counts as lost where it violates by more than those that succeed.
+    solved = is_over(search.best.end.status[rows])
+    limit = torch.where(solved, search.solver.violation_tolerance, admitted)
+    lost = ~(old.violation <= limit)
+    cheaper = new.cost < old.cost - STATIONARY * old.cost.abs()
+    tight = (end.status == SOLVED) & (new.violation <= old.violation.clamp(min=admitted))
+    better = is_preferred(search.call.problem.take(rows), new, old, limit) & (lost | (cheaper & tight))
+    search.best.replace(rows, better, new, end)
 
 
 def _unsolved(search: Search) -> Tensor:
@@ -113,12 +158,16 @@ def _unsolved(search: Search) -> Tensor:
 
 def continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:
     """Solves of a call from trajectories, with their multipliers, among the obstacles near these."""
-    call = replace(call, U0=start.U, warm=start.multipliers)
-    near = Nearby.along(call, start.X)
+    return solved_nearby(solver, replace(call, U0=start.U, warm=start.multipliers), start.X)
+
+
+def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor) -> SolveEnd:
+    """Solves of a call from states X (B, N+1, n), among the obstacles near these."""
+    near = Nearby.along(call, X)
     if near is None:
-        return solver.solved(call, start.X)
-    found = solver.solved(near.call, start.X)
+        return solver.solved(call, X)
+    found = solver.solved(near.call, X)
     wrong, end = near.wrong(found.best), near.end(found)
     if wrong.numel() > 0:
-        put(end, wrong, solver.solved(call.take(wrong), start.X[wrong]))
+        put(end, wrong, solver.solved(call.take(wrong), X[wrong]))
     return end

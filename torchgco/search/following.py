@@ -53,6 +53,14 @@ class Paths:
     unit: Tensor  # (B,): q0 / R^4
     obstacles: Inflated
 
+    def joined(self, corners: Tensor, found: Tensor) -> Paths:
+        """With one path more of each problem, (B, 1, P, d), as a class of its own, where it was found, (B,)."""
+        own = torch.full_like(self.classes[:, :1], self.classes.shape[1])
+        return replace(
+            self, corners=torch.cat((self.corners, corners), dim=1), classes=torch.cat((self.classes, own), dim=1),
+            live=torch.cat((self.live, found.unsqueeze(1) & self.live.any(1, keepdim=True)), dim=1),
+        )  # fmt: skip
+
     def stretch(self) -> Tensor:
         """The length (B, K) of each path, in distances between its ends."""
         ends = self.corners[:, :, 0] - self.corners[:, :, -1]
@@ -110,6 +118,18 @@ class Follow:
         if not self.stiffness:
             raise InputError("follow.stiffness", "one or more numbers above 0", self.stiffness)
 
+    def __str__(self) -> str:
+        guide = "spring" if self.tube is None else "tube"
+        stiffness = ", ".join(f"{value:g}" for value in self.stiffness)
+        count = (1 + len(self.initial_offsets)) * len(self.paces)
+        several = f", {count} candidates" if count > 1 else ""
+        bare = ", without obstacles" if self.obstacles == 0 else ""
+        return f"{guide} {stiffness}, {self.iterations} iterations, corners over {self.smoothing:g} N{several}{bare}"
+
+    def fitting(self, m: int) -> Follow:
+        """Without initial offsets where these have another number of controls than m."""
+        return self if all(len(offset) == m for offset in self.initial_offsets) else replace(self, initial_offsets=())
+
     @property
     def paces(self) -> tuple[float, ...]:
         """The values of `arrive`, as a tuple."""
@@ -134,8 +154,7 @@ class Follow:
     def track(self, candidates: Candidates, paths: Paths, free: Free | None) -> Candidates:
         """The candidates, tracked along their paths from their initial controls at their paces."""
         paces, K = len(self.paces), paths.corners.shape[1]
-        path = paths.corners.flatten(0, 1).repeat_interleave(paces, dim=0)
-        arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
+        arrive = paths.corners.new_tensor(self.paces).repeat(paths.corners.shape[0] * K)
         if free is not None:
             slower = free.slower.repeat_interleave(K * paces)
             arrive = torch.minimum(self.depart + (arrive - self.depart) * slower, arrive.clamp(min=1.0))
@@ -144,6 +163,12 @@ class Follow:
             shares = ((free.share * free.slower).unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
             latest = self.pace * shares.flatten().repeat_interleave(paces)
             arrive = torch.minimum(arrive, latest.clamp(min=self.depart + SHORTEST))
+        return self.along(candidates, paths, arrive, paces)
+
+    def along(self, candidates: Candidates, paths: Paths, arrive: Tensor, paces: int) -> Candidates:
+        """The same at given paces: shares `arrive` (B * K * paces,) of the horizon, for each path one after another."""
+        K = paths.corners.shape[1]
+        path = paths.corners.flatten(0, 1).repeat_interleave(paces, dim=0)
         center = self._centers(path, arrive, candidates.problem, paths)
         problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
         number = torch.arange(candidates.live.numel(), device=path.device)

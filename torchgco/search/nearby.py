@@ -24,7 +24,7 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 
 DETOUR = math.sqrt(2.0)  # ways this many times as long as the straight one stay within half of its length from it
-FEWER = 0.5  # share of a problem's obstacles that must be far, for leaving any out
+FEWER = 0.5  # share of a problem's obstacles that must be far from a trajectory, for leaving any out of its refining
 
 
 class Nearby:
@@ -47,16 +47,20 @@ class Nearby:
 
     @classmethod
     def of(cls, call: Call) -> Nearby | None:
-        """None where every problem keeps all obstacles: there are few far ones, or none can be told far."""
-        return cls._where(call, lambda part, solids: _on_the_way(call.problem, solids))
+        """None where every problem keeps all obstacles: none is far, or can be told far.
+
+        A single far one counts: points all over the scene, and with them paths, would spread to it.
+        """
+        return cls._where(call, lambda part, solids: _on_the_way(call.problem, solids), 0.0)
 
     @classmethod
     def along(cls, call: Call, X: Tensor) -> Nearby | None:
-        """A call without the obstacles farther from X (B, N+1, n) than a mean one is thick; None as for `of`."""
-        return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids))
+        """A call without the obstacles farther from X (B, N+1, n) than a mean one is thick; None where few are."""
+        return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids), FEWER)
 
     @classmethod
-    def _where(cls, call: Call, near: Callable[[Obstacles, Solids], Tensor | None]) -> Nearby | None:
+    def _where(cls, call: Call, near: Callable[[Obstacles, Solids], Tensor | None], share: float) -> Nearby | None:
+        """Without those that aren't near, of problems in which they are more than a share of all."""
         problem = call.problem
         kept = [_kept(part, near) if isinstance(part, Obstacles) else None for part in problem.constraints]
         known = [part for part in kept if part is not None]
@@ -64,7 +68,8 @@ class Nearby:
             return None
         present = [~part.absent for part in problem.constraints if isinstance(part, Obstacles)]
         few = torch.stack([part.sum(-1) for part in known]).sum(0)
-        worth = few <= (1.0 - FEWER) * torch.stack([part.sum(-1) for part in present]).sum(0)
+        every = torch.stack([part.sum(-1) for part in present]).sum(0)
+        worth = (few < every) & (few <= (1.0 - share) * every)
         if not bool(worth.any()):
             return None
         return cls(call, [None if part is None else _places(part | ~worth.unsqueeze(-1)) for part in kept])

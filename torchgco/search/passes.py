@@ -1,13 +1,13 @@
-"""The passes of the search: each row of a solver's table is one of these, or a `PathProposals`.
+"""The steps of a search that solve by AL-iLQR: from the guess, from proposals, into the goal, from samples.
 
-A pass says which problems it looks at and what it does with them. The best trajectory of all passes is kept: one that
+A step says which problems it looks at and what it does with them. The best trajectory of all passes is kept: one that
 arrives at the goal before one that is feasible, then the cheapest.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import ClassVar, Literal
 
 import torch
 
@@ -20,11 +20,8 @@ from torchgco.lagrangian.quality import goal_tolerance
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
-from torchgco.search.chords import ClearChords
-from torchgco.search.converge import Converge
-from torchgco.search.finish import Finish
-from torchgco.search.proposals import PathProposals
-from torchgco.search.starts import Starts
+from torchgco.search.proposals import WHEN
+from torchgco.search.row import Row
 from torchgco.solvers.caught import StopWhenCaught
 
 WITHIN = 0.95  # share of the goal tolerance to which trajectories are attracted
@@ -33,14 +30,14 @@ SEED_STEP = 1_000_003  # between the seeds of two attempts
 
 
 @dataclass(frozen=True)
-class Solve:
+class Solve(Row):
     """A solve from the given guess.
 
     Args:
         until: "caught": a solve is stopped where its trajectory is caught between obstacles; "end": it isn't.
-        when: "pathless": where no path can be sought, as among moving obstacles, where waiting is often enough;
-            "unarrived": where no solve has been made, or has not arrived. Problems that converge are not solved again
-            where the goal is assumed: it may lie beyond the horizon.
+        among: "pathless": problems in which no path can be sought, as among moving obstacles, where waiting is often
+            enough; "all". Those that have arrived are not solved again, nor those that have converged where the goal is
+            assumed: it may lie beyond the horizon.
         single_contact_after: from this outer iteration on, a knot inside one obstacle counts as caught, too; None: only
             knots inside two.
 
@@ -49,15 +46,27 @@ class Solve:
     """
 
     until: Literal["caught", "end"] = "caught"
-    when: Literal["pathless", "unarrived"] = "unarrived"
+    among: Literal["pathless", "all"] = "all"
     single_contact_after: Count | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "solve")
 
+    @property
+    def problems(self) -> str:
+        return "where no path can be sought" if self.among == "pathless" else "all, or those that have not arrived"
+
+    @property
+    def does(self) -> str:
+        if self.until == "end":
+            return "AL-iLQR to the end"
+        after = self.single_contact_after
+        single = "" if after is None else f", or inside one after {after} outer iterations"
+        return f"AL-iLQR until a knot lies inside two obstacles{single}"
+
     def run(self, search: Search) -> None:
         """Solve; see the class."""
-        if self.when == "pathless" and search.has_paths:
+        if self.among == "pathless" and search.has_paths:
             return
         stop = StopWhenCaught(self.single_contact_after) if self.until == "caught" and search.guided else None
         if not search.begun:
@@ -80,11 +89,14 @@ class Solve:
 
 
 @dataclass(frozen=True)
-class FromProposal:
+class FromProposal(Row):
     """An attempt from every proposal of the passes before.
 
     The penalty of a rejected proposal is kept: it keeps the solver from returning to the caught trajectory.
     """
+
+    problems: ClassVar[str] = "with a proposal"  # type: ignore[misc]
+    does: ClassVar[str] = "AL-iLQR from there"  # type: ignore[misc]
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -103,11 +115,32 @@ class FromProposal:
 
 
 @dataclass(frozen=True)
-class IntoGoal:
-    """An attempt from the best trajectories that end close to the goal, their ends attracted to it."""
+class IntoGoal(Row):
+    """An attempt from the best trajectories that end close to the goal, their ends attracted to it.
+
+    Args:
+        among: as of `Solve`.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    among: Literal["pathless", "all"] = "all"
+
+    @property
+    def problems(self) -> str:
+        where = ", where no path can be sought" if self.among == "pathless" else ""
+        return f"caught, close to the goal, not arrived{where}"
+
+    does: ClassVar[str] = "AL-iLQR with the end attracted to the goal"  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        check_options(self, "into_goal")
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
+        if self.among == "pathless" and search.has_paths:
+            return
         rows, best = search.rows("close"), search.best
         start = take(best.end.best, rows)
         if rows.numel() > 0:
@@ -116,7 +149,7 @@ class IntoGoal:
 
 
 @dataclass(frozen=True)
-class FromSamples:
+class FromSamples(Row):
     """Attempts from the caught trajectory, guided by samples from the start: the guidance of the local solver.
 
     Args:
@@ -133,6 +166,15 @@ class FromSamples:
 
     def __post_init__(self) -> None:
         check_options(self, "samples")
+
+    @property
+    def problems(self) -> str:
+        return WHEN[self.when]
+
+    @property
+    def does(self) -> str:
+        draws = "goes on once" if self.redraws == 0 else f"{self.redraws} times, with other draws"
+        return f"AL-iLQR from the caught iterate, guided by samples: {draws}"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -152,11 +194,6 @@ class FromSamples:
         else:
             call = replace(call, seed=call.seed + SEED_STEP * draw)
         search.best.improve(rows, call, guidance=search.guidance, guide_first=True)
-
-
-Pass: TypeAlias = (
-    Solve | PathProposals | FromProposal | IntoGoal | FromSamples | Converge | Finish | ClearChords | Starts
-)
 
 
 def _goal_region(problem: Problem) -> GuideRegion:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -32,8 +32,15 @@ from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
 from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
 from torchgco.search.record import comparison
+from torchgco.search.row import Row
 from torchgco.solution import SearchRecord
 
+WHEN = {
+    "caught": "caught",
+    "unarrived": "caught, not arrived",
+    "far": "caught, not even close to the goal",
+    "unproposed": "caught, without a proposal",
+}
 PATHS_AT_ONCE = 1536  # paths of all problems that are compared and tracked together: bounds the memory
 ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
 
@@ -56,14 +63,14 @@ class Proposal(NamedTuple):
 
 
 class Rounds(Protocol):
-    """A search that keeps the round of proposals from pass to pass."""
+    """A search that keeps the round of proposals from step to step."""
 
     def propose(self, proposals: PathProposals) -> None: ...
 
 
 @dataclass(frozen=True)
-class PathProposals:
-    """A pass that follows short paths between static obstacles, and proposes the candidate that is cheapest to fly.
+class PathProposals(Row):
+    """A step that follows short paths between static obstacles, and proposes the candidate that is cheapest to fly.
 
     Args:
         when: the problems that it looks at. Among those that were caught: all ("caught"), those that have not arrived
@@ -94,6 +101,8 @@ class PathProposals:
     max_penetration: Positive = 0.1
     max_gap: Positive | None = None
 
+    seeks_paths: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_options(self, "proposals")
         for name in ("roadmaps", "follow"):
@@ -108,9 +117,30 @@ class PathProposals:
         """Whether this pass improves the proposals of the one before."""
         return self.when in ("unproposed", "costly")
 
+    @property
+    def problems(self) -> str:
+        if self.when == "costly":
+            return f"with a proposal over {self.max_gap or 0.0:.0%} dearer than without obstacles"
+        return WHEN[self.when]
+
+    @property
+    def does(self) -> str:
+        points = " and ".join(str(roadmap.num_halton) for roadmap in self.roadmaps)
+        paths = f"{self.num_paths} paths over {points} points" if self.roadmaps else "the same paths"
+        relax = "all" if self.relax_top is None else f"the best {self.relax_top}"
+        relaxed = f"{relax} relaxed, {self.relax_iterations} iterations" if self.relax_iterations else "not relaxed"
+        refined = f"; the best {self.refine.top} refined, {self.refine.rounds} rounds" if self.refine.top > 1 else ""
+        least = ", as refined" if self.refine.needed else ""
+        ways = "; then ".join(str(follow) for follow in self.follow)
+        return f"{paths}: {ways}; {relaxed}{refined}; accepted up to {self.max_penetration:g} R deep{least}"
+
     def run(self, search: Rounds) -> None:
-        """A pass of a search; see the class."""
+        """Propose; see the class."""
         search.propose(self)
+
+    def fitting(self, m: int) -> Self:
+        """Without initial offsets that have another number of controls than m."""
+        return replace(self, follow=tuple(follow.fitting(m) for follow in self.follow))
 
     @property
     def at_once(self) -> int:
@@ -145,7 +175,7 @@ class PathProposals:
             return
         every = rows.numel() == whole.problem.B
         problem, rest = (whole.problem, whole.rest) if every else (whole.problem.take(rows), whole.rest[rows])
-        paths = self._paths(whole, rows) if self.roadmaps else take(whole.paths, rows)
+        paths = whole.seek(rows, self.roadmaps, self.num_paths) if self.roadmaps else take(whole.paths, rows)
         if not self.continues:
             whole.paths = paths
         note = None if whole.record is None else partial(whole.note, rows, paths, self.refine)
@@ -156,25 +186,6 @@ class PathProposals:
             better = (~old.found | (new.found & (new.cost < old.cost))).nonzero().flatten()
             put(whole.proposal, rows[better], take(new, better))
             whole.proposal.iterations[rows] = old.iterations + new.iterations
-
-    def _paths(self, whole: Part, rows: Tensor) -> Paths:
-        """The paths of all searches, one per homotopy class, of the problems in `rows`."""
-        assert whole.scene is not None
-        R, unit = (scale[rows] for scale in whole.scales)
-        usable, known = torch.isfinite(unit) & (unit > 0), []
-        found = torch.zeros_like(usable)
-        for number, roadmap in enumerate(self.roadmaps):
-            if any(roadmap.repeats(other, whole.scene) for other in self.roadmaps[:number]):
-                continue
-            corners, arrives = roadmap.paths(whole.scene, self.num_paths, rows, whole.known)
-            known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, self.num_paths)))
-            found = found | (arrives & usable)
-        corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
-        obstacles = whole.scene.obstacles
-        obstacles = obstacles if rows.numel() == whole.problem.B else take(obstacles, rows)
-        label = classes(corners, obstacles)
-        first = label == torch.arange(label.shape[1], device=label.device)
-        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def _along(
         self,
@@ -238,6 +249,25 @@ class Part:
         """R and q0 / R^4 (B,); see `scene.scales`."""
         assert self.scene is not None
         return seen.scales(self.problem, self.scene, self.rest)
+
+    def seek(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
+        """The paths of some searches, `count` each and one per homotopy class, of the problems in `rows`."""
+        assert self.scene is not None
+        R, unit = (scale[rows] for scale in self.scales)
+        usable, known = torch.isfinite(unit) & (unit > 0), []
+        found = torch.zeros_like(usable)
+        for number, roadmap in enumerate(roadmaps):
+            if any(roadmap.repeats(other, self.scene) for other in roadmaps[:number]):
+                continue
+            corners, arrives = roadmap.paths(self.scene, count, rows, self.known)
+            known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, count)))
+            found = found | (arrives & usable)
+        corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
+        obstacles = self.scene.obstacles
+        obstacles = obstacles if rows.numel() == self.problem.B else take(obstacles, rows)
+        label = classes(corners, obstacles)
+        first = label == torch.arange(label.shape[1], device=label.device)
+        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
         """Record a comparison for the problems in `rows`; see `record.comparison`."""

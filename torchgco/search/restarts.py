@@ -4,34 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from torchgco.base.errors import InputError, shown
+from torchgco.base.errors import InputError
 from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.kernels import expect_interior
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.scene import has_paths
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
-from torchgco.search.converge import Converge
-from torchgco.search.finish import Finish
+from torchgco.search.converge import Converge, mapped
 from torchgco.search.nearby import Nearby, merged
-from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Pass, Solve
+from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.proposals import PathProposals
-from torchgco.search.starts import Starts
+from torchgco.search.row import Passes, Row, passes_of
 from torchgco.search.suitability import suited_paths
 from torchgco.search.table import rows_of
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
 from torchgco.solvers.infeasible import least_violated
+from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.session import Session
 
 if TYPE_CHECKING:
     import pandas as pd
 
-PASSES = (Solve(), PathProposals(), FromProposal(), FromSamples("unproposed"), IntoGoal(), ClearChords())
+PASSES = Passes((Solve(), PathProposals(), FromProposal(), FromSamples("unproposed"), IntoGoal(), ClearChords()))
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,8 @@ class Restarts(Solver):
 
     Args:
         local: makes every solve, without its `guidance`: that guides attempts from samples alone (`FromSamples`).
-        passes: in their order; the first ones make a solve from the given guess.
+        passes: by name, or in a list; in their order: the first ones make a solve from the given guess.
+        interior: the interior point that the passes solve by, to its own tight tolerance.
 
     Raises:
         InputError: a field out of its range, passes that don't begin with a solve, or one that would improve proposals
@@ -48,28 +50,35 @@ class Restarts(Solver):
     """
 
     local: AugmentedLagrangian = AugmentedLagrangian()
-    passes: tuple[Pass, ...] = PASSES
+    passes: Passes = PASSES
+    interior: InteriorPoint = InteriorPoint()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "passes", passes_of(self.passes))
         _check(self.passes)
-        object.__setattr__(self, "passes", tuple(self.passes))
         check_options(self, "solver")
 
-    def table(self) -> pd.DataFrame:
-        """The passes, a row each: which problems they look at, and what they do with them."""
+    def table(self, problem: Problem | None = None) -> pd.DataFrame:
+        """The passes, a row each: which problems they look at, and what they do with them.
+
+        Args:
+            problem: only the rows that may work on problems of this kind; None: all.
+        """
         import pandas as pd
 
-        return pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
+        table = pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
+        kind = None if problem is None else kind_of(problem)
+        return table if kind is None else table[[kind in row.kinds for row in self.passes]]
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
         """The passes but the last solves, as the next plan continues this one; and the local solver, unguided."""
-        passes = tuple(one for one in self.passes if not isinstance(one, Converge | Finish | Starts))
+        passes = Passes(step for step in self.passes.steps if not step.last)
         return replace(self, passes=passes), replace(self.local, guidance=None, max_outer_iterations=rounds)
 
     @property
     def _finishes(self) -> bool:
         """Whether a pass is the interior point's: in closed loop there is none, and no time for a verdict."""
-        return any(isinstance(one, Converge) for one in self.passes)
+        return any(isinstance(one, Converge) for one in self.passes.steps)
 
     def announce(self, problem: Problem) -> None:
         """Where a pass is the interior point's."""
@@ -82,7 +91,7 @@ class Restarts(Solver):
 
     def take_states(self, problem: Problem) -> bool:
         """Where the first solve is the interior point's: without obstacles."""
-        first = any(isinstance(one, Converge) and one.when == "first" for one in self.passes)
+        first = any(isinstance(one, Converge) and one.among == "free" for one in self.passes.steps)
         return first and Converge.begins(problem)
 
     def recording(self) -> Restarts:
@@ -106,7 +115,7 @@ class Restarts(Solver):
         solver = self.local
         session = Session(call, solver.inner.rules, solver.record)
         passes, guidance = self._suited(session.call.problem)
-        search = Search(session.call, solver, passes, guidance, session.recorder)
+        search = Search(session.call, solver, passes, guidance, self.interior, session.recorder)
         self._run(search, passes)
         end = search.best.end
         if self._finishes:
@@ -114,12 +123,12 @@ class Restarts(Solver):
         solution = session.finished(end, solver.violation_tolerance, solver.slots)
         return replace(solution, search=search.finish_record(*session.scales))
 
-    def _run(self, search: Search, passes: Sequence[Pass | None]) -> None:
+    def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
         """All passes, until the time is over."""
         for number, one in enumerate(passes, start=1):
             if search.begun and search.call.late:
                 return
-            name, late = type(self.passes[number - 1]).__name__, False
+            name, late = self.passes.names[number - 1], False
             search.next_pass(number, name)
             try:
                 if one is not None:
@@ -130,17 +139,17 @@ class Restarts(Solver):
             if late:
                 return
 
-    def _suited(self, problem: Problem) -> tuple[Sequence[Pass | None], Guidance | None]:
+    def _suited(self, problem: Problem) -> tuple[Sequence[Row | None], Guidance | None]:
         """The passes, None for those that can't serve these problems, and the guidance, None where it can't.
 
         A GuidanceWarning names what can't.
         """
         if not problem.geometric:
-            return [None if isinstance(one, PathProposals) else one for one in self.passes], None
+            return [None if one.seeks_paths else one for one in self.passes], None
         guidance, losses = self.local.guidance, list[str]()
         if isinstance(guidance, GCO):
             sampler, unsampled = suited_guide(guidance.sampler, problem)
-            solves = (one for one in self.passes if isinstance(one, Solve) and one.until == "caught")
+            solves = (one for one in self.passes.steps if isinstance(one, Solve) and one.until == "caught")
             after = next((solve.single_contact_after for solve in solves), None)
             guidance = None if sampler is None else replace(guidance, sampler=sampler).in_search(after)
             losses += [] if unsampled is None else [unsampled]
@@ -148,24 +157,28 @@ class Restarts(Solver):
             guidance = guidance.suited(problem)
         passes, unsought = suited_paths(self.passes, problem)
         losses += [] if unsought is None else [unsought]
-        warn_of_losses(losses, guidance is None and not any(isinstance(one, PathProposals) for one in passes))
+        warn_of_losses(losses, guidance is None and not any(one.seeks_paths for one in passes if one is not None))
         return passes, guidance
 
 
-def _check(passes: Any) -> None:
-    """InputError for what is no list of passes, for no first solve, or for a pass that would improve no proposals."""
-    if not isinstance(passes, list | tuple):
-        raise InputError("solver.passes", "a list of passes of torchgco.search", shown(passes))
+def kind_of(problem: Problem) -> str:
+    """The kind of problem: "free" of obstacles, "moving" where no path can be sought, "maps", or "bodies" without."""
+    if not problem.geometric:
+        return "free"
+    return "moving" if not has_paths(problem) else "maps" if mapped(problem) else "bodies"
+
+
+def _check(passes: Passes) -> None:
+    """InputError for no first solve, or for a pass that would improve no proposals."""
     begun = False
-    for number, one in enumerate(passes):
-        if not isinstance(one, Pass):
-            raise InputError(f"solver.passes[{number}]", "a pass of torchgco.search", shown(one))
-        if isinstance(one, PathProposals) and one.continues and not begun:
-            expected = f"path proposals before those for problems that are {one.when}, and no FromProposal in between"
-            raise InputError(f"solver.passes[{number}].when", expected, one.when)
-        begun = isinstance(one, PathProposals) or (begun and not isinstance(one, FromProposal))
-    some = [isinstance(one, Solve | Converge) and one.when in ("pathless", "first") for one in passes]
-    first = next((one for one, of_some in zip(passes, some, strict=True) if not of_some), None)
+    for number, row in enumerate(passes):
+        for step in row.steps:
+            if isinstance(step, PathProposals) and step.continues and not begun:
+                expected = f"path proposals before those that are {step.when}, and no FromProposal in between"
+                raise InputError(f"solver.passes[{number}].when", expected, step.when)
+            begun = isinstance(step, PathProposals) or (begun and not isinstance(step, FromProposal))
+    some = [isinstance(one, Solve | Converge) and one.among in ("pathless", "free") for one in passes.steps]
+    first = next((one for one, of_some in zip(passes.steps, some, strict=True) if not of_some), None)
     if not isinstance(first, Solve):
         got = "none" if first is None else type(first).__name__
         raise InputError("solver.passes", "a Solve first, not only for problems without paths", got)

@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
+from torchgco.base.status import UNMOVED, Status, is_over
 from torchgco.base.tree import take
-from torchgco.lagrangian.quality import is_preferred
-from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.constraints.bounds import ControlBounds
+from torchgco.lagrangian.state import Iterate
+from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
-from torchgco.search.converge import Converge
-from torchgco.search.finish import STREAM, half_ranges
+from torchgco.search.converge import Converge, keep_tight
+from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.ending import STATIONARY
-from torchgco.solvers.interior import InteriorPoint
 
 KNOTS = 4  # of the noise: with 8, guesses are bent more often than optima are, and lead to fewer of them
-NEXT_STREAM = 2 * STREAM  # outer iteration that keys the noise, after that of `Finish`
+STREAM = 1 << 21  # outer iteration that keys the noise: no solve makes so many
 
 
 @dataclass(frozen=True)
-class Starts:
+class Starts(Row):
     """Solves by the interior point from random guesses, of problems without obstacles; the best result is kept.
 
     A guess has states on the straight line from the start to the end of the best trajectory, bent by smooth noise, and
     the controls given, with smooth noise: swing-ups and manoeuvres have many local minima, and random controls alone
-    lead chaotic systems far away. A result is better that is feasible, or cheaper by more than a stationary trajectory
-    may leave to save. Guesses are keyed by (seed, id, start).
+    lead chaotic systems far away. Guesses are keyed by (seed, id, start).
 
     Args:
         count: of guesses.
@@ -40,7 +38,6 @@ class Starts:
         bend: standard deviation of the noise in the states half-way, as a share of the range of each along the best
             trajectory.
         change: standard deviation of the noise in the controls, as a share of half their range.
-        solver: of these solves.
 
     Raises:
         InputError: a field out of its range.
@@ -50,10 +47,19 @@ class Starts:
     when: Literal["unsolved", "all"] = "unsolved"
     bend: Positive = 0.2
     change: Positive = 0.1
-    solver: InteriorPoint = InteriorPoint()
+
+    last: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_options(self, "starts")
+
+    @property
+    def problems(self) -> str:
+        return f"without obstacles, {'all' if self.when == 'all' else 'unsolved at first'}"
+
+    @property
+    def does(self) -> str:
+        return f"interior point from {self.count} guesses, bent by {self.bend:g}, controls by {self.change:g}"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -84,13 +90,13 @@ class Starts:
         start = torch.arange(self.count, device=rows.device).repeat(rows.numel())
         call = replace(search.call.take(each), callback=None, warm=None)
         X, U = self._guess(call, take(search.best.end.best, each), start)
-        end = self.solver.solved(replace(call, U0=U), X)
+        end = search.interior.solved(replace(call, U0=U), X)
         for number in range(self.count):
-            self._keep(search, rows, take(end, slice(number, None, self.count)))
+            keep_tight(search, rows, take(end, slice(number, None, self.count)))
 
     def _guess(self, call: Call, best: Iterate, start: Tensor) -> tuple[Tensor, Tensor]:
         """States (b, N+1, n) and controls (b, N, m) to begin with, for starts of the numbers (b,)."""
-        bends, changes = (DrawKey(call.seed, call.ids, NEXT_STREAM + 2 * start + part) for part in (0, 1))
+        bends, changes = (DrawKey(call.seed, call.ids, STREAM + 2 * start + part) for part in (0, 1))
         X, way = best.X, torch.linspace(0.0, 1.0, call.problem.N + 1, dtype=best.X.dtype, device=best.X.device)
         way = way.view(1, -1, 1)
         size = 4.0 * way * (1.0 - way) * (X.amax(1) - X.amin(1)).unsqueeze(1)
@@ -98,15 +104,12 @@ class Starts:
         U = call.U0 + self.change * half_ranges(call.problem, call.U0) * smooth_normal(changes, KNOTS, call.U0)
         return line + self.bend * size * smooth_normal(bends, KNOTS, X), U
 
-    def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
-        """Keep results that are better than the best so far, by more than rounding, and as feasible as tolerated."""
-        old, new = take(search.best.end.best, rows), end.best
-        admitted = self.solver.admitted(search.call.problem)
-        # A solve that failed counts as lost where it violates by more than those that succeed.
-        solved = is_over(search.best.end.status[rows])
-        limit = torch.where(solved, search.solver.violation_tolerance, admitted)
-        lost = ~(old.violation <= limit)
-        cheaper = new.cost < old.cost - STATIONARY * old.cost.abs()
-        tight = (end.status == SOLVED) & (new.violation <= old.violation.clamp(min=admitted))
-        better = is_preferred(search.call.problem.take(rows), new, old, limit) & (lost | (cheaper & tight))
-        search.best.replace(rows, better, new, end)
+
+def half_ranges(problem: Problem, U: Tensor) -> Tensor:
+    """Half the range of each control between its bounds, (B, 1, m); 1 or the largest control where it is unbounded."""
+    half = U.abs().amax(1, keepdim=True).clamp(min=1.0)
+    for bounds in problem.constraints:
+        if isinstance(bounds, ControlBounds):
+            own = 0.5 * bounds.range.unsqueeze(1)
+            half = torch.where(torch.isfinite(own), own, half)
+    return half

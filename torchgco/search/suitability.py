@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from torchgco.guidance.suitability import check_form, failure
 from torchgco.kernels import kernels_of
@@ -11,17 +10,16 @@ from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
-from torchgco.search.passes import Pass
-from torchgco.search.proposals import PathProposals
+from torchgco.search.row import Row
 
 
-def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[Sequence[Pass | None], str | None]:
+def suited_paths(passes: Sequence[Row], problem: Problem) -> tuple[Sequence[Row | None], str | None]:
     """The passes, with None for proposals along paths that can't serve; and a sentence on what is lost, or None.
 
     Obstacles that the roadmap doesn't know by design, such as moving ones, are no loss. Initial offsets for another
     number of controls are left out.
     """
-    others = [None if isinstance(one, PathProposals) else one for one in passes]
+    others = [None if one.seeks_paths else one for one in passes]
     if None not in others:
         return others, None
     position, bodies = problem.dynamics.position, bool(problem.obstacles)
@@ -37,14 +35,7 @@ def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[Sequence[Pas
     why = None if kernels_of(problem).compiled else failure(_expand, problem, problem.x0.dtype)
     if why is not None:
         return others, f"no path can be followed ({why})"
-    return [_with_fitting_offsets(one, problem.m) if isinstance(one, PathProposals) else one for one in passes], None
-
-
-def _with_fitting_offsets(proposals: PathProposals, m: int) -> PathProposals:
-    """The same pass, without initial offsets that have another number of controls than m."""
-    fits = (all(len(offset) == m for offset in follow.initial_offsets) for follow in proposals.follow)
-    follow = (f if fit else replace(f, initial_offsets=()) for f, fit in zip(proposals.follow, fits, strict=True))
-    return replace(proposals, follow=tuple(follow))
+    return [one.fitting(problem.m) for one in passes], None
 
 
 def _expand(problem: Problem) -> None:

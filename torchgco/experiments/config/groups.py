@@ -42,6 +42,7 @@ from torchgco.scenarios import (
     Yard,
 )
 from torchgco.scenarios.vehicle import BUILT_IN
+from torchgco.search import Passes
 
 FAMILIES: tuple[type[Any], ...] = (
     Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
@@ -173,6 +174,8 @@ def _tree(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         own = {field.name: _tree(getattr(value, field.name)) for field in fields(value) if field.init}
         return {"_target_": _path(type(value))} | own
+    if isinstance(value, Passes):
+        return {name: _tree(row) for name, row in value.items()}
     return [_tree(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 

@@ -16,8 +16,8 @@ PARTIAL = "_partial_"  # of missions: their planner and plant are put in later
 def check_stored(tree: Any, group: str, field: str) -> None:
     """Check that a node of a study's file, in plain containers, makes nothing but classes of a group's own options.
 
-    Their arguments are numbers, texts, lists and further classes of the group: no interpolations, which could read the
-    environment, and no free mappings, which are options of other libraries.
+    Their arguments are numbers, texts, lists and further classes of the group, by name too: no interpolations, which
+    could read the environment, and no free mappings, which are options of other libraries.
 
     Args:
         group: of `conf`: model, solver, mission or plant.
@@ -40,7 +40,11 @@ def _check(value: Any, known: frozenset[type], group: str, field: str) -> None:
     if not isinstance(value, Mapping):
         return
     if MADE not in value:
-        raise _refused(field, "a number, a text, a list or a class", value)
+        if not value or not all(isinstance(item, Mapping) and MADE in item for item in value.values()):
+            raise _refused(field, "a number, a text, a list, a class or classes by name", value)
+        for name, item in value.items():
+            _check(item, known, group, f"{field}.{name}")
+        return
     if not _is_known(value[MADE], known):
         raise _refused(f"{field}.{MADE}", f"a class that torchgco's own options of {group} make", value[MADE])
     for key, item in value.items():

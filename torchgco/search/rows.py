@@ -1,0 +1,225 @@
+"""The rows of the default's table: each makes several steps, whose settings follow from a few options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+from torchgco.base.options import Count, Natural, Positive, check_options
+from torchgco.roadmap.roadmap import Roadmap
+from torchgco.search.candidates import Refine
+from torchgco.search.converge import Converge
+from torchgco.search.direct import Direct, Join
+from torchgco.search.following import Follow
+from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
+from torchgco.search.proposals import PathProposals
+from torchgco.search.row import Row
+from torchgco.search.starts import Starts
+
+REPAIRED = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)  # of candidates that lie deep in an obstacle
+DEEP = 0.5  # how deep these may lie, in R
+
+
+@dataclass(frozen=True)
+class FirstSolve(Row):
+    """The solve from the given guess.
+
+    Without obstacles the interior point makes it; where no path can be sought, AL-iLQR to its end; else AL-iLQR until
+    it is caught, and the interior point beside it where that is cheap.
+
+    Args:
+        single_contact_after: as of `Solve`.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    single_contact_after: Count | None = 3
+
+    def __post_init__(self) -> None:
+        check_options(self, "guess")
+
+    @property
+    def steps(self) -> tuple[Row, ...]:
+        solve = Solve(single_contact_after=self.single_contact_after)
+        return Converge(among="free"), Solve("end", "pathless"), solve, Direct()
+
+    @property
+    def problems(self) -> str:
+        return "all"
+
+    @property
+    def does(self) -> str:
+        after = self.single_contact_after
+        single = "" if after is None else f", or one after {after} outer iterations"
+        return (
+            "without obstacles: interior point from the guess or the start held; where no path can be sought: AL-iLQR "
+            f"to the end; else until caught (two obstacles at a knot{single}); {Direct().problems}: interior point too"
+        )
+
+
+@dataclass(frozen=True)
+class Paths(Row):
+    """Proposals along paths, where these lack or cost much further ones, and an attempt from the best.
+
+    Args:
+        num_paths, roadmap, follow, relax_iterations, relax_top, max_penetration: as of `PathProposals`.
+        refined: candidates that are refined before they are compared; 1: the best is proposed as relaxed, only those of
+            paths that led to no proposal are refined, and where the attempt ends far from the goal, twice as many.
+        max_gap: proposals that cost more than this above the trajectory without obstacles, as a share, are compared
+            with those along twice as many paths; None: none are.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    num_paths: Count = 6
+    roadmap: Roadmap = Roadmap()
+    follow: Follow = Follow()
+    relax_iterations: Natural = 20
+    relax_top: Count | None = None
+    refined: Count = 1
+    max_penetration: Positive = 0.1
+    max_gap: Positive | None = None
+
+    seeks_paths: ClassVar[bool] = True
+    kinds: ClassVar[tuple[str, ...]] = ("maps", "bodies")
+
+    def __post_init__(self) -> None:
+        check_options(self, "paths")
+
+    @property
+    def proposals(self) -> PathProposals:
+        """The first step."""
+        return PathProposals(
+            roadmaps=(self.roadmap,), num_paths=self.num_paths, follow=(self.follow,),
+            relax_iterations=self.relax_iterations, relax_top=self.relax_top, refine=Refine(top=self.refined),
+            max_penetration=self.max_penetration,
+        )  # fmt: skip
+
+    @property
+    def steps(self) -> tuple[Row, ...]:
+        first, near = self.proposals, closer(self.follow)
+        # Obstacles may bar the way from rest to the path, such as a wall between the two.
+        again = replace(
+            first, when="unproposed", roadmaps=(), follow=(near, replace(near, obstacles=0.0)), relax_top=None
+        )
+        if self.refined == 1:
+            again = replace(again, refine=REPAIRED, max_penetration=DEEP)
+        more = () if self.max_gap is None else (self._more(first),)
+        steps = first, *more, again, FromProposal(), IntoGoal()
+        return (*steps, self._thorough(first), FromProposal()) if self.refined == 1 else steps
+
+    def _thorough(self, first: PathProposals) -> PathProposals:
+        """Along twice as many paths, to the end of the horizon and all refined, where the attempt ends far away."""
+        count, follow = 2 * self.num_paths, replace(self.follow, iterations=3 * self.follow.iterations, pace=None)
+        return replace(first, when="far", num_paths=count, follow=(follow,), relax_top=None, refine=Refine(top=count))
+
+    def _more(self, first: PathProposals) -> PathProposals:
+        """Along twice as many paths, over twice as many points too: other paths, but not always better ones."""
+        denser = replace(self.roadmap, num_halton=2 * self.roadmap.num_halton)
+        count = 2 * self.num_paths
+        return replace(
+            first, when="costly", roadmaps=(self.roadmap, denser), num_paths=count,
+            follow=(self.follow, closer(self.follow)), relax_top=count, refine=REPAIRED, max_penetration=DEEP,
+            max_gap=self.max_gap,
+        )  # fmt: skip
+
+    @property
+    def problems(self) -> str:
+        return "caught, not arrived"
+
+    @property
+    def does(self) -> str:
+        more = "" if self.max_gap is None else f"; over {self.max_gap:.0%} dearer than free: twice as many paths"
+        far = "; still far: twice as many, all refined" if self.refined == 1 else ""
+        return (
+            f"{self.proposals.does}{more}; without any: followed closer; then AL-iLQR from the best, into the goal{far}"
+        )
+
+    def fitting(self, m: int) -> Self:
+        """Without initial offsets that have another number of controls than m."""
+        return replace(self, follow=self.follow.fitting(m))
+
+
+@dataclass(frozen=True)
+class Samples(Row):
+    """Attempts from samples, and one into the goal; then what the interior point found beside the search competes.
+
+    Where there was never a proposal, as among moving obstacles, the solve that was stopped goes into the goal, or on,
+    first.
+
+    Args:
+        redraws: as of `FromSamples`.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    redraws: Natural = 2
+
+    kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
+
+    def __post_init__(self) -> None:
+        check_options(self, "samples")
+
+    @property
+    def steps(self) -> tuple[Row, ...]:
+        return (
+            IntoGoal("pathless"), FromSamples("unproposed"), FromSamples(redraws=self.redraws), IntoGoal(), Join(),
+        )  # fmt: skip
+
+    @property
+    def problems(self) -> str:
+        return "caught, not arrived"
+
+    @property
+    def does(self) -> str:
+        return f"{self.steps[2].does}; the best into the goal; what waits competes"
+
+
+@dataclass(frozen=True)
+class Tighten(Row):
+    """The last solve, by the interior point: from the best trajectory.
+
+    Problems without obstacles that were unsolved at first are solved from other guesses, too.
+
+    Args:
+        starts: so many; 0: none.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    starts: Natural = 8
+
+    last: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_options(self, "tighten")
+
+    @property
+    def steps(self) -> tuple[Row, ...]:
+        return Converge(), *((Starts(self.starts),) if self.starts > 0 else ())
+
+    @property
+    def problems(self) -> str:
+        return "not solved as tightly yet"
+
+    @property
+    def does(self) -> str:
+        more = f"; without obstacles, unsolved: from {self.starts} guesses" if self.starts > 0 else ""
+        return f"{self.steps[0].does}{more}"
+
+
+def closer(follow: Follow) -> Follow:
+    """Follows the same paths closer, where candidates leave them for a trap.
+
+    A spring gives way to the cost: it gets stiffer, and then takes more iterations to reach the path. So does a tube
+    around sharper corners.
+    """
+    spring = follow.tube is None
+    return replace(
+        follow, smoothing=follow.smoothing / 4.0, iterations=(3 if spring else 2) * follow.iterations,
+        stiffness=(10.0 * follow.stiffness[-1],) if spring else follow.stiffness,
+    )  # fmt: skip

@@ -1,0 +1,203 @@
+"""Paths tracked closely at several paces, and each trajectory solved by the interior point: nothing is relaxed.
+
+A relaxed candidate gives way to its cost through whatever is thinner than its penalty can hold, such as the walls of a
+map. A stiff and narrow tube keeps a candidate on its path, nearly clear of all obstacles; from there an interior point
+with a small barrier stays on its side of each of them. What it finds has the homotopy class of its path and about the
+pace that it was given: several of both are tried, and the cheapest counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from torchgco.base.options import Count, check_options
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.kernels import chord_clearance, open_loop
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.state import SolveEnd
+from torchgco.problem.problem import Problem
+from torchgco.roadmap.roadmap import Roadmap
+from torchgco.search.attempts import Search
+from torchgco.search.candidates import Candidates, Refine, Refined
+from torchgco.search.converge import mapped, solved_nearby
+from torchgco.search.following import Follow, Free, Paths
+from torchgco.search.proposals import Part
+from torchgco.search.row import Row
+from torchgco.solvers.interior import InteriorPoint
+
+AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
+# Tracked candidates lie a small part of R inside an obstacle, from where the interior point leads out of it again; from
+# deeper than `DEEP` it rarely does. A spring, or a wider tube, leaves most of them there.
+FOLLOW = Follow(smoothing=0.02, tube=0.05, stiffness=(200.0, 2000.0), iterations=40)
+TURN = 0.5  # share of a control's range by which a vehicle is turned on the spot over the first tenth of the horizon
+STILL = 1e-9  # share of the distance to the goal by which it may move then
+DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all others
+LATEST_FIRST = 0.55  # share of the horizon: the slowest that the first pace is
+ROADMAP = Roadmap()
+PACES = 4  # at which each path is tracked
+TOP = 8  # candidates of a problem that are solved, those of least cost as tracked: the lanes of a vector in C
+# From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
+SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
+BOTH = Refine(top=2)  # marks candidates as solved in the record
+
+
+@dataclass(frozen=True)
+class Tube(Row):
+    """Tracks paths closely at several paces, solves the cheapest by the interior point, and keeps the best.
+
+    Among the paths is one that keeps clear of a map's obstacles, with its corners averaged. A vehicle that can turn on
+    the spot follows each from rest and after either turn: else it reverses along much of a way behind it. The first
+    pace is that of the trajectory without obstacles, the last takes the whole horizon; the others lie evenly between.
+    Candidates count where they end feasible and at the goal.
+
+    Args:
+        among: "maps": in problems with a map among their obstacles; "bodies": in those without.
+        num_paths: of the roadmap, before those of one homotopy class are merged.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    among: Literal["maps", "bodies"] = "bodies"
+    num_paths: Count = 6
+
+    seeks_paths: ClassVar[bool] = True
+    last: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_options(self, "tube")
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        return (self.among,)
+
+    @property
+    def problems(self) -> str:
+        return f"{'in maps' if self.among == 'maps' else 'among spheres and boxes'}: caught, not arrived"
+
+    @property
+    def does(self) -> str:
+        return (
+            f"{self.num_paths} paths and one that keeps clear: {FOLLOW}, {PACES} paces; not relaxed; interior point "
+            f"from the {TOP} cheapest"
+        )
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        rows = search.rows("unarrived")
+        if rows.numel() == 0 or not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
+            return
+        each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
+        for some in rows.split(max(1, AT_ONCE // each)):
+            if search.call.late:
+                return
+            self._some(search, some)
+
+    def _some(self, search: Search, rows: Tensor) -> None:
+        """As `run`, for the problems in `rows`."""
+        problem = search.call.problem.take(rows)
+        rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+        part = Part(problem.in_cost_units(), rest, search.call.rows[rows], search.record)
+        if part.scene is None:
+            return
+        search.best.worked[rows] = True
+        every = torch.arange(problem.B, device=rows.device)
+        paths = part.seek(every, (ROADMAP,), self.num_paths).joined(*ROADMAP.clear_path(part.scene))
+        starts, usable = _starts(problem, rest)
+        live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(PACES, dim=1)
+        starts = starts.repeat_interleave(PACES, dim=1).repeat(1, paths.corners.shape[1], 1, 1)
+        candidates = Candidates.begin(part.problem, starts, paths.R, paths.unit, live)
+        tracked = FOLLOW.along(candidates, paths, self._arrivals(paths, part.free(FOLLOW.iterations)), PACES)
+        chosen = tracked.pick(self._order(tracked)[:, :TOP])
+        search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
+        solved = self._solved(search, rows, chosen)
+        if search.record is not None:
+            found = solved.cost[solved.best].isfinite()
+            part.note(every, paths, BOTH, tracked, chosen, chosen.live, solved, found)
+
+    def _order(self, tracked: Candidates) -> Tensor:
+        """Places (B, count) of each problem's candidates: live ones that aren't deep in an obstacle first, then cheap.
+
+        What a candidate costs as tracked says more of what it will cost than its depth does, which will be mended.
+        """
+        merit = torch.full_like(tracked.unit, torch.inf)
+        for rows in tracked.parts():
+            merit[rows] = tracked.of(rows).cost.total(tracked.X[rows], tracked.U[rows])
+        order = merit.nan_to_num(torch.inf).view(-1, tracked.count).argsort(dim=-1, stable=True)
+        deep, dead = tracked.penetration() > DEEP * tracked.R, ~tracked.live
+        last = torch.where(dead, 2, deep.to(torch.int8)).view(-1, tracked.count)
+        return order.gather(1, last.gather(1, order).argsort(dim=-1, stable=True))
+
+    def _arrivals(self, paths: Paths, free: Free) -> Tensor:
+        """Shares (B * K * paces,) of the horizon at which each candidate arrives."""
+        own = (free.share * free.slower).unsqueeze(-1) * paths.stretch()
+        first = own.nan_to_num(torch.inf).clamp(min=2.0 * torch.finfo(own.dtype).eps, max=LATEST_FIRST)
+        later = torch.linspace(0.0, 1.0, PACES, dtype=first.dtype, device=first.device)
+        return (first.unsqueeze(-1) + (1.0 - first.unsqueeze(-1)) * later).flatten()
+
+    def _solved(self, search: Search, rows: Tensor, tracked: Candidates) -> Refined:
+        """Every tracked candidate solved; the best of each problem in `rows` is kept."""
+        problem, limit = tracked.problem, search.solver.violation_tolerance
+        finite = [torch.isfinite(part).flatten(1).all(-1) for part in (tracked.X, tracked.U)]
+        some = (tracked.live & finite[0] & finite[1]).nonzero().flatten()
+        cost, made = torch.full_like(tracked.unit, torch.inf), tracked.iterations
+        multipliers = Multipliers(tuple(tracked.U.new_zeros(0, *s) for s in problem.row_shapes), tracked.unit)
+        if some.numel() == 0:
+            return Refined(tracked, multipliers, some.new_zeros(problem.B), cost)
+        call = replace(search.call.take(rows[some // tracked.count]), U0=tracked.U[some], warm=None, callback=None)
+        end = solved_nearby(SOLVER, call, tracked.X[some])
+        good = (end.best.violation <= limit) & has_arrived(call.problem, end.best.X)
+        cost[some] = torch.where(good, end.best.cost, torch.inf)
+        made = made.index_add(0, some // tracked.count, end.iterations)
+        clear, fits = torch.full_like(cost, torch.inf), good.nonzero().flatten()
+        if fits.numel() > 0:  # others may end anywhere
+            misses = chord_clearance(call.problem.take(fits), end.best.X[fits]) >= 0
+            clear[some[fits]] = torch.where(misses, end.best.cost[fits], torch.inf)
+        for merit in (clear, cost):  # the cheapest that is clear between knots, too, is remembered by `Best.keep`
+            self._keep(search, rows, tracked.count, some, end, merit, made)
+            made = torch.zeros_like(made)
+        best = cost.view(-1, tracked.count).argmin(1) + torch.arange(problem.B, device=rows.device) * tracked.count
+        X, U = tracked.X.clone(), tracked.U.clone()
+        X[some], U[some] = end.best.X, end.best.U
+        return Refined(replace(tracked, X=X, U=U), multipliers, best, cost)
+
+    def _keep(
+        self, search: Search, rows: Tensor, count: int, some: Tensor, end: SolveEnd, merit: Tensor, made: Tensor
+    ) -> None:
+        """Keep the solved candidate of least merit (B * count,) of each problem in `rows`; `made` (B,) iterations."""
+        least, at = merit.view(-1, count).min(1)
+        place = torch.full_like(merit, -1, dtype=torch.int64)
+        place[some] = torch.arange(some.numel(), device=some.device)
+        chosen = place.view(-1, count).gather(1, at.unsqueeze(1))[:, 0]
+        found = torch.isfinite(least).nonzero().flatten()
+        one = take(end, chosen[found])
+        one.status[:] = int(Status.MAX_ITERATIONS)  # the last row brings it to its own tolerance
+        one.iterations[:] = made[found]
+        search.best.keep(rows[found], one)
+        lost = (~torch.isfinite(least)).nonzero().flatten()
+        search.best.end.iterations[rows[lost]] += made[lost]
+
+
+def _starts(problem: Problem, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Controls (B, S, N, m) to begin with: rest, and turns on the spot; and which (B, S) of these each problem has.
+
+    A turn is an offset of one control that changes the state, but moves the vehicle nowhere.
+    """
+    assert problem.goal is not None
+    m, at = problem.m, problem.position
+    axes = [tuple(TURN * sign if i == j else 0.0 for j in range(m)) for i in range(m) for sign in (1.0, -1.0)]
+    starts = replace(FOLLOW, initial_offsets=tuple(axes)).starts(problem, rest)
+    each = torch.arange(problem.B, device=rest.device).repeat_interleave(starts.shape[1])
+    X = open_loop(problem.take(each), starts.flatten(0, 1)).unflatten(0, starts.shape[:2])
+    away, size = (X - X[:, :1]).abs(), problem.goal.distance(problem.x0[:, at])
+    stays = away[..., at].amax((-1, -2)) <= STILL * size.unsqueeze(-1)
+    usable = stays & (away.amax((-1, -2)) > 0.0)
+    usable[:, 0] = True
+    some = usable.any(0).nonzero().flatten()
+    return starts[:, some], usable[:, some]
