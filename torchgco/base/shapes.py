@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 from torch._C._dynamo.eval_frame import get_eval_frame_callback  # type: ignore[import]
 from torch._C._functorch import peek_interpreter_stack  # type: ignore[import]
-from torch.autograd import forward_ad
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.gradients import is_recording
@@ -87,14 +86,12 @@ def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
 
 
 def check_untransformed(what: str) -> None:
-    """Raise InputError inside torch.compile, forward mode, and transforms of torch.func such as vmap and grad.
+    """Raise InputError inside torch.compile, and inside transforms of torch.func such as vmap and grad.
 
     Kernels in C read memory, which tensors there don't have; and a batch is solved at once anyway.
     """
     if peek_interpreter_stack() is not None:
         raise InputError(what, "a call outside of torch.func.vmap and grad: it takes a batch itself", "one inside")
-    if forward_ad._current_level >= 0:
-        raise InputError(what, "a call outside of forward_ad.dual_level: gradients are reverse", "one inside")
     if get_eval_frame_callback():
         raise InputError(what, "a call outside of torch.compile: it makes kernels of its own", "one inside")
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.errors import InputError
@@ -35,6 +36,8 @@ def asks_for_gradients(problem: Problem) -> bool:
     Raises:
         InputError: they can't be served.
     """
+    if forward_ad._current_level >= 0:
+        raise InputError("solve", "a call outside of forward_ad.dual_level: derivatives are reverse", "one inside")
     if not torch.is_grad_enabled() or torch.is_inference_mode_enabled() or problem.B == 0:
         return False
     if problem.given is None and not _captures(problem):
