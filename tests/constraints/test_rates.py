@@ -205,6 +205,10 @@ class Sharp(Smooth):
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         return 2.0 * super().total(X, U)
 
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        super().expand(X, U, H)
+        H.mul_(2.0)
+
 
 def test_a_cost_keeps_its_own_sum() -> None:
     base = user_problem(5, 12)

@@ -68,7 +68,7 @@ def both(monkeypatch: pytest.MonkeyPatch, solve: Callable[[], SolveEnd]) -> tupl
         self.measures = False
 
     monkeypatch.setattr(Engine, "__init__", without)
-    monkeypatch.setattr("torchgco.kernels._engines", {})
+    monkeypatch.setattr("torchgco.kernels.choice._engines", {})
     return native, solve()
 
 

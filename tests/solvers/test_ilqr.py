@@ -11,8 +11,8 @@ import torch
 from tests.problems import planar_batch
 from tests.solvers.problems import linear_problem, zeros
 from torchgco import ILQR, AugmentedLagrangian, Cost, FunctionConstraint, LineSearch, Problem, Solution, Status
+from torchgco.ilqr import descent, line_search
 from torchgco.ilqr.riccati import backward
-from torchgco.solvers import ilqr, line_search
 
 
 def test_lqr_is_solved_in_one_step() -> None:
@@ -100,7 +100,7 @@ def test_statuses(monkeypatch) -> None:
     assert cut.solve(walled, zeros(walled)).statuses == [Status.MAX_ITERATIONS] * 2
     patient = replace(cut, max_outer_iterations=100, patience=4)
     assert patient.solve(walled, zeros(walled)).statuses == [Status.INFEASIBLE] * 2
-    monkeypatch.setattr(ilqr, "REGULARISATION_MAX", 1e-4)
+    monkeypatch.setattr(descent, "REGULARISATION_MAX", 1e-4)
     hopeless = ILQR().solve(saddle(1.0), zeros(saddle(1.0)))
     assert hopeless.statuses == [Status.NOT_POSITIVE_DEFINITE] * 2
     assert all(status.sentence for status in Status)

@@ -292,7 +292,7 @@ class Compiled:
         """The problem with its numbers as they are, and nothing that was computed from others."""
         problem = self._problem
         constraints = tuple(_renewed(part) for part in problem.constraints)
-        known = replace(problem.known, row_shapes=None, packed=(None, None))
+        known = replace(problem.known, row_shapes=None, interior=None, packed=(None, None))
         now = problem._with({"constraints": constraints}, known)
         if now.goal is None or now.goal.assumed:
             dims = now._dimensions(now.x0)

@@ -30,9 +30,6 @@ class TorchKernels:
     name = "pytorch"
     compiled = False
 
-    def __init__(self) -> None:
-        self._interior: EagerInterior | None = None
-
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         return rollout.open_loop(problem.dynamics, problem.x0, U)
 
@@ -63,9 +60,10 @@ class TorchKernels:
         return None
 
     def interior(self, problem: Problem) -> InteriorKernels:
-        if self._interior is None:
-            self._interior = EagerInterior.of(problem)
-        return self._interior
+        known = problem.known
+        if known.interior is None:
+            known.interior = EagerInterior.of(problem)
+        return known.interior
 
     def sample(self, problem: Problem, U: Tensor, how: sampling.Sampling) -> Tensor:
         return sampling.sample(problem, U, how)

@@ -105,7 +105,7 @@ def without_obstacles(problem: Problem) -> Problem | None:
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
     kernels_of(problem)  # which both then share: two forms would trace the problem twice
-    other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None))
+    other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None, interior=None))
     return other
 
 
