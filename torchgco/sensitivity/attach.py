@@ -62,7 +62,7 @@ def _captures(problem: Problem) -> bool:
         (one.cost, lambda: one.cost.total(X, U)),
         *((part, lambda part=part: part.value(X, U)) for part in one.constraints),
     ]
-    with recording():
+    with computing_on(one.x0.device), recording():  # a user's function may make tensors, too
         return any(is_users(part) and value().requires_grad for part, value in uses)
 
 
