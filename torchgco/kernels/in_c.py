@@ -47,7 +47,6 @@ class NativeKernels:
 
     def __init__(self, engine: Engine, warn: Callable[[Exception], None]) -> None:
         self.engine, self._warn = engine, warn
-        self._other = TorchKernels()  # for what C can't serve
         self._samplers: dict[Hashable, Sampler] = {}
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
@@ -114,7 +113,7 @@ class NativeKernels:
             return InteriorEngine(self.engine)
         except InputError as error:  # second derivatives whose code would be too long
             self._warn(error)
-            return self._other.interior(problem)
+            return TorchKernels().interior(problem)
 
     def sample(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
         if how.dtype not in self._samplers:  # compiled at the first call: most solves never sample

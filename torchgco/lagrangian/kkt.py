@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-STIFF = (
-    1e8  # sigma, as a multiple of the largest curvature: the root of rounding, which balances what each round leaves
-)
+# sigma, as a multiple of the largest curvature: the root of rounding, which balances what each round leaves
+STIFF = 1e8
 ROUNDS = 4
 PIVOT = 1e-14  # least pivot of the factors, as a share of its entry: where one is less, the minimum isn't strict
 

@@ -83,10 +83,9 @@ class Tube(Row):
 
     @property
     def does(self) -> str:
-        return (
-            f"{self.num_paths} paths and one that keeps clear: {FOLLOW}, {PACES} paces; not relaxed; interior point "
-            f"from the {TOP} cheapest"
-        )
+        more = " and one that keeps clear" if self.among == "maps" else ""
+        tracked = f"{self.num_paths} paths{more}: {FOLLOW}, {PACES} paces"
+        return f"{tracked}; not relaxed; interior point from the {TOP} cheapest"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
