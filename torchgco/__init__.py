@@ -68,6 +68,7 @@ from torchgco.obstacles import Boxes as Boxes
 from torchgco.obstacles import Capsules as Capsules
 from torchgco.obstacles import OscillatingBoxes as OscillatingBoxes
 from torchgco.obstacles import Spheres as Spheres
+from torchgco.problem.free_time import FreeTime as FreeTime
 from torchgco.problem.goal import Goal as Goal
 from torchgco.problem.problem import Problem as Problem
 from torchgco.roadmap import Roadmap as Roadmap

@@ -62,6 +62,9 @@ class Solution:
     trace: pd.DataFrame | None = None  # a row per problem and iteration, where the solver records
     search: SearchRecord | None = None  # paths, candidates and passes, where a solver with passes records
     horizon: Tensor | None = None  # (B,) int64: stages of each problem, after which its state is held; None: N
+    times: Tensor | None = None  # (B, N+1): times of the knots, s, where the time is free; None: see `t`
+    # (B,), s: where the time is free and its longest doesn't do, a duration that does, NaN where none was found
+    needed: Tensor | None = None
     reason: Tensor | None = None  # (B,) int64, see Differentiability; None: not asked for
     account: Account | None = None  # the problem and the solver, for `t` and `explain`; of a loaded one the times alone
 
@@ -75,13 +78,22 @@ class Solution:
 
     @property
     def t(self) -> Tensor:
-        """Times of the knots, s: (N+1,), or (B, N+1) where horizons or stages differ; see `problem.times`.
+        """Times of the knots, s: (N+1,), or (B, N+1) where horizons or stages differ, or the time is free.
 
         Raises:
             InputError: the model has no time step, or this solution doesn't know its problem: a user's own, or a file's
                 without times.
         """
-        return (self.account or Account()).times()
+        return (self.account or Account()).times() if self.times is None else self.times
+
+    @property
+    def duration(self) -> Tensor:
+        """How long each trajectory lasts, (B,), s.
+
+        Raises:
+            InputError: as `t`.
+        """
+        return self.t[..., -1].expand(len(self))
 
     def explain(self, b: int = 0, problem: Problem | None = None) -> Explanation:
         """What happened to problem b, in words: the result, where it was caught, the passes, why it ended, what to try.

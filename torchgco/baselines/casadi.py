@@ -25,6 +25,7 @@ from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Callback, Progress, Solver
+from torchgco.solvers.timing import Chooser
 
 if TYPE_CHECKING:
     from torchgco.baselines.nlp import Program
@@ -91,6 +92,10 @@ class CasADiSolver(Solver):
     def take_states(self, problem: Problem) -> bool:
         """Always."""
         return True
+
+    def choosing_time(self, problem: Problem) -> Chooser:
+        """This solver."""
+        return Chooser(self, self, self.violation_tolerance)
 
     def _options(self, problem: Problem, program: Program) -> dict[str, Any]:
         """Options of the plugin and of CasADi around it; neither prints."""

@@ -47,9 +47,25 @@ class Dynamics(PerElement):
         """Whether `step` integrates `field`."""
         return type(self).step is Dynamics.step
 
+    @property
+    def stretches(self) -> bool:
+        """Whether a stage may be longer or shorter than dt, as in a problem with free time: `field` is all there is.
+
+        A class with a `step` of its own that integrates `field` and then calls `settled` says so, too.
+        """
+        return self.is_integrated
+
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         """Time derivative of x, (..., n)."""
         raise NotImplementedError(f"{type(self).__name__} defines neither `step` nor `field`")
+
+    def settled(self, x: Tensor) -> Tensor:
+        """States (..., n) as they must be wherever `field` is asked in a problem with free time, by default x itself.
+
+        A model with a quaternion divides it by its norm here: a longer stage lets the norm grow, and with it whatever
+        is proportional to its square, such as thrust.
+        """
+        return x
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """The state one time step later, (..., n)."""

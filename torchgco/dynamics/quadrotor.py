@@ -135,9 +135,9 @@ class QuadrotorPlanning(Dynamics):
 
         p' = v,  v' = a R(q) e3 - g e3,  q' = 1/2 Qx(w) q,  w' = (w_c - w)/T_w,  a' = (a_c - a)/T_a
 
-    q isn't renormalised, as in the paper's planner. The time constants may be tensors (B,). Of the airframe the model
-    takes g alone, and its mass and limits of thrust for `control_limits`; a mission takes all of it, for the vehicle
-    that follows the plans.
+    q isn't renormalised, as in the paper's planner, but where the time is free. The time constants may be tensors (B,).
+    Of the airframe the model takes g alone, and its mass and limits of thrust for `control_limits`; a mission takes all
+    of it, for the vehicle that follows the plans.
 
     Raises:
         InputError: a field out of its range or of another kind.
@@ -170,6 +170,9 @@ class QuadrotorPlanning(Dynamics):
         turning = ((w_c - w_i) / T_w for w_c, w_i in zip(controls[:3], w, strict=True))
         return vectors(*pose_rates(v, q, w, a, self.airframe.gravity), *turning, (controls[3] - a) / T_a)
 
+    def settled(self, x: Tensor) -> Tensor:
+        return with_unit_quaternion(x)
+
 
 @dataclass(frozen=True)
 class QuadrotorPlant(Dynamics):
@@ -200,8 +203,13 @@ class QuadrotorPlant(Dynamics):
         rates = self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)
         return torch.cat((vectors(*pose), *rates), dim=-1)
 
+    stretches: ClassVar[bool] = True  # type: ignore[misc]
+
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         return within_limits(super().step(x, u), self.airframe)
+
+    def settled(self, x: Tensor) -> Tensor:
+        return within_limits(x, self.airframe)
 
 
 def within_limits(x: Tensor, airframe: Airframe) -> Tensor:
@@ -210,6 +218,12 @@ def within_limits(x: Tensor, airframe: Airframe) -> Tensor:
     q = q / q.square().sum(-1, keepdim=True).sqrt()
     F = x[..., 13:].clamp(airframe.thrust_min, airframe.thrust_max)
     return torch.cat((x[..., :6], q, x[..., 10:13], F), dim=-1)
+
+
+def with_unit_quaternion(x: Tensor) -> Tensor:
+    """States (..., n) whose components 6 to 9 are a quaternion, with that divided by its norm."""
+    q = x[..., 6:10]
+    return torch.cat((x[..., :6], q / q.square().sum(-1, keepdim=True).sqrt(), x[..., 10:]), dim=-1)
 
 
 @dataclass(frozen=True)

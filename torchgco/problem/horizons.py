@@ -25,6 +25,7 @@ from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.in_time import in_time
 from torchgco.problem.problem import Problem
 from torchgco.problem.rates import with_controls_before
 
@@ -33,11 +34,13 @@ OUT_OF_THE_WAY = -1.0  # of inequalities that don't count, as of absent obstacle
 
 
 def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
-    """The problem in the form that solvers work on; itself where it has neither horizons nor bounded rates.
+    """The problem in the form that solvers work on; itself without horizons, bounded rates and a free time.
 
     Args:
         joins_knots: rows of two knots stay as they are.
     """
+    if problem.time is not None:
+        return in_time(problem)
     held = within_horizons(problem)
     return held if joins_knots else with_controls_before(held)
 

@@ -10,24 +10,24 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError, theirs
-from torchgco.base.mixing import foreign, why
-from torchgco.base.options import Count, Seconds, check_value
-from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
+from torchgco.base.errors import InputError, shown
+from torchgco.base.options import Count, check_value
+from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.integrators import Integrator
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
+from torchgco.problem.free_time import FreeTime, check_served
 from torchgco.problem.given import Given
 from torchgco.problem.goal import Goal
 from torchgco.problem.known import Known
+from torchgco.problem.model import check_model
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
 from torchgco.problem.summary import summary
 
@@ -51,6 +51,7 @@ class Problem:
             is moved inside `StateBounds` that hold at knot 0. Other constraints hold at that knot where their `knots`
             say so, obstacles wherever a position is free. The interior point, and so `gco`, finds the start, which
             then is X[:, 0] of the solution; other solvers hold the guess. None: x0 is given.
+        time: a FreeTime, where the duration is chosen, too; None: N stages of dt.
 
     Raises:
         InputError: names the part at fault, what was expected and what was given. A start that is bad in one problem
@@ -65,6 +66,7 @@ class Problem:
     goal: Goal | None = None
     horizon: Any = None
     free_start: Any = None
+    time: FreeTime | None = None
 
     known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
     # What it was given, where tensors of that ask for gradients; the fields hold numbers alone.
@@ -85,7 +87,7 @@ class Problem:
         """Bind the parts; the arguments are those that were given, by which checks of code know them again."""
         dims = self._dimensions(self.x0)
         object.__setattr__(self, "dynamics", bound(self.dynamics, dims, "dynamics", Dynamics))
-        self._check_dynamics()
+        check_model(self.dynamics, self.x0)
         object.__setattr__(self, "cost", bound(self.cost, dims, "cost", Cost))
         object.__setattr__(self, "constraints", _all_bound(self.constraints, dims))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
@@ -98,6 +100,9 @@ class Problem:
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "known", Known())
+        if self.time is not None:
+            object.__setattr__(self, "time", self.time.bind(dims))
+            check_served(self)
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
@@ -248,6 +253,7 @@ class Problem:
             "goal": None if self.goal is None else self.goal.take(index),
             "horizon": None if self.horizon is None else self.horizon[index],
             "free_start": None if self.free_start is None else self.free_start[index],
+            "time": None if self.time is None else self.time.take(index),
         }
         part = self._with(parts, known=self.known)
         if self.given is not None:
@@ -343,8 +349,8 @@ class Problem:
 
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
-        parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0", "goal")}
-        return self._with(parts)
+        names = "dynamics", "cost", "constraints", "x0", "goal", "time"
+        return self._with({name: cast(getattr(self, name), dtype) for name in names})
 
     def _with(self, parts: dict[str, object], known: Known | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
@@ -383,35 +389,9 @@ class Problem:
             raise InputError("cost.goal", "a method, which no field may hide", type(self.cost.goal).__name__)
         if self.goal is not None and not isinstance(self.goal, Goal):
             raise InputError("goal", "a Goal, or None", type(self.goal).__name__)
+        if self.time is not None and not isinstance(self.time, FreeTime):
+            raise InputError("time", "a FreeTime, or None", shown(self.time))
         _check_constraints(self.constraints)
-
-    def _check_dynamics(self) -> None:
-        check_value(getattr(self.dynamics, "dt", None), Seconds | None, "dynamics.dt")
-        if type(self.dynamics).step is Dynamics.step:
-            check_value(self.dynamics.integrator, Integrator, "dynamics.integrator")
-        where = self.dynamics.position
-        if where is not None and where not in [slice(i, j) for j in range(1, self.n + 1) for i in range(j)]:
-            raise InputError("dynamics.position", f"a slice of states within 0..{self.n}, or None", repr(where))
-        for name in self.dynamics.per_element:
-            value = getattr(self.dynamics, name)
-            if not isinstance(value, Tensor):
-                check_value(value, float, f"dynamics.{name}")
-            elif value.dim() > 0:
-                if tuple(value.shape) not in ((self.B,), (1,)):
-                    raise InputError(f"dynamics.{name}", f"a number or a tensor ({self.B},)", tuple(value.shape))
-                if value.dtype != self.x0.dtype or value.device != self.x0.device:
-                    wanted = f"{self.x0.dtype} on {self.x0.device} as x0"
-                    raise InputError(f"dynamics.{name}", wanted, f"{value.dtype} on {value.device}")
-                check_tensor(value, f"dynamics.{name}")
-        step, start = self.dynamics.at(0).step, (self.x0, self.x0.new_zeros(self.B, self.m))
-        expected = f"a step for {self.x0.dtype} states {tuple(self.x0.shape)}, as x0"
-        try:
-            after = step(*start)
-        except MISTAKES as error:
-            raise InputError("dynamics.step", expected, why(error, step, *start)) from theirs(error)
-        if not isinstance(after, Tensor) or after.shape != self.x0.shape or after.dtype != self.x0.dtype:
-            got = foreign(self.x0.dtype, step, *start) if isinstance(after, Tensor) else None
-            raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", got or describe(after))
 
 
 def _is_whole(index: Rows, B: int) -> bool:

@@ -28,6 +28,7 @@ from torchgco.solvers.contracts import Call, Guidance, Solver
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.session import Session
+from torchgco.solvers.timing import Chooser
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,6 +94,12 @@ class Restarts(Solver):
         """Where the first solve is the interior point's: without obstacles."""
         first = any(isinstance(one, Converge) and one.among == "free" for one in self.passes.steps)
         return first and Converge.begins(problem)
+
+    def choosing_time(self, problem: Problem) -> Chooser:
+        """The interior point; among obstacles the passes where the time is held, and the interior point from there."""
+        if not problem.geometric:
+            return self.interior.choosing_time(problem)
+        return Chooser(self, self.interior, self.local.violation_tolerance, rounds=1)
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""

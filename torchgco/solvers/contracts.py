@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -25,6 +25,9 @@ from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
+
+if TYPE_CHECKING:
+    from torchgco.solvers.timing import Chooser
 
 
 @dataclass(frozen=True)
@@ -186,6 +189,8 @@ class Solver(Brief):
                 Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
                 return replace(Solution.empty(problem), account=Account(problem, self))
             whole = for_solvers(problem, self.joins_knots)
+            if problem.time is not None:
+                return self._in_time(problem, whole, U0, seed, ids, warm, callback, max_seconds, X0)
             if problem.horizon is not None:
                 problem.check_controls(U0)
                 U0 = at_rest_after(problem, U0)
@@ -199,6 +204,36 @@ class Solver(Brief):
             found = self.run(call)
             found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
             return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
+
+    def _in_time(
+        self,
+        problem: Problem,
+        whole: Problem,
+        U0: Tensor,
+        seed: int,
+        ids: Tensor | None,
+        warm: Multipliers | None,
+        callback: Callback | None,
+        max_seconds: float | None,
+        X0: Tensor | None,
+    ) -> Solution:
+        """`solve` of a problem with a free time, which is `whole` for solvers."""
+        from torchgco.solvers import timing  # it needs this module
+
+        problem.check_controls(U0)
+        if X0 is not None:
+            check_tensor(X0, "X0", problem.x0)
+            check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
+        lifted = None if warm is None else timing.lifted_multipliers(problem, whole, warm)
+        U = torch.cat((U0, U0.new_ones(*U0.shape[:2], whole.m - problem.m)), dim=-1)
+        call = Call.checked(whole, U, seed, ids, lifted, callback, max_seconds)
+        self.announce(call.problem)
+        found = timing.solve_in_time(self, problem, call, X0)
+        return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
+
+    def choosing_time(self, problem: Problem) -> Chooser | None:
+        """What solves problems with a free time, in the form `in_time`, for this solver; None: it can't."""
+        return None
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""

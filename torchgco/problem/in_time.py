@@ -1,0 +1,311 @@
+"""Problems with a free time in the form that solvers work on, and the way back.
+
+The states are [x, tau, controls of the stage before], the controls [u, next tau]: the first segment's factor tau is a
+free component of the start, the next one a control of the last stage before its segment, and everywhere else tau stays
+as it is. A control that would change the length at every stage takes several times the iterations. Only where there
+are several segments is there a next tau, and only where rates are bounded are there controls of the stage before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import Dimensions, check_shape, lead
+from torchgco.constraints.base import Constraint, WrappedConstraint
+from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.costs.base import Cost, WrappedCost
+from torchgco.dynamics.base import WrappedDynamics
+from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.free_time import FreeTime
+from torchgco.problem.problem import Problem
+from torchgco.problem.rates import IN_PLACE
+
+FORM = "in free time"  # what is kept with the form of the problem for this one
+PIN = 1e-3  # cost of a next tau that nobody reads, per unit squared, as a share of that of the nominal stages' time
+EQUAL = 1e-9  # difference of two stages of a segment, as a share, that is due to rounding
+
+
+def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
+    """The problem with its factors of time among its states and controls; itself where the time isn't free.
+
+    Constraints keep their places, rows and knots; bounds on the factors come after them.
+
+    Args:
+        guess: factors (B, S) to begin with; None: those of the problem, else the nominal times.
+    """
+    time = problem.time
+    if time is None:
+        return problem
+    guess = guess_of(problem) if guess is None else guess
+    rates = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
+    controls = None if rates is None else rates.controls
+    x0 = _start(problem, problem.x0, guess[:, :1], rates)
+    free = problem.free_start
+    free = torch.zeros_like(problem.x0, dtype=torch.bool) if free is None else free
+    parts: dict[str, object] = {
+        "dynamics": _Dynamics(problem.dynamics, controls, _switches(time, problem.N)),
+        "cost": _cost(problem, time),
+        "x0": x0,
+        "free_start": pad(pad(free, (0, 1), value=True), (0, x0.shape[1] - problem.n - 1)),
+        "time": None,
+    }
+    whole = problem._with(parts, known=problem.known.of_lifted(f"{FORM} {time.segments}"))
+    rows = tuple(_constraint(c, problem) for c in problem.constraints)
+    object.__setattr__(whole, "constraints", (*rows, *_bounds(whole, time, problem.n)))
+    return whole
+
+
+def guess_of(problem: Problem) -> Tensor:
+    """The factors (B, S) to begin with: those that were given, else the nominal times, within the bounds."""
+    time = problem.time
+    assert time is not None
+    return time.guess if time.guess is not None else torch.clamp(torch.ones_like(time.least), time.least, time.most)
+
+
+def states_in_time(problem: Problem, X: Tensor, U: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
+    """X (B, N+1, n), U (B, N, m) with the factors (B, S), as states and controls of the problem `in_time`."""
+    time, N = problem.time, problem.N
+    assert time is not None
+    along = factors[:, time.of_stages(N)]
+    parts = [X, torch.cat((along, along[:, -1:]), dim=1).unsqueeze(-1)]
+    rates = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
+    if rates is not None:
+        first = _start(problem, X[:, 0], factors[:, :1], rates)[:, problem.n + 1 :]
+        parts.append(torch.cat((first.unsqueeze(1), U[..., rates.controls]), dim=1))
+    if time.count == 1:
+        return torch.cat(parts, dim=-1), U
+    later = torch.cat((along[:, 1:], torch.ones_like(along[:, :1])), dim=1)
+    idle = _switches(time, N) == 0
+    return torch.cat(parts, dim=-1), torch.cat((U, torch.where(idle, 1.0, later).unsqueeze(-1)), dim=-1)
+
+
+def factors_in(problem: Problem, X: Tensor) -> Tensor:
+    """The factors (B, S) in states X (B, N+1, n') of the problem `in_time`, for the user's problem."""
+    assert problem.time is not None
+    return X[:, list(problem.time.segments), problem.n]
+
+
+def times_of(problem: Problem, factors: Tensor) -> Tensor:
+    """The times (B, N+1) of the knots, s."""
+    assert problem.time is not None
+    lengths = problem.dynamics.dt * factors[:, problem.time.of_stages(problem.N)]
+    return torch.cat((torch.zeros_like(lengths[:, :1]), lengths.cumsum(-1)), dim=-1)
+
+
+def factors_of(problem: Problem, times: Any) -> Tensor:
+    """The factors (B, S) of the times (B, N+1) of the knots, s.
+
+    Raises:
+        InputError: another shape, a first time other than 0, stages of a segment that differ.
+    """
+    time, N = problem.time, problem.N
+    assert time is not None
+    if not isinstance(times, Tensor):
+        expected = "the times of the knots, such as solution.t, as the problem's time is free"
+        raise InputError("times", expected, type(times).__name__)
+    check_shape(times, (problem.B, N + 1), "times")
+    times = times.to(problem.x0)
+    lengths, segments = times.diff(dim=1) / problem.dynamics.dt, list(time.segments)
+    sizes = torch.tensor([b - a for a, b in zip(segments, [*segments[1:], N], strict=True)], device=lengths.device)
+    factors = lengths.new_zeros(lengths.shape[0], len(segments))
+    factors = factors.index_add(1, time.of_stages(N), lengths) / sizes
+    wrong = (lengths - factors[:, time.of_stages(N)]).abs() > EQUAL * times[:, -1:].abs() / problem.dynamics.dt
+    if bool(wrong.any()) or bool((times[:, 0] != 0).any()):
+        raise InputError("times", "knots from 0 s on, at equal distances within each segment", "others")
+    return factors
+
+
+def _start(problem: Problem, x0: Tensor, factor: Tensor, rates: RateBounds | None) -> Tensor:
+    """Starts x0 (B, n) with the factor (B, 1) of the first segment and the controls before."""
+    parts = [x0, factor]
+    if rates is not None:
+        before = x0.new_zeros(1, problem.m) if rates.previous is None else rates.previous
+        parts.append(before[:, rates.controls].expand(len(x0), -1))
+    return torch.cat(parts, dim=-1)
+
+
+def _switches(time: FreeTime, N: int) -> Tensor | None:
+    """1 at the stages (N,) after which a new segment begins, else 0; None where there is one segment."""
+    if time.count == 1:
+        return None
+    switches = time.least.new_zeros(N)
+    switches[[first - 1 for first in time.segments[1:]]] = 1.0
+    return switches
+
+
+@dataclass(frozen=True)
+class _Dynamics(WrappedDynamics):
+    """A model whose stages last tau dt, with tau among its states."""
+
+    controls: Tensor | None  # (r,) int64: which controls of the stage before are states, too
+    switches: Tensor | None  # (N,): 1 at stages whose last control is the next tau
+    k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at` where there are switches
+
+    batched: ClassVar[tuple[str, ...]] = ("model",)
+
+    n = property(lambda self: self.model.n + 1 + (0 if self.controls is None else len(self.controls)))  # type: ignore[assignment]
+    m = property(lambda self: self.model.m + (self.switches is not None))  # type: ignore[assignment]
+    integrator = property(lambda self: self.model.integrator)  # type: ignore[assignment]
+
+    def at(self, k: int | Tensor) -> Self:
+        return self if self.switches is None else replace(self, k=k)
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        """The derivative by the time that runs evenly from knot to knot, dt a stage."""
+        n, model = self.model.n, self.model
+        rates = x[..., n : n + 1] * model.field(model.settled(x[..., :n]), u[..., : model.m])
+        return torch.cat((rates, torch.zeros_like(x[..., n:])), dim=-1)
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        n, m, model = self.model.n, self.model.m, self.model
+        tau, v = x[..., n : n + 1], u[..., :m]
+        rates = lambda z: tau * model.field(model.settled(z), v)
+        ahead = model.settled(INTEGRATORS[model.integrator](rates, x[..., :n], model.dt))
+        parts = [ahead, tau if self.switches is None else self._next(tau, u[..., m : m + 1])]
+        return torch.cat(parts if self.controls is None else [*parts, v[..., self.controls]], dim=-1)
+
+    def _next(self, tau: Tensor, chosen: Tensor) -> Tensor:
+        if self.k is None:
+            raise InputError("dynamics", "a stage, as in `dynamics.at(k).step(x, u)`", "none")
+        switches = _of_stages(self.switches, self.k, tau[..., 0]).unsqueeze(-1)
+        return switches * chosen + (1.0 - switches) * tau
+
+
+def _of_stages(values: Any, k: int | Tensor, like: Tensor) -> Tensor:
+    """Values (N,) of stage k or stages k (K,), shaped to fit `like` (B,), (B, S) or (B, K)."""
+    found = values[k]
+    return found.expand(like.shape)
+
+
+def _cost(problem: Problem, time: FreeTime) -> Cost:
+    dt = problem.dynamics.dt
+    seconds = time.weight * dt
+    pin = PIN * torch.where(seconds > 0, seconds, dt)
+    idle = None if time.count == 1 else 1.0 - _switches(time, problem.N)  # type: ignore[operator]
+    return _Cost(problem.cost, problem.n, problem.m, seconds, pin, idle)
+
+
+@dataclass(frozen=True)
+class _Cost(WrappedCost):
+    """A cost per time, and of the time itself."""
+
+    n: int
+    m: int
+    seconds: Tensor  # (B,): cost of a stage of tau = 1
+    pin: Tensor  # (B,): cost of a next tau that nobody reads, which makes the minimum strict
+    idle: Tensor | None  # (N,): 1 at the stages of such ones
+
+    batched: ClassVar[tuple[str, ...]] = ("cost", "seconds", "pin")
+
+    def rest_controls(self, like: Tensor) -> Tensor:
+        rest = self.cost.rest_controls(like[..., : self.m])
+        return rest if self.idle is None else torch.cat((rest, torch.ones_like(rest[..., :1])), dim=-1)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        tau = x[..., self.n]
+        value = tau * self.cost.stage(x[..., : self.n], u[..., : self.m], k) + lead(self.seconds, tau) * tau
+        if self.idle is None:
+            return value
+        return value + lead(self.pin, tau) * _of_stages(self.idle, k, tau) * (u[..., self.m] - 1.0).square()
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self.cost.terminal(x[..., : self.n])
+
+    def goal(self, x0: Tensor) -> None:
+        """The problem has its goal already."""
+
+
+def _bounds(whole: Problem, time: FreeTime, n: int) -> list[Constraint]:
+    """Bounds on the factors: of the first in the start, of the others where they are chosen."""
+    model, x0 = whole.dynamics, whole.x0
+    dims = Dimensions(len(x0), whole.N, whole.n, whole.m, model.dt, model.position, x0, 1)
+    first = [x0.new_full((len(x0), whole.n), free) for free in (-torch.inf, torch.inf)]
+    for bound, factors in zip(first, (time.least, time.most), strict=True):
+        bound[:, n] = factors[:, 0]
+    found: list[Constraint] = [StateBounds(*first, knots=[0]).bind(dims)]
+    if time.count > 1:
+        later = [x0.new_full((len(x0), time.count - 1, whole.m), free) for free in (-torch.inf, torch.inf)]
+        for bound, factors in zip(later, (time.least, time.most), strict=True):
+            bound[..., -1] = factors[:, 1:]
+        found.append(ControlBounds(*later, knots=[k - 1 for k in time.segments[1:]]).bind(dims))
+    return found
+
+
+def _constraint(constraint: Constraint, problem: Problem) -> Constraint:
+    n, m = problem.n, problem.m
+    if isinstance(constraint, RateBounds):
+        return _Rates(constraint.with_states_from(n + 1), n, m)
+    if isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE:
+        return constraint
+    return _Rows(constraint, n, m)
+
+
+@dataclass(frozen=True)
+class _Rows(WrappedConstraint):
+    """A constraint on the first n states and m controls."""
+
+    n: int
+    m: int
+
+    batched: ClassVar[tuple[str, ...]] = ("constraint",)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.value(X[..., : self.n], U[..., : self.m])
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.violation(X[..., : self.n], U[..., : self.m])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self.constraint.at(x[..., : self.n], k)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n, m, s = self.n, self.m, self.n + 1 + self.m
+        blocks = H.new_zeros(*H.shape[:2], s, s)
+        self.constraint.accumulate(X[..., :n], U[..., :m], g, h, blocks)
+        one = X.shape[-1]
+        own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
+        H[..., own.unsqueeze(-1), own] += blocks
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        return self.constraint.start_is_clear(x0[:, : self.n])
+
+
+@dataclass(frozen=True)
+class _Rates(_Rows):
+    """Bounds on changes of controls from stage to stage, which grow with the length of the stage: tau times these."""
+
+    constraint: RateBounds
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        rates, tau = self.constraint, X[:, self.constraint.knots, self.n : self.n + 1]
+        z = (U[..., : self.m] - X[:, : U.shape[1], rates.states])[:, rates.knots]
+        upper, lower = rates.limits()
+        return torch.cat((z[..., rates.above] - tau * upper, tau * lower - z[..., rates.below]), dim=-1)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.value(X, U).clamp(min=0.0)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        rates, one = self.constraint, X.shape[-1]
+        upper, lower = rates.limits()
+        every = torch.arange(self.m, device=H.device)
+        J = H.new_zeros(*torch.broadcast_shapes(upper.shape[:2], g.shape[:2]), g.shape[-1], H.shape[-1])
+        first = 0
+        for which, limit, sign in ((rates.above, upper, 1.0), (rates.below, lower, -1.0)):
+            controls = every[which]
+            rows = first + torch.arange(len(controls), device=H.device)
+            J[..., rows, one + 1 + controls], J[..., rows, rates.states[controls]] = sign, -sign
+            J[..., rows, self.n] = -sign * limit
+            first += len(controls)
+        slope = (g.unsqueeze(-2) @ J).squeeze(-2)
+        add = (h.unsqueeze(-1) * J).mT @ J
+        add[..., one, :] += slope
+        add[..., :, one] += slope
+        H[:, rates.knots] += add

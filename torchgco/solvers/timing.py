@@ -1,0 +1,253 @@
+"""Solves of problems with a free time: at a time that is held first, then with the time free.
+
+From a guess that doesn't obey the dynamics, the first step of a method may shorten the time until no trajectory is
+left, and no local method gets out of that: a vehicle that moves away from its goal is closest to being at rest there
+after the time it takes to stop. From a trajectory the same method converges in a few iterations, however long it takes.
+So a trajectory at a held time is sought first; where there is none, at twice the time, up to the longest.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import HorizonWarning, InputError
+from torchgco.base.status import Status
+from torchgco.base.tree import put, take
+from torchgco.costs.base import WrappedCost
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import is_better
+from torchgco.problem.in_time import factors_in, in_time, states_in_time, times_of
+from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Call, Solver
+from torchgco.solvers.steering import steering_factors
+from torchgco.solvers.straight import straight_line
+
+LONG = 1.5  # the first time that is held, as a multiple of an estimate
+LONGER = 2.0  # the next one, of the one before
+AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
+BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
+NAMED = 5  # problems that the warning names
+
+
+@dataclass(frozen=True)
+class Chooser:
+    """What solves problems with a free time.
+
+    Attributes:
+        held: finds a trajectory at a time that is held.
+        free: takes the time as a variable, from states to begin with.
+        limit: violation up to which a trajectory is feasible.
+        rounds: searches at the times found last, where another way may be the better one.
+    """
+
+    held: Solver
+    free: Solver
+    limit: float
+    rounds: int = 0
+
+
+class Timed:
+    """One solve of problems with a free time.
+
+    Args:
+        problem: the user's.
+        call: of the problem in free time, whose X0 and warm multipliers, where given, are guesses of the user.
+    """
+
+    def __init__(self, chooser: Chooser, problem: Problem, call: Call) -> None:
+        self.chooser, self.problem, self.call = chooser, problem, call
+        assert problem.time is not None
+        self.time, line = problem.time, straight_line(problem)
+        self.first = _first_factors(problem, line)
+        self.line = states_in_time(problem, line, call.U0[..., : problem.m], self.first)[0]
+        self.best: Solution | None = None
+
+    def run(self) -> Solution:
+        """Solve at longer and longer times; see the module."""
+        rows, time = torch.arange(self.problem.B, device=self.problem.x0.device), self.time
+        guess, again = self.first, torch.zeros_like(rows)
+        given = self.call.X0 is not None
+        while rows.numel() > 0:
+            self._tried(rows, guess[rows], given)
+            best = self._found
+            over = (best.status == Status.CONVERGED) | (best.status == Status.INVALID_START)
+            factors = factors_in(self.problem, best.X)
+            short = over & (factors <= AT_LEAST * time.least).all(-1) & (again == 0)  # once more, to be sure
+            again += short
+            left = (~over | short) & (guess < time.most).any(-1)
+            rows = rows[left[rows]]
+            guess, given = torch.minimum(LONGER * guess, time.most), False
+            if self.call.late:
+                break
+        self._freed_where_none_is()
+        for _ in range(self.chooser.rounds):
+            self._again()
+        return self._found
+
+    @property
+    def _found(self) -> Solution:
+        assert self.best is not None
+        return self.best
+
+    def _tried(self, rows: Tensor, guess: Tensor, given: bool) -> None:
+        """Solve problems with the time held at `guess` (b, S), then free; `given`: from the user's states."""
+        call = self._at(rows, guess, given)
+        if given and self.call.warm is not None:
+            self._keep(rows, self.chooser.free.run(call))
+            return
+        held = replace(call, problem=call.problem.held_at(call.problem.x0), warm=None)
+        solver = self.chooser.held
+        first = solver.run(held if solver.take_states(held.problem) else replace(held, X0=None))
+        does = first.violation <= self.chooser.limit
+        status = torch.where(does & (first.status == Status.CONVERGED), int(Status.FEASIBLE), first.status)
+        self._keep(rows, replace(first, status=status))  # stationary for this time alone
+        does = does.nonzero().flatten()
+        if does.numel() > 0:
+            self._keep(rows[does], self._freed(call.take(does), first.take(does)))
+
+    def _freed(self, call: Call, start: Solution) -> Solution:
+        """The trajectories with the time free."""
+        return self.chooser.free.run(replace(call, X0=start.X, U0=start.U, warm=None))
+
+    def _freed_where_none_is(self) -> None:
+        """Free the time where no time that was held does: where few do, from the given guess and the least violated."""
+        guess, rows = self.time.guess, self._lost
+        if guess is not None and rows.numel() > 0 and not self.call.late:
+            self._tried(rows, guess[rows], False)
+        rows = self._lost
+        if rows.numel() > 0 and not self.call.late:
+            start = self._found.take(rows)
+            call = self._at(rows, factors_in(self.problem.take(rows), start.X), False)
+            self._keep(rows, self._freed(call, start))
+
+    @property
+    def _lost(self) -> Tensor:
+        """The problems (b,) that could be solved, and have no feasible trajectory."""
+        status = self._found.status
+        lost = ~(self._found.violation <= self.chooser.limit) & (status != Status.INVALID_START)
+        return lost.nonzero().flatten()
+
+    def _again(self) -> None:
+        """Search once more at the times found, and keep what is better with the time free."""
+        rows = (self._found.violation <= self.chooser.limit).nonzero().flatten()
+        if rows.numel() > 0 and not self.call.late:
+            self._tried(rows, factors_in(self.problem, self._found.X)[rows], False)
+
+    def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Call:
+        """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
+        call, user, n = self.call.take(rows), self.problem.take(rows), self.problem.n
+        X = call.X0 if given and call.X0 is not None else self.line[rows]
+        X, U = states_in_time(user, X[..., :n], call.U0[..., : user.m], guess)
+        x0 = call.problem.x0.clone()
+        x0[:, n] = guess[:, 0]
+        return replace(call, problem=call.problem._with({"x0": x0}, call.problem.known), X0=X, U0=U)
+
+    def _keep(self, rows: Tensor, found: Solution) -> None:
+        """Keep what is better than before; iterations add up."""
+        if self.best is None:
+            self.best = replace(found, trace=None, search=None)
+            return
+        best, old = self.best, self.best.take(rows)
+        better = is_better(found.cost, found.violation, old.cost, old.violation, self.chooser.limit)
+        same = (found.cost <= old.cost) & (found.violation <= self.chooser.limit)
+        better |= same & (found.status == Status.CONVERGED)
+        where = better.nonzero().flatten()
+        for name in ("X", "U", "K", "d", "multipliers", "cost", "violation", "status"):
+            put(getattr(best, name), rows[where], take(getattr(found, name), where))
+        for name in ("iterations", "outer_iterations", "guided"):
+            getattr(best, name)[rows] += getattr(found, name)
+
+
+def _first_factors(problem: Problem, line: Tensor) -> Tensor:
+    """The factors (B, S) that are held first, from states on a line: the guess, or `LONG` times the estimate.
+
+    A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end.
+    """
+    time = problem.time
+    assert time is not None
+    estimate = steering_factors(problem, line).unsqueeze(-1)
+    own = (LONG * torch.where(estimate.isnan(), 1.0, estimate)).clamp(time.least, time.most)
+    return own if time.guess is None else torch.where(time.guess < estimate, own, time.guess)
+
+
+def solve_in_time(solver: Solver, problem: Problem, call: Call, X0: Tensor | None) -> Solution:
+    """The solution of a user's problem with a free time, for a call of the problem `in_time`.
+
+    Args:
+        X0: states (B, N+1, n) of the user's problem to begin with; None: on the straight line to the end.
+
+    Raises:
+        InputError: a solver that can't choose the time.
+    """
+    chooser = solver.choosing_time(call.problem)
+    if chooser is None:
+        able = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
+        raise InputError("solver", able, type(solver).__name__)
+    found = Timed(chooser, problem, replace(call, X0=X0)).run()
+    return of_user(problem, found, told_of(chooser, problem, call, found))
+
+
+def of_user(problem: Problem, found: Solution, needed: Tensor | None = None) -> Solution:
+    """A solution of the problem `in_time` as one of the user's: its own states, controls and rows, and the times."""
+    n, m, count = problem.n, problem.m, len(problem.constraints)
+    times = times_of(problem, factors_in(problem, found.X))
+    multipliers = Multipliers(found.multipliers.lam[:count], found.multipliers.mu)
+    X, K = found.X[..., :n].contiguous(), found.K[..., :m, :n].contiguous()
+    U, d = found.U[..., :m].contiguous(), found.d[..., :m].contiguous()
+    search = None if found.search is None else found.search.of_first_states(n)
+    return replace(found, X=X, U=U, K=K, d=d, multipliers=multipliers, search=search, times=times, needed=needed)
+
+
+def lifted_multipliers(problem: Problem, whole: Problem, warm: Multipliers) -> Multipliers:
+    """Multipliers of the user's rows with those of the bounds on the factors, 0."""
+    warm.check(problem)
+    more = [warm.mu.new_zeros(whole.B, *shape) for shape in whole.row_shapes[len(warm.lam) :]]
+    return Multipliers((*warm.lam, *more), warm.mu)
+
+
+def told_of(chooser: Chooser, problem: Problem, call: Call, found: Solution) -> Tensor | None:
+    """Durations (B,), s, beyond the longest allowed, at which problems can be solved that can't within it.
+
+    NaN where nothing was asked or found; None where all is feasible. A HorizonWarning names them.
+    """
+    rows = (~(found.violation <= chooser.limit) & (found.status != Status.INVALID_START)).nonzero().flatten()
+    if rows.numel() == 0 or call.late:
+        return None
+    some, time = problem.take(rows), problem.time
+    assert time is not None
+    time = time.take(rows)
+    freed = replace(time, least=time.most, most=BEYOND * time.most, guess=None, weight=torch.ones_like(time.weight))
+    longer = some._with({"time": freed, "cost": _Nothing(some.cost)})
+    again = Timed(chooser, longer, replace(call.take(rows), problem=in_time(longer), X0=None, warm=None)).run()
+    needed = torch.full_like(found.cost, torch.nan)
+    does = again.violation <= chooser.limit
+    needed[rows[does]] = times_of(some, factors_in(some, again.X))[does, -1]
+    known = (~needed.isnan()).nonzero().flatten().tolist()
+    if known:
+        places = ", ".join(f"problem {b}: {float(needed[b]):.4g} s" for b in known[:NAMED])
+        more = ", ..." if len(known) > NAMED else ""
+        warnings.warn(
+            f"time.most: {len(known)} of {problem.B} problems need more time than that; the least found that would do "
+            f"is, for {places}{more}",
+            HorizonWarning,
+            stacklevel=4,
+        )
+    return needed
+
+
+@dataclass(frozen=True)
+class _Nothing(WrappedCost):
+    """A cost of 0: the time alone counts."""
+
+    batched = ("cost",)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return 0.0 * x[..., 0]
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return 0.0 * x[..., 0]
