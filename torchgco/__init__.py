@@ -91,7 +91,8 @@ if TYPE_CHECKING:
 # In the order of the API reference.
 __all__ = [  # noqa: RUF022
     # the problem
-    "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
+    "Problem", "Goal", "FreeTime", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning",
+    "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules",
     "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "Separation", "FirstStepRates",
     "FunctionConstraint", "FunctionCost",

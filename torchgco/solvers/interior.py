@@ -37,7 +37,7 @@ from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
 
 AT_ONCE = 256  # problems between two reports of progress
-ROUGH, FEW = 1e-2, 100  # tolerance, and iterations, of a trajectory whose time is to be freed next
+ROUGH, FEW = 1e-2, 60  # tolerance, and iterations, of a trajectory whose time is to be freed next
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 # Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
 FILTER: dict[str, Any] = {
@@ -120,7 +120,8 @@ class InteriorPoint(Solver):
     def choosing_time(self, problem: Problem) -> Chooser:
         """This solver; where the time is held, with a tolerance that any trajectory meets, and few iterations."""
         held = replace(self, tolerance=max(self.tolerance, ROUGH), max_iterations=min(self.max_iterations, FEW))
-        return Chooser(held, self, self.admitted(problem))
+        first = replace(self, max_iterations=held.max_iterations)
+        return Chooser(held, self, self.admitted(problem), first)
 
     def solve_from(self, problem: Problem, X0: Tensor, U0: Tensor, max_seconds: float | None = None) -> Solution:
         """Solve from states that the controls need not lead to, such as waypoints.

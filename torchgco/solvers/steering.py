@@ -23,33 +23,94 @@ MISSES = 1e-6  # of the way to the end, which counts as reached
 SLACK = 1e-9  # by which controls and states may pass their bounds
 
 
-def steering_factors(problem: Problem, X: Tensor) -> Tensor:
-    """Factors (B,) of the nominal time, NaN where no time is found, as of models that aren't linear or not bounded.
+class Steering:
+    """The linear model of problems with a free time, and what its controls of least squares do in some time.
 
     Args:
-        X: (B, N+1, n), the way to the end, in whose middle the model is linear.
+        problem: of B problems.
+        line: states (B, N+1, n) on the way to the end, in whose middle the model is linear.
     """
-    B, time = problem.B, problem.time
-    assert time is not None
-    none = X.new_full((B,), torch.nan)
-    bounds = problem.control_bounds
-    if bounds is None or not bool(torch.isfinite(bounds.range).all()):
-        return none
-    lower, upper = (bound.mean(1).expand(B, -1) for bound in bounds.by_knot)
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-    try:
-        A, G, c = _linear(problem, X[:, problem.N // 2], middle)
-        J = _asked(problem, X[:, -1])
-    except MISTAKES:  # a model that PyTorch can't differentiate forwards
-        return none
-    shares = torch.linspace(0.0, 1.0, TIMES, dtype=X.dtype, device=X.device)
-    least, most = time.least.amin(-1, keepdim=True), time.most.amax(-1, keepdim=True)
-    factors = least * (most / least) ** shares  # (B, TIMES)
-    found = none
-    for factor in factors.flip(-1).unbind(-1):  # the shortest that serves is written last
-        fits = _steers(problem, X, (A, G * half.unsqueeze(1), c), J, factor)
-        found = torch.where(fits, factor, found)
-    return found
+
+    def __init__(self, problem: Problem, line: Tensor) -> None:
+        self.problem, self.line = problem, line
+        self.model: tuple[Tensor, Tensor, Tensor] | None = None
+        bounds = problem.control_bounds
+        if bounds is None or not bool(torch.isfinite(bounds.range).all()):
+            return
+        lower, upper = (bound.mean(1).expand(problem.B, -1) for bound in bounds.by_knot)
+        self.middle, self.half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+        try:
+            A, G, c = _linear(problem, line[:, problem.N // 2], self.middle)
+            self.asked = _asked(problem, line[:, -1])
+        except MISTAKES:  # a model that PyTorch can't differentiate forwards
+            return
+        self.model = A, G * self.half.unsqueeze(1), c
+
+    def factors(self) -> Tensor:
+        """The shortest times that serve, as factors (B,) of the nominal one; NaN where none does, or none is known."""
+        time = self.problem.time
+        assert time is not None
+        found = torch.full_like(self.line[:, 0, 0], torch.nan)
+        shares = torch.linspace(0.0, 1.0, TIMES, dtype=found.dtype, device=found.device)
+        least, most = time.least.amin(-1, keepdim=True), time.most.amax(-1, keepdim=True)
+        for factor in (least * (most / least) ** shares).flip(-1).unbind(-1):  # the shortest is written last
+            steered = self._steered(factor)
+            if steered is not None:
+                found = torch.where(self._fits(*steered), factor, found)
+        return found
+
+    def guess(self, factor: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """States (B, N+1, n) and controls (B, N, m) in factor (B,) times the nominal time; elsewhere the line and U."""
+        steered = self._steered(factor)
+        if steered is None:
+            return self.line, U
+        x, u, misses = steered
+        place = torch.linspace(0.0, float(STAGES), self.problem.N + 1, dtype=x.dtype, device=x.device)
+        first = place.long().clamp(max=STAGES - 1)
+        share = (place - first).view(1, -1, 1)
+        X = (1.0 - share) * x[:, first] + share * x[:, first + 1]
+        X = self.problem.dynamics.settled(X)
+        held = self.middle.unsqueeze(1) + self.half.unsqueeze(1) * u[:, first[:-1]]
+        lower, upper = self.middle - self.half, self.middle + self.half
+        held = torch.minimum(torch.maximum(held, lower.unsqueeze(1)), upper.unsqueeze(1))
+        fits = (self._fits(x, u, misses) & torch.isfinite(X).flatten(1).all(-1)).view(-1, 1, 1)
+        return torch.where(fits, X, self.line), torch.where(fits, held, U)
+
+    def _steered(self, factor: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+        """States (B, STAGES+1, n), controls (B, STAGES, m) as shares of half their range, and by how much they miss."""
+        if self.model is None:
+            return None
+        (A, G, c), problem = self.model, self.problem
+        B, n, m = problem.B, problem.n, problem.m
+        generator = A.new_zeros(B, n + m + 1, n + m + 1)
+        generator[:, :n] = torch.cat((A, G, c.unsqueeze(-1)), dim=-1)
+        generator *= (factor * problem.N * problem.dynamics.dt / STAGES).view(-1, 1, 1)
+        step = torch.linalg.matrix_exp(generator)[:, :n]
+        one, push, drift = step[..., :n], step[..., n : n + m], step[..., -1:]
+        x, reach, through, start = self.line[:, 0].unsqueeze(-1), [], self.asked, self.line[:, 0].unsqueeze(-1)
+        for _ in range(STAGES):
+            x = one @ x + drift
+            reach.append(through @ push)
+            through = through @ one
+        W, missing = torch.cat(reach[::-1], dim=-1), self.asked @ (self.line[:, -1:].mT - x)  # (B, p, STAGES m)
+        if not bool(torch.isfinite(W).all()) or not bool(torch.isfinite(missing).all()):
+            return None
+        u = torch.linalg.pinv(W) @ missing
+        misses = (W @ u - missing).abs().amax((1, 2)) / (1.0 + (self.asked @ (x - start)).abs().amax((1, 2)))
+        u = u.view(B, STAGES, m)
+        path = [start]
+        for part in u.unsqueeze(-1).unbind(1):
+            path.append(one @ path[-1] + push @ part + drift)
+        return torch.cat(path, dim=-1).mT, u, misses
+
+    def _fits(self, x: Tensor, u: Tensor, misses: Tensor) -> Tensor:
+        """Whether the end is reached, and controls and states are within their bounds, (B,) bool."""
+        fits = (misses <= MISSES) & (u.abs().amax((1, 2)) <= 1.0 + SLACK)
+        for bounds in self.problem.constraints:
+            if isinstance(bounds, StateBounds) and isinstance(bounds.knots, slice) and bounds.lower.dim() == 2:
+                over = torch.maximum(x - bounds.upper.unsqueeze(1), bounds.lower.unsqueeze(1) - x)
+                fits &= over[:, 1:].amax((1, 2)) <= SLACK
+        return fits
 
 
 def _linear(problem: Problem, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -69,33 +130,3 @@ def _asked(problem: Problem, end: Tensor) -> Tensor:
         every = torch.eye(n, dtype=end.dtype, device=end.device)
         rows = [(every if where is None else every[where]).expand(len(end), -1, -1)]
     return torch.cat(rows, dim=1)
-
-
-def _steers(problem: Problem, X: Tensor, model: tuple[Tensor, Tensor, Tensor], J: Tensor, factor: Tensor) -> Tensor:
-    """Whether least squares of controls (in units of half their range) do it in factor (B,) times the nominal time."""
-    (A, G, c), (B, n, m) = model, (problem.B, problem.n, problem.m)
-    h = factor * problem.N * problem.dynamics.dt / STAGES
-    generator = A.new_zeros(B, n + m + 1, n + m + 1)
-    generator[:, :n] = torch.cat((A, G, c.unsqueeze(-1)), dim=-1) * h.view(-1, 1, 1)
-    step = torch.linalg.matrix_exp(generator)[:, :n]
-    one, push, drift = step[..., :n], step[..., n : n + m], step[..., -1:]
-    x, reach, through = X[:, 0].unsqueeze(-1), [], J
-    for _ in range(STAGES):
-        x = one @ x + drift
-        reach.append(through @ push)
-        through = through @ one
-    W = torch.cat(reach[::-1], dim=-1)  # (B, p, STAGES m)
-    missing = J @ (X[:, -1:].mT - x)
-    scale = 1.0 + (J @ (X[:, -1:].mT - X[:, :1].mT)).abs().amax((1, 2))
-    if not bool(torch.isfinite(W).all()) or not bool(torch.isfinite(missing).all()):
-        return torch.zeros_like(factor, dtype=torch.bool)
-    u = torch.linalg.pinv(W) @ missing
-    fits = ((W @ u - missing).abs().amax((1, 2)) <= MISSES * scale) & (u.abs().amax((1, 2)) <= 1.0 + SLACK)
-    x = X[:, 0].unsqueeze(-1)
-    for part in u.view(B, STAGES, m, 1).unbind(1):
-        x = one @ x + push @ part + drift
-        for bounds in problem.constraints:
-            if isinstance(bounds, StateBounds) and isinstance(bounds.knots, slice) and bounds.lower.dim() == 2:
-                over = torch.maximum(x[..., 0] - bounds.upper, bounds.lower - x[..., 0]).amax(-1)
-                fits &= over <= SLACK
-    return fits

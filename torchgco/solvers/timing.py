@@ -20,11 +20,12 @@ from torchgco.base.tree import put, take
 from torchgco.costs.base import WrappedCost
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
+from torchgco.problem.free_time import FreeTime
 from torchgco.problem.in_time import factors_in, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
-from torchgco.solvers.steering import steering_factors
+from torchgco.solvers.steering import Steering
 from torchgco.solvers.straight import straight_line
 
 LONG = 1.5  # the first time that is held, as a multiple of an estimate
@@ -42,12 +43,14 @@ class Chooser:
         held: finds a trajectory at a time that is held.
         free: takes the time as a variable, from states to begin with.
         limit: violation up to which a trajectory is feasible.
+        first: takes the time as a variable at once, in few iterations; None: it is held first.
         rounds: searches at the times found last, where another way may be the better one.
     """
 
     held: Solver
     free: Solver
     limit: float
+    first: Solver | None = None
     rounds: int = 0
 
 
@@ -63,8 +66,10 @@ class Timed:
         self.chooser, self.problem, self.call = chooser, problem, call
         assert problem.time is not None
         self.time, line = problem.time, straight_line(problem)
-        self.first = _first_factors(problem, line)
-        self.line = states_in_time(problem, line, call.U0[..., : problem.m], self.first)[0]
+        steering, U = Steering(problem, line), call.U0[..., : problem.m]
+        self.first = _first_factors(self.time, steering.factors())
+        X, U = (line, U) if call.X0 is not None else steering.guess(self.first.amax(-1), U)
+        self.X, self.U = X, U  # of the user's problem
         self.best: Solution | None = None
 
     def run(self) -> Solution:
@@ -76,8 +81,7 @@ class Timed:
             self._tried(rows, guess[rows], given)
             best = self._found
             over = (best.status == Status.CONVERGED) | (best.status == Status.INVALID_START)
-            factors = factors_in(self.problem, best.X)
-            short = over & (factors <= AT_LEAST * time.least).all(-1) & (again == 0)  # once more, to be sure
+            short = over & self._is_short(torch.arange(len(over)), best) & (again == 0)  # once more, to be sure
             again += short
             left = (~over | short) & (guess < time.most).any(-1)
             rows = rows[left[rows]]
@@ -100,6 +104,17 @@ class Timed:
         if given and self.call.warm is not None:
             self._keep(rows, self.chooser.free.run(call))
             return
+        if self.chooser.first is not None:
+            found = self.chooser.first.run(replace(call, warm=None))
+            self._keep(rows, found)
+            left = (found.status != Status.CONVERGED) | self._is_short(rows, found)
+            left = left.nonzero().flatten()
+            rows, call = rows[left], call.take(left)
+        if rows.numel() > 0:
+            self._held(rows, call)
+
+    def _held(self, rows: Tensor, call: Call) -> None:
+        """Find trajectories at the time of the call's starts, and free it."""
         held = replace(call, problem=call.problem.held_at(call.problem.x0), warm=None)
         solver = self.chooser.held
         first = solver.run(held if solver.take_states(held.problem) else replace(held, X0=None))
@@ -109,6 +124,11 @@ class Timed:
         does = does.nonzero().flatten()
         if does.numel() > 0:
             self._keep(rows[does], self._freed(call.take(does), first.take(does)))
+
+    def _is_short(self, rows: Tensor, found: Solution) -> Tensor:
+        """Whether trajectories are as short as they may be."""
+        factors = factors_in(self.problem.take(rows), found.X)
+        return (factors <= AT_LEAST * self.time.least[rows]).all(-1)
 
     def _freed(self, call: Call, start: Solution) -> Solution:
         """The trajectories with the time free."""
@@ -141,8 +161,8 @@ class Timed:
     def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Call:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
         call, user, n = self.call.take(rows), self.problem.take(rows), self.problem.n
-        X = call.X0 if given and call.X0 is not None else self.line[rows]
-        X, U = states_in_time(user, X[..., :n], call.U0[..., : user.m], guess)
+        X, U = (call.X0, call.U0) if given and call.X0 is not None else (self.X[rows], self.U[rows])
+        X, U = states_in_time(user, X[..., :n], U[..., : user.m], guess)
         x0 = call.problem.x0.clone()
         x0[:, n] = guess[:, 0]
         return replace(call, problem=call.problem._with({"x0": x0}, call.problem.known), X0=X, U0=U)
@@ -163,14 +183,12 @@ class Timed:
             getattr(best, name)[rows] += getattr(found, name)
 
 
-def _first_factors(problem: Problem, line: Tensor) -> Tensor:
-    """The factors (B, S) that are held first, from states on a line: the guess, or `LONG` times the estimate.
+def _first_factors(time: FreeTime, estimate: Tensor) -> Tensor:
+    """The factors (B, S) to begin with: the guess, or `LONG` times the estimate (B,), which may be NaN.
 
     A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end.
     """
-    time = problem.time
-    assert time is not None
-    estimate = steering_factors(problem, line).unsqueeze(-1)
+    estimate = estimate.unsqueeze(-1)
     own = (LONG * torch.where(estimate.isnan(), 1.0, estimate)).clamp(time.least, time.most)
     return own if time.guess is None else torch.where(time.guess < estimate, own, time.guess)
 
