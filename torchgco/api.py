@@ -23,6 +23,7 @@ from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
+from torchgco.problem.in_time import at_times, guessing_times
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
@@ -89,6 +90,7 @@ def solve(
     differentiates = asks_for_gradients(problem)
     solver = "gco" if solver is None else solver
     name = solver if isinstance(solver, str) else None
+    X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
     problem, U0 = _start(problem, warm, solver, U0)
     multipliers = None if warm is None else warm.multipliers
@@ -198,6 +200,8 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
     if U0 is not None:  # traced once, for the solve and for the warnings after it
         return (current(problem) if for_solvers(problem) is problem else problem), U0
     if warm is not None:
+        if problem.time is not None:
+            problem = guessing_times(problem, warm.t)
         if problem.free_start is not None:
             check_shape(warm.X, (problem.B, problem.N + 1, problem.n), "warm.X")
             problem = problem.guessing(warm.X[:, 0])
@@ -241,8 +245,10 @@ def _warn_of_scale(problem: Problem, U0: Tensor, solution: Solution) -> None:
     if rows.numel() == 0:
         return
     part, found = problem.take(rows), (solution.X[rows], solution.U[rows])
-    guess = open_loop(part.held_at(found[0][:, 0]), U0[rows]), U0[rows]
-    place = dwarfed(part, guess, found)
+    times = None if solution.times is None else solution.times[rows]
+    whole, *found = at_times(part, *found, times)
+    U = torch.cat((U0[rows], found[1][..., part.m :]), dim=-1)
+    place = dwarfed(whole, (open_loop(whole.held_at(found[0][:, 0]), U), U), (found[0], found[1]))
     large = (place != NONE).nonzero().flatten().tolist()
     if large:
         b, i = int(rows[large[0]]), int(place[large[0]])
@@ -314,5 +320,6 @@ def _guess(problem: Problem, whole: Problem) -> Tensor:
                 held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
                 outside[:, bounds.knots] |= (held < lower) | (held > upper)
                 middle[:, bounds.knots] = bounds.middle(held)
-        lost = ~torch.isfinite(open_loop(whole, rest)).flatten(1).all(-1)
+        next_factors = rest.new_ones(*rest.shape[:2], whole.m - problem.m)  # where the time is free
+        lost = ~torch.isfinite(open_loop(whole, torch.cat((rest, next_factors), dim=-1))).flatten(1).all(-1)
         return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)

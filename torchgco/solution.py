@@ -155,6 +155,8 @@ class Solution:
             InputError: `steps` isn't a number of stages, 1 or more.
         """
         check_value(steps, Count, "steps")
+        if self.times is not None:
+            raise InputError("solution", "one of fixed times: later knots of a free time lie elsewhere", "a free time")
         last, problem = self.horizon, None if self.account is None else self.account.problem
         stage = None if last is None else last - 1
         U, K, d = (shifted(part, steps, last=stage) for part in (self.U, self.K, self.d))
@@ -194,7 +196,8 @@ class Solution:
         moved = {f.name: getattr(self, f.name).to(where) for f in fields(self) if f.name in _TENSORS}
         multipliers = Multipliers(tuple(lam.to(where) for lam in self.multipliers.lam), self.multipliers.mu.to(where))
         horizon = None if self.horizon is None else self.horizon.to(where)
-        return Solution(multipliers=multipliers, horizon=horizon, account=account, **moved)
+        more = {name: part.to(where) for name in ("times", "needed") if (part := getattr(self, name)) is not None}
+        return Solution(multipliers=multipliers, horizon=horizon, account=account, **moved, **more)
 
     def to_dict(self) -> dict[str, Any]:
         """X, U and the numbers of each problem as NumPy arrays, by name; `status` as names, t where it is known."""
@@ -240,10 +243,13 @@ class Solution:
             columns[name] = getattr(self, name).detach().cpu().numpy()
         if self.horizon is not None:
             columns["horizon"] = self.horizon.cpu().numpy()
+        if self.times is not None:
+            columns["duration"] = self.duration.cpu().numpy()
         if self.account is not None and self.account.kernels is not None:
             columns["kernels"] = self.account.kernels
         if problem is not None:
-            columns |= judged(problem, self.U.detach(), None if problem.free_start is None else self.X[:, 0].detach())
+            start = None if problem.free_start is None else self.X[:, 0].detach()
+            columns |= judged(problem, self.U.detach(), start, self.times if problem.time is not None else None)
         return pd.DataFrame(columns).rename_axis("element")
 
     def worst_rows(self, problem: Problem) -> pd.DataFrame:
@@ -261,7 +267,8 @@ class Solution:
 
         check_shape(self.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
         check_shape(self.U, (problem.B, problem.N, problem.m), "problem: solution.U")
-        return pd.DataFrame(worst_rows(problem, self.X.detach(), self.U.detach())).rename_axis("element")
+        rows = worst_rows(problem, self.X.detach(), self.U.detach(), self.times)
+        return pd.DataFrame(rows).rename_axis("element")
 
     if TYPE_CHECKING:  # pages know solutions: `torchgco` adds the method
 
@@ -275,6 +282,8 @@ class Solution:
             arrays["horizon"] = self.horizon.cpu().numpy()
         with suppress(InputError):  # dynamics without a time step
             arrays["t"] = self.t.cpu().numpy()
+        if self.times is not None:
+            arrays["times"] = self.times.cpu().numpy()
         if self.account is not None and self.account.kernels is not None:
             arrays["kernels"] = np.array(self.account.kernels)
         for i, lam in enumerate(self.multipliers.lam):
@@ -291,20 +300,21 @@ class Solution:
         where = check_device(device)
         arrays = read_arrays(path, "path", "a solution file", {*_TENSORS, "mu"})
         count = next(i for i in range(len(arrays)) if f"lam{i}" not in arrays)
-        more = [name for name in ("horizon", "t") if name in arrays]
+        more = [name for name in ("horizon", "t", "times") if name in arrays]
         names = (*_TENSORS, "mu", *(f"lam{i}" for i in range(count)), *more)
         strange = [name for name in names if arrays[name].dtype.kind not in "iuf"]
         if strange:
             raise InputError("path", "a solution file", f"{path}, where {strange[0]} holds no numbers")
-        ranks = {"X": 3, "U": 3, "K": 4, "d": 3, "t": arrays["t"].ndim if "t" in arrays else 1}
+        ranks = {"X": 3, "U": 3, "K": 4, "d": 3, "times": 2, "t": arrays["t"].ndim if "t" in arrays else 1}
         if any(arrays[name].ndim != ranks.get(name, 3 if name.startswith("lam") else 1) for name in names):
             raise InputError("path", "a solution file", f"{path}, whose arrays have other shapes")
         tensors: dict[str, Any] = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
         lam = tuple(tensors[f"lam{i}"] for i in range(count))
-        own = {name: tensors[name] for name in _TENSORS}
+        own: dict[str, Any] = {name: tensors[name] for name in _TENSORS}
         kernels = str(arrays["kernels"]) if "kernels" in arrays else None
         account = Account(t=tensors.get("t"), kernels=kernels) if "t" in tensors or kernels is not None else None
-        return cls(multipliers=Multipliers(lam, tensors["mu"]), horizon=tensors.get("horizon"), account=account, **own)
+        own |= {name: tensors.get(name) for name in ("horizon", "times")}
+        return cls(multipliers=Multipliers(lam, tensors["mu"]), account=account, **own)
 
 
 def _places(index: Any, B: int, device: torch.device) -> Tensor:
@@ -322,7 +332,7 @@ def _places(index: Any, B: int, device: torch.device) -> Tensor:
     return torch.where(rows < 0, rows + B, rows).long()
 
 
-_OTHERS = ("multipliers", "trace", "search", "horizon", "reason", "account")
+_OTHERS = ("multipliers", "trace", "search", "horizon", "times", "needed", "reason", "account")
 _TENSORS = tuple(f.name for f in fields(Solution) if f.name not in _OTHERS)
 # What torch.load may make of a file of torch.save; they hold tensors, and run nothing.
 torch.serialization.add_safe_globals([Solution, Multipliers, Account, SearchRecord, Comparison, Standing])

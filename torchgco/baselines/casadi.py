@@ -61,18 +61,23 @@ class CasADiSolver(Solver):
         if find_spec("casadi") is None:
             raise InputError("solver", "CasADi (`pip install casadi`)", "no such module")
 
-    def prepare(self, problem: Problem) -> PreparedCasADi:
+    def prepare(self, problem: Problem) -> Solver:
         """The program and the solver built for one batch, so that a solve takes the plugin's time alone.
+
+        Where the time is free this solver itself, which makes several programs.
 
         Raises:
             InputError: a part of the problem that can't be traced, an operation without a counterpart in CasADi, an
                 option that the plugin refuses, or (FATROP) rows that join several knots.
         """
+        check_problem(problem)
+        return self if problem.time is not None else self._prepared(problem)
+
+    def _prepared(self, problem: Problem) -> PreparedCasADi:
         import casadi
 
         from torchgco.baselines.nlp import transcribe
 
-        check_problem(problem)
         program = transcribe(problem)
         nlp = {"x": program.variables, "p": program.parameters, "f": program.objective, "g": program.rows}
         try:
@@ -83,7 +88,7 @@ class CasADiSolver(Solver):
 
     def run(self, call: Call) -> Solution:
         """From U0 and its rollout; X is the rollout of the controls found. Raises the errors of `prepare`, too."""
-        return self.prepare(call.problem).run(call)
+        return self._prepared(call.problem).run(call)
 
     def frees_start(self, problem: Problem) -> bool:
         """Where the same components are free in all problems."""

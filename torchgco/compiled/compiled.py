@@ -131,6 +131,8 @@ class Compiled:
         receding: bool,
         interior: InteriorPoint,
     ) -> None:
+        if problem.time is not None:
+            raise InputError("problem", "one of fixed times: torchgco.solve chooses times", "a free time")
         if problem.x0.device.type != "cpu":
             raise InputError("problem", "one on the CPU", str(problem.x0.device))
         self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes

@@ -21,6 +21,7 @@ from torchgco.judging.judge import columns as judged
 from torchgco.lagrangian.unmoved import unmoved
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import within_horizons
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.problem.times import times
 
@@ -44,6 +45,8 @@ class Solved(Protocol):
     trace: pd.DataFrame | None
     search: SearchRecord | None
     account: Account | None
+    times: Tensor | None
+    needed: Tensor | None
 
 
 class Explanation(str):
@@ -93,10 +96,11 @@ class _One:
         rows = torch.tensor([b], device=whole.x0.device)
         self.rows, self.problem = rows, whole.take(rows)
         self.X, self.U = solved.X[rows], solved.U[rows]
-        self.held = within_horizons(self.problem)
         self.t: Tensor | None = None
+        self.times = None if solved.times is None else solved.times[rows]  # where the time is free
+        self.held, self.full_X, self.full_U = at_times(within_horizons(self.problem), self.X, self.U, self.times)
         try:
-            t = times(self.problem)
+            t = times(self.problem) if self.times is None else self.times
             self.t = t if t.dim() == 1 else t[0]
         except InputError:  # dynamics without a time step
             pass
@@ -118,7 +122,7 @@ class _One:
         """`clearance` and `reached` by the judge, where it knows them."""
         start = None if self.problem.free_start is None else self.X[:, 0]
         try:
-            return {name: column[0] for name, column in judged(self.problem, self.U, start).items()}
+            return {name: column[0] for name, column in judged(self.problem, self.U, start, self.times).items()}
         except InputError:  # obstacles of a kind that can't be judged
             return {}
 
@@ -142,7 +146,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         clearance=clearance,
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
-        unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.X, one.U, ADMITTED)),
+        unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.full_X, one.full_U, ADMITTED)),
         named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
     )
@@ -160,6 +164,7 @@ def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]
     if one.lost_at is not None:
         lines.append(f"the state at knot {one.lost_at} isn't finite: the stage before it is where the model fails")
         return lines
+    lines += _duration(solved, b, one)
     worst = place_told(one.problem, one.X, one.U, one.t)
     lines.append("no constraint is violated" if worst is None else f"violated most: {worst}")
     if facts.clearance is not None and facts.clearance < float("inf"):
@@ -175,6 +180,21 @@ def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]
     return lines
 
 
+def _duration(solved: Solved, b: int, one: _One) -> list[str]:
+    """How long the trajectory lasts, where that was free, and whether the longest time does."""
+    time = one.problem.time
+    if time is None or one.t is None:
+        return []
+    sizes = torch.bincount(time.of_stages(one.problem.N))
+    least, most = ((factors[0] * sizes).sum() * one.problem.dynamics.dt for factors in (time.least, time.most))
+    lines = [f"duration {number(float(one.t[-1]))} s, of {number(float(least))} to {number(float(most))} s allowed"]
+    if solved.needed is not None and float(solved.violation[b]) > ADMITTED:
+        needed = float(solved.needed[b])
+        told = "none longer that was tried does" if needed != needed else f"{number(needed)} s would do"
+        lines.append(f"no duration up to time.most was found to do; {told}")
+    return lines
+
+
 def _caught(solved: Solved, b: int, one: _One | None) -> list[str]:
     """Where the first solve was caught, where that is recorded; else where the returned trajectory is."""
     if one is None:
@@ -184,11 +204,11 @@ def _caught(solved: Solved, b: int, one: _One | None) -> list[str]:
         at = (rows == b).nonzero().flatten()
         if at.numel() == 0:
             return ["no: the first solve wasn't stopped between obstacles"]
-        told = caught_told(one.held, X[at], one.U, one.t)
+        told = caught_told(one.held, X[at], one.full_U, one.t)
         return [f"the first solve was stopped {told}" if told else "the first solve was stopped between obstacles"]
     if one.lost_at is not None:
         return []
-    told = caught_told(one.held, one.X, one.U, one.t, ADMITTED)
+    told = caught_told(one.held, one.full_X, one.full_U, one.t, ADMITTED)
     return [f"the returned trajectory lies {told}"] if told else []
 
 

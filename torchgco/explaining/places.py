@@ -74,9 +74,12 @@ def caught_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None, depth:
 
 def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str | None:
     """The row that X (1, N+1, n), U (1, N, m) violates most; None where it violates none."""
-    worst = {name: column[0] for name, column in worst_rows(problem, X, U).items()}
+    times = None if problem.time is None or t is None else t.unsqueeze(0)
+    worst = {name: column[0] for name, column in worst_rows(problem, X, U, times).items()}
     if worst["constraint"] == NONE:
         return None
+    if worst["constraint"] >= len(problem.constraints):
+        return f"the bounds of the time, by a factor of {number(worst['violation'])}"
     constraint = problem.constraints[worst["constraint"]]
     length = " m" if constraint.geometric else ""
     where = knots_told([worst["knot"]], t)

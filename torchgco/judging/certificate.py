@@ -31,6 +31,7 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.horizons import within_horizons
+from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, check_problem
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
@@ -70,6 +71,7 @@ def certify(
     U: Tensor,
     asked: Tensor | None = None,
     multipliers: Sequence[Tensor] | None = None,
+    times: Tensor | None = None,
 ) -> Certificate:
     """Certify trajectories X (B, N+1, n), U (B, N, m).
 
@@ -91,6 +93,8 @@ def certify(
         asked: (B,) bool, the problems to certify; NaN for the others. None: all.
         multipliers: (B, K, p) of each constraint, such as `solution.multipliers.lam`; wherever they come from, they are
             tested. Below 0 they count as 0, but for equalities. None: fitted.
+        times: (B, N+1), s, of the knots where the time is free, such as `solution.t`. The KKT residual then is with
+            respect to the factors of time, too; multipliers of their bounds are those that fit best.
 
     Raises:
         InputError: X, U, asked or multipliers don't fit the problem.
@@ -106,7 +110,8 @@ def certify(
     if multipliers is not None:
         multipliers = _checked_multipliers(problem, multipliers)
     with computing_on(problem.x0.device):
-        return _certified(problem, X, U, asked, multipliers)
+        given = None if times is None else doubled(times, "times", problem)
+        return _certified(*at_times(problem, X, U, given), asked, multipliers)
 
 
 def _checked_multipliers(problem: Problem, multipliers: Sequence[Tensor]) -> list[Tensor]:
@@ -256,18 +261,13 @@ def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]) -> Tensor:
+    multipliers = [*multipliers, *_of_factors(problem, X, U, multipliers)]
     rows = [constraint.value(X, U) for constraint in problem.constraints]
     lams = [
         torch.where(torch.isfinite(c), lam if constraint.sense == "equality" else lam.clamp(min=0.0), 0.0)
         for constraint, lam, c in zip(problem.constraints, multipliers, rows, strict=True)
     ]  # a bound at infinity pushes nobody
-
-    def lagrangian(x: Tensor, u: Tensor) -> Tensor:
-        parts = zip(problem.constraints, lams, strict=True)
-        pushes = (torch.where(lam != 0, lam * c.value(x, u), 0.0).flatten(1).sum(-1) for c, lam in parts)
-        return sum(pushes, problem.cost.total(x, u))
-
-    reduced, terms, start = _reduced(problem, X, U, *_local(lagrangian, X, U))
+    reduced, terms, start = _reduced(problem, X, U, *_local(_lagrangian(problem, lams), X, U))
     free = _free(problem)
     rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
     unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
@@ -275,6 +275,32 @@ def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]
     cost = cost + LEAST_COST * problem.N * problem.cost_unit[0]
     products = [torch.where(lam != 0, lam * c, 0.0).abs().flatten() for lam, c in zip(lams, rows, strict=True)]
     return torch.cat((unfit.view(1), *(product / cost for product in products))).amax()
+
+
+def _lagrangian(problem: Problem, lams: Sequence[Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
+    """The cost with the first constraints, as many as there are multipliers lams."""
+
+    def value(x: Tensor, u: Tensor) -> Tensor:
+        parts = zip(problem.constraints, lams, strict=False)
+        pushes = (torch.where(lam != 0, lam * c.value(x, u), 0.0).flatten(1).sum(-1) for c, lam in parts)
+        return sum(pushes, problem.cost.total(x, u))
+
+    return value
+
+
+def _of_factors(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]) -> list[Tensor]:
+    """Multipliers of the bounds on factors of time, the last constraints: those that what is left asks for."""
+    bounds: list[Any] = list(problem.constraints[len(multipliers) :])
+    if not bounds:
+        return []
+    reduced, _, start = _reduced(problem, X, U, *_local(_lagrangian(problem, multipliers), X, U))
+    found = []
+    for part in bounds:
+        slopes = reduced[:, part.knots] if part.of == "u" else start[0].unsqueeze(1)
+        upper, lower = -slopes[..., part.above], slopes[..., part.below]
+        lam = torch.cat((upper, lower), dim=-1).clamp(min=0.0)
+        found.append(torch.where(part.value(X, U) >= -ACTIVE_WITHIN, lam, 0.0))
+    return found
 
 
 def _free(problem: Problem) -> Tensor:
@@ -352,10 +378,12 @@ def _reduced(
     x, u = X[:, :-1].repeat(n, 1, 1), U.repeat(n, 1, 1)
     fx, fu = gradients(lambda x, u: twins.step(x, u).diagonal(dim1=0, dim2=2), x, u)  # (n, N, n), (n, N, m)
     total, terms, of_start = torch.empty_like(gU), torch.empty_like(gU[0]), torch.empty_like(gX[0, 0])
-    adjoint = gX[:, N]
+    adjoint, chosen = gX[:, N], factor_controls(problem)
     for k in range(N - 1, -1, -1):
         total[:, k] = gU[:, k] + adjoint @ fu[:, k]
         terms[k] = gU[0, k].abs() + adjoint[0].abs() @ fu[:, k].abs()
+        if k < N - 1:  # a next factor of time is nothing but a state: what cancels, cancels in that
+            terms[k, chosen] = of_start @ fu[:, k, chosen].abs()
         of_start = gX[0, k].abs() + adjoint[0].abs() @ fx[:, k].abs()
         adjoint = gX[:, k] + adjoint @ fx[:, k]
     return total, terms, (adjoint, of_start)

@@ -25,6 +25,7 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.goal import Goal
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, check_problem
 
 OTHERS_WITHIN = ADMITTED  # how far all constraints but the obstacles may be violated by a feasible trajectory
@@ -74,6 +75,7 @@ def judge(
     goal: Tensor | None = None,
     goal_radius: Tensor | float | None = None,
     start: Tensor | None = None,
+    times: Tensor | None = None,
 ) -> Verdict:
     """Judge controls U (B, N, m) by their rollout from the start: any controls of any model, in float64.
 
@@ -86,6 +88,8 @@ def judge(
         goal_radius: number or (B,), m, above 0. None: that of the problem's goal.
         start: (B, n), the starts found, such as `solution.X[:, 0]`, where some are free. One that differs from x0 in a
             component that isn't free is not feasible. None: x0, where none is free.
+        times: (B, N+1), s, of the knots where the time is free, such as `solution.t`; a duration out of its bounds is
+            not feasible. None: the time isn't free.
 
     Raises:
         InputError: U, goal, radius or start don't fit the problem, a goal is given without a radius, or for dynamics
@@ -100,6 +104,9 @@ def judge(
     with computing_on(problem.x0.device):
         end = _goal(problem, *given[:2])
         first = _start(problem, given[2])
+        held = first.unsqueeze(1).expand(-1, problem.N + 1, -1)
+        problem, held, U = at_times(problem, held, U, None if times is None else doubled(times, "times", problem))
+        first = held[:, 0]
         X, moved = [first], _moved(problem, first)
         cost = torch.zeros_like(problem.x0[:, 0])
         for k in range(problem.N):
@@ -354,11 +361,11 @@ def frame_columns(verdict: Verdict) -> dict[str, Any]:
     return {name: getattr(verdict, name).cpu().numpy() for name in names}
 
 
-def columns(problem: Problem, U: Tensor, start: Tensor | None = None) -> dict[str, Any]:
+def columns(problem: Problem, U: Tensor, start: Tensor | None = None, times: Tensor | None = None) -> dict[str, Any]:
     """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
 
     `clearance` (m) where the problem has obstacles, `reached` where it has a goal; a problem of another precision is
-    judged in float64; `start` as in `judge`.
+    judged in float64; `start` and `times` as in `judge`.
 
     Raises:
         InputError: as `judge`.
@@ -370,5 +377,5 @@ def columns(problem: Problem, U: Tensor, start: Tensor | None = None) -> dict[st
     names += ["reached"] if problem.goal is not None else []
     if not names:
         return {}
-    verdict = judge(problem, U, start=start)
+    verdict = judge(problem, U, start=start, times=times)
     return {name: getattr(verdict, name).cpu().numpy() for name in names}

@@ -9,13 +9,20 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.problem.horizons import within_horizons
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
 
 NONE = -1  # the place of what isn't there
 
 
-def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> dict[str, list[Any]]:
-    """The columns of `Solution.worst_rows` for X (B, N+1, n), U (B, N, m); NaN violates most."""
+def worst_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = None) -> dict[str, list[Any]]:
+    """The columns of `Solution.worst_rows` for X (B, N+1, n), U (B, N, m); NaN violates most.
+
+    Args:
+        times: (B, N+1), s, of the knots where the time is free. Its bounds then come after the constraints, as "time".
+    """
+    user = problem
+    problem, X, U = at_times(problem, X, U, times)
     lost = ~torch.isfinite(X).all(-1)
     first = torch.where(lost.any(-1), lost.long().argmax(-1), NONE)
     largest = X.new_zeros(problem.B)
@@ -30,7 +37,8 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> dict[str, list[Any]]:
         found = torch.stack((torch.full_like(at, number), knots[at // rows.shape[-1]], at % rows.shape[-1]))
         place, largest = torch.where(more, found, place), torch.where(more, most, largest)
     where, knot, row = place.tolist()
-    names = [kind_of(problem.constraints[i]) if i != NONE else "" for i in where]
+    kinds = [kind_of(part) for part in user.constraints]
+    names = ["" if i == NONE else kinds[i] if i < len(kinds) else "time" for i in where]
     return {
         "constraint": where, "name": names, "knot": knot, "row": row, "violation": largest.tolist(),
         "lost_at": first.tolist(),

@@ -157,6 +157,8 @@ class _Flight:
         self.planner = mission.planner if mission.latency == 0 else replace(mission.planner, first_step=False)
         if problem.goal is None:
             raise InputError("goal", "a Goal in the problem", None)
+        if problem.time is not None:
+            raise InputError("time", "None for a mission, whose control periods are fixed", "a free time")
         if problem.horizon is not None:
             raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
         mission.check(problem.dynamics)

@@ -96,7 +96,7 @@ def _places(b: Any, B: int) -> list[int]:
 def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[list[Course], str]:
     """The trajectories, each up to its own last knot, and the unit of t: s, or knots of a model without time step."""
     try:
-        t, unit = times(problem), "t [s]"
+        t, unit = times(problem) if solution.times is None else solution.times, "t [s]"
     except InputError:
         t, unit = torch.arange(problem.N + 1, device=problem.x0.device), "knot"
     found = []

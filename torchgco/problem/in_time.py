@@ -43,7 +43,7 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
     time = problem.time
     if time is None:
         return problem
-    guess = guess_of(problem) if guess is None else guess
+    guess = _guess(problem) if guess is None else guess
     rates = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
     controls = None if rates is None else rates.controls
     x0 = _start(problem, problem.x0, guess[:, :1], rates)
@@ -62,7 +62,7 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
     return whole
 
 
-def guess_of(problem: Problem) -> Tensor:
+def _guess(problem: Problem) -> Tensor:
     """The factors (B, S) to begin with: those that were given, else the nominal times, within the bounds."""
     time = problem.time
     assert time is not None
@@ -90,6 +90,13 @@ def factors_in(problem: Problem, X: Tensor) -> Tensor:
     """The factors (B, S) in states X (B, N+1, n') of the problem `in_time`, for the user's problem."""
     assert problem.time is not None
     return X[:, list(problem.time.segments), problem.n]
+
+
+def factor_controls(whole: Problem) -> slice:
+    """Which controls of a problem `in_time`, or of any other, are factors of time."""
+    model = whole.dynamics
+    chosen = isinstance(model, _Dynamics) and model.switches is not None
+    return slice(whole.m - 1, whole.m) if chosen else slice(0, 0)
 
 
 def times_of(problem: Problem, factors: Tensor) -> Tensor:
@@ -120,6 +127,29 @@ def factors_of(problem: Problem, times: Any) -> Tensor:
     if bool(wrong.any()) or bool((times[:, 0] != 0).any()):
         raise InputError("times", "knots from 0 s on, at equal distances within each segment", "others")
     return factors
+
+
+def guessing_times(problem: Problem, times: Any) -> Problem:
+    """The problem with the times (B, N+1) of an earlier solution, s, as guesses within its bounds."""
+    assert problem.time is not None
+    guess = factors_of(problem, times).clamp(problem.time.least, problem.time.most)
+    return problem._with({"time": replace(problem.time, guess=guess)}, problem.known)
+
+
+def at_times(problem: Problem, X: Tensor, U: Tensor, times: Any) -> tuple[Problem, Tensor, Tensor]:
+    """The problem `in_time` with states X (B, N+1, n) and controls U (B, N, m) at the times (B, N+1), s, of its knots.
+
+    All three as they are where the time isn't free.
+
+    Raises:
+        InputError: times that `factors_of` refuses, or times of a problem whose time isn't free.
+    """
+    if problem.time is None:
+        if times is not None:
+            raise InputError("times", "None, as the problem's time isn't free", "times")
+        return problem, X, U
+    factors = factors_of(problem, times)
+    return in_time(problem, factors), *states_in_time(problem, X, U, factors)
 
 
 def _start(problem: Problem, x0: Tensor, factor: Tensor, rates: RateBounds | None) -> Tensor:

@@ -46,6 +46,7 @@ def asks_for_gradients(problem: Problem) -> bool:
         (problem.x0.dtype, problem.x0.dtype != torch.float64),
         ("horizons per problem", problem.horizon is not None),
         ("a free start", problem.free_start is not None and bool(problem.free_start.any())),
+        ("a free time", problem.time is not None),
         ("RateBounds", any(isinstance(part, RateBounds) for part in problem.constraints)),
     ):
         if refused:

@@ -67,7 +67,8 @@ class Timed:
         assert problem.time is not None
         self.time, line = problem.time, straight_line(problem)
         steering, U = Steering(problem, line), call.U0[..., : problem.m]
-        self.first = _first_factors(self.time, steering.factors())
+        given = call.X0 is not None and self.time.guess is not None
+        self.first = self.time.guess if given else _first_factors(self.time, steering.factors())
         X, U = (line, U) if call.X0 is not None else steering.guess(self.first.amax(-1), U)
         self.X, self.U = X, U  # of the user's problem
         self.best: Solution | None = None

@@ -56,7 +56,7 @@ def _times(problem: Problem, solution: Solution) -> tuple[np.ndarray | None, flo
     dt = getattr(problem.dynamics, "dt", None) or 1.0
     try:
         t = solution.t
-    except InputError:  # the solution doesn't know its problem
+    except InputError:  # the solution doesn't know its problem, which then isn't one of free time
         try:
             t = times(problem)
         except InputError:
