@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -25,9 +25,7 @@ from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
-
-if TYPE_CHECKING:
-    from torchgco.solvers.timing import Chooser
+from torchgco.solvers.timing import Chooser, lifted_multipliers, solve_in_time
 
 
 @dataclass(frozen=True)
@@ -218,17 +216,19 @@ class Solver(Brief):
         X0: Tensor | None,
     ) -> Solution:
         """`solve` of a problem with a free time, which is `whole` for solvers."""
-        from torchgco.solvers import timing  # it needs this module
-
         problem.check_controls(U0)
         if X0 is not None:
             check_tensor(X0, "X0", problem.x0)
             check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
-        lifted = None if warm is None else timing.lifted_multipliers(problem, whole, warm)
+        lifted = None if warm is None else lifted_multipliers(problem, whole, warm)
         U = torch.cat((U0, U0.new_ones(*U0.shape[:2], whole.m - problem.m)), dim=-1)
         call = Call.checked(whole, U, seed, ids, lifted, callback, max_seconds)
         self.announce(call.problem)
-        found = timing.solve_in_time(self, problem, call, X0)
+        chooser = self.choosing_time(call.problem)
+        if chooser is None:
+            able = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
+            raise InputError("solver", able, type(self).__name__)
+        found = solve_in_time(chooser, problem, call, X0)
         return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
 
     def choosing_time(self, problem: Problem) -> Chooser | None:

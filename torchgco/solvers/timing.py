@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import HorizonWarning, InputError
+from torchgco.base.errors import HorizonWarning
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
 from torchgco.costs.base import WrappedCost
@@ -24,7 +25,6 @@ from torchgco.problem.free_time import FreeTime
 from torchgco.problem.in_time import factors_in, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.steering import Steering
 from torchgco.solvers.straight import straight_line
 
@@ -33,6 +33,13 @@ LONGER = 2.0  # the next one, of the one before
 AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
 BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
 NAMED = 5  # problems that the warning names
+
+
+class Runs(Protocol):
+    """A solver, of what `contracts.Call` holds."""
+
+    def run(self, call: Any) -> Solution: ...
+    def take_states(self, problem: Problem) -> bool: ...
 
 
 @dataclass(frozen=True)
@@ -47,10 +54,10 @@ class Chooser:
         rounds: searches at the times found last, where another way may be the better one.
     """
 
-    held: Solver
-    free: Solver
+    held: Runs
+    free: Runs
     limit: float
-    first: Solver | None = None
+    first: Runs | None = None
     rounds: int = 0
 
 
@@ -62,13 +69,12 @@ class Timed:
         call: of the problem in free time, whose X0 and warm multipliers, where given, are guesses of the user.
     """
 
-    def __init__(self, chooser: Chooser, problem: Problem, call: Call) -> None:
+    def __init__(self, chooser: Chooser, problem: Problem, call: Any) -> None:
         self.chooser, self.problem, self.call = chooser, problem, call
         assert problem.time is not None
         self.time, line = problem.time, straight_line(problem)
         steering, U = Steering(problem, line), call.U0[..., : problem.m]
-        given = call.X0 is not None and self.time.guess is not None
-        self.first = self.time.guess if given else _first_factors(self.time, steering.factors())
+        self.first = _first_factors(self.time, steering.factors(), call.X0 is not None)
         X, U = (line, U) if call.X0 is not None else steering.guess(self.first.amax(-1), U)
         self.X, self.U = X, U  # of the user's problem
         self.best: Solution | None = None
@@ -114,7 +120,7 @@ class Timed:
         if rows.numel() > 0:
             self._held(rows, call)
 
-    def _held(self, rows: Tensor, call: Call) -> None:
+    def _held(self, rows: Tensor, call: Any) -> None:
         """Find trajectories at the time of the call's starts, and free it."""
         held = replace(call, problem=call.problem.held_at(call.problem.x0), warm=None)
         solver = self.chooser.held
@@ -131,7 +137,7 @@ class Timed:
         factors = factors_in(self.problem.take(rows), found.X)
         return (factors <= AT_LEAST * self.time.least[rows]).all(-1)
 
-    def _freed(self, call: Call, start: Solution) -> Solution:
+    def _freed(self, call: Any, start: Solution) -> Solution:
         """The trajectories with the time free."""
         return self.chooser.free.run(replace(call, X0=start.X, U0=start.U, warm=None))
 
@@ -159,7 +165,7 @@ class Timed:
         if rows.numel() > 0 and not self.call.late:
             self._tried(rows, factors_in(self.problem, self._found.X)[rows], False)
 
-    def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Call:
+    def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Any:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
         call, user, n = self.call.take(rows), self.problem.take(rows), self.problem.n
         X, U = (call.X0, call.U0) if given and call.X0 is not None else (self.X[rows], self.U[rows])
@@ -184,29 +190,26 @@ class Timed:
             getattr(best, name)[rows] += getattr(found, name)
 
 
-def _first_factors(time: FreeTime, estimate: Tensor) -> Tensor:
+def _first_factors(time: FreeTime, estimate: Tensor, has_states: bool) -> Tensor:
     """The factors (B, S) to begin with: the guess, or `LONG` times the estimate (B,), which may be NaN.
 
-    A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end.
+    A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end; beside
+    states to begin with it counts all the same.
     """
     estimate = estimate.unsqueeze(-1)
     own = (LONG * torch.where(estimate.isnan(), 1.0, estimate)).clamp(time.least, time.most)
-    return own if time.guess is None else torch.where(time.guess < estimate, own, time.guess)
+    if time.guess is None:
+        return own
+    return time.guess if has_states else torch.where(time.guess < estimate, own, time.guess)
 
 
-def solve_in_time(solver: Solver, problem: Problem, call: Call, X0: Tensor | None) -> Solution:
+def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | None) -> Solution:
     """The solution of a user's problem with a free time, for a call of the problem `in_time`.
 
     Args:
-        X0: states (B, N+1, n) of the user's problem to begin with; None: on the straight line to the end.
-
-    Raises:
-        InputError: a solver that can't choose the time.
+        X0: states (B, N+1, n) of the user's problem to begin with; None: those of the linear model, or on the straight
+            line to the end.
     """
-    chooser = solver.choosing_time(call.problem)
-    if chooser is None:
-        able = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
-        raise InputError("solver", able, type(solver).__name__)
     found = Timed(chooser, problem, replace(call, X0=X0)).run()
     return of_user(problem, found, told_of(chooser, problem, call, found))
 
@@ -229,7 +232,7 @@ def lifted_multipliers(problem: Problem, whole: Problem, warm: Multipliers) -> M
     return Multipliers((*warm.lam, *more), warm.mu)
 
 
-def told_of(chooser: Chooser, problem: Problem, call: Call, found: Solution) -> Tensor | None:
+def told_of(chooser: Chooser, problem: Problem, call: Any, found: Solution) -> Tensor | None:
     """Durations (B,), s, beyond the longest allowed, at which problems can be solved that can't within it.
 
     NaN where nothing was asked or found; None where all is feasible. A HorizonWarning names them.
