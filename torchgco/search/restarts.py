@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 PASSES = Passes((Solve(), PathProposals(), FromProposal(), FromSamples("unproposed"), IntoGoal(), ClearChords()))
 
+PACES = 0.7, 1.0, 1.4  # of the times found, where the time is free: each is a search of its own
+
 
 @dataclass(frozen=True)
 class Restarts(Solver):
@@ -99,7 +101,7 @@ class Restarts(Solver):
         """The interior point; among obstacles the passes where the time is held, and the interior point from there."""
         if not problem.geometric:
             return self.interior.choosing_time(problem)
-        return Chooser(self, self.interior, self.local.violation_tolerance, rounds=1)
+        return Chooser(self, self.interior, self.local.violation_tolerance, paces=PACES)
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""

@@ -51,14 +51,14 @@ class Chooser:
         free: takes the time as a variable, from states to begin with.
         limit: violation up to which a trajectory is feasible.
         first: takes the time as a variable at once, in few iterations; None: it is held first.
-        rounds: searches at the times found last, where another way may be the better one.
+        paces: shares of the times found at which it is searched again, as another way may be the better one there.
     """
 
     held: Runs
     free: Runs
     limit: float
     first: Runs | None = None
-    rounds: int = 0
+    paces: tuple[float, ...] = ()
 
 
 class Timed:
@@ -87,7 +87,7 @@ class Timed:
         while rows.numel() > 0:
             self._tried(rows, guess[rows], given)
             best = self._found
-            over = (best.status == Status.CONVERGED) | (best.status == Status.INVALID_START)
+            over = (best.violation <= self.chooser.limit) | (best.status == Status.INVALID_START)
             short = over & self._is_short(torch.arange(len(over)), best) & (again == 0)  # once more, to be sure
             again += short
             left = (~over | short) & (guess < time.most).any(-1)
@@ -96,8 +96,7 @@ class Timed:
             if self.call.late:
                 break
         self._freed_where_none_is()
-        for _ in range(self.chooser.rounds):
-            self._again()
+        self._again()
         return self._found
 
     @property
@@ -160,10 +159,12 @@ class Timed:
         return lost.nonzero().flatten()
 
     def _again(self) -> None:
-        """Search once more at the times found, and keep what is better with the time free."""
-        rows = (self._found.violation <= self.chooser.limit).nonzero().flatten()
-        if rows.numel() > 0 and not self.call.late:
-            self._tried(rows, factors_in(self.problem, self._found.X)[rows], False)
+        """Search again at shares of the times found so far, and keep what is better with the time free."""
+        for pace in self.chooser.paces:
+            rows = (self._found.violation <= self.chooser.limit).nonzero().flatten()
+            factors = (pace * factors_in(self.problem, self._found.X)).clamp(self.time.least, self.time.most)
+            if rows.numel() > 0 and not self.call.late:
+                self._tried(rows, factors[rows], False)
 
     def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Any:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
