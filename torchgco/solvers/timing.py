@@ -21,7 +21,6 @@ from torchgco.base.tree import put, take
 from torchgco.costs.base import WrappedCost
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
-from torchgco.problem.free_time import FreeTime
 from torchgco.problem.in_time import factors_in, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -32,6 +31,7 @@ LONG = 1.5  # the first time that is held, as a multiple of an estimate
 LONGER = 2.0  # the next one, of the one before
 AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
 BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
+NEAR = 0.1  # difference of two times, as a share, that makes no other search
 NAMED = 5  # problems that the warning names
 
 
@@ -74,7 +74,10 @@ class Timed:
         assert problem.time is not None
         self.time, line = problem.time, straight_line(problem)
         steering, U = Steering(problem, line), call.U0[..., : problem.m]
-        self.first = _first_factors(self.time, steering.factors(), call.X0 is not None)
+        estimate = steering.factors().unsqueeze(-1)
+        own = LONG * torch.where(estimate.isnan(), 1.0, estimate)
+        self.own = own.clamp(self.time.least, self.time.most)
+        self.first = self._first(estimate)
         X, U = (line, U) if call.X0 is not None else steering.guess(self.first.amax(-1), U)
         self.X, self.U = X, U  # of the user's problem
         self.best: Solution | None = None
@@ -98,6 +101,17 @@ class Timed:
         self._freed_where_none_is()
         self._again()
         return self._found
+
+    def _first(self, estimate: Tensor) -> Tensor:
+        """The factors (B, S) to begin with: the guess, or `LONG` times the estimate (B, 1), which may be NaN.
+
+        A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end; beside
+        states to begin with it counts all the same.
+        """
+        guess = self.time.guess
+        if guess is None:
+            return self.own
+        return guess if self.call.X0 is not None else torch.where(guess < estimate, self.own, guess)
 
     @property
     def _found(self) -> Solution:
@@ -159,12 +173,20 @@ class Timed:
         return lost.nonzero().flatten()
 
     def _again(self) -> None:
-        """Search again at shares of the times found so far, and keep what is better with the time free."""
-        for pace in self.chooser.paces:
-            rows = (self._found.violation <= self.chooser.limit).nonzero().flatten()
-            factors = (pace * factors_in(self.problem, self._found.X)).clamp(self.time.least, self.time.most)
+        """Search again at other times, and keep what is better with the time free.
+
+        These are the estimate, where a guess was far from it, and shares of the times found so far: what is found then
+        depends little on the guess.
+        """
+        if not self.chooser.paces:
+            return
+        far = ((self.first / self.own - 1.0).abs() > NEAR).any(-1)
+        for pace in (None, *self.chooser.paces):
+            found = self._found.violation <= self.chooser.limit
+            rows = (found & far if pace is None else found).nonzero().flatten()
+            factors = self.own if pace is None else pace * factors_in(self.problem, self._found.X)
             if rows.numel() > 0 and not self.call.late:
-                self._tried(rows, factors[rows], False)
+                self._tried(rows, factors.clamp(self.time.least, self.time.most)[rows], False)
 
     def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Any:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
@@ -189,19 +211,6 @@ class Timed:
             put(getattr(best, name), rows[where], take(getattr(found, name), where))
         for name in ("iterations", "outer_iterations", "guided"):
             getattr(best, name)[rows] += getattr(found, name)
-
-
-def _first_factors(time: FreeTime, estimate: Tensor, has_states: bool) -> Tensor:
-    """The factors (B, S) to begin with: the guess, or `LONG` times the estimate (B,), which may be NaN.
-
-    A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end; beside
-    states to begin with it counts all the same.
-    """
-    estimate = estimate.unsqueeze(-1)
-    own = (LONG * torch.where(estimate.isnan(), 1.0, estimate)).clamp(time.least, time.most)
-    if time.guess is None:
-        return own
-    return time.guess if has_states else torch.where(time.guess < estimate, own, time.guess)
 
 
 def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | None) -> Solution:
