@@ -35,9 +35,11 @@ class Steering:
         self.problem, self.line = problem, line
         self.model: tuple[Tensor, Tensor, Tensor] | None = None
         bounds = problem.control_bounds
-        if bounds is None or not bool(torch.isfinite(bounds.range).all()):
+        if bounds is None:
             return
         lower, upper = (bound.mean(1).expand(problem.B, -1) for bound in bounds.by_knot)
+        self.bounded = (torch.isfinite(lower) & torch.isfinite(upper)).all(-1)
+        lower, upper = (torch.where(self.bounded.unsqueeze(-1), bound, 0.0) for bound in (lower, upper))
         self.middle, self.half = 0.5 * (lower + upper), 0.5 * (upper - lower)
         try:
             A, G, c = _linear(problem, line[:, problem.N // 2], self.middle)
@@ -93,9 +95,9 @@ class Steering:
             reach.append(through @ push)
             through = through @ one
         W, missing = torch.cat(reach[::-1], dim=-1), self.asked @ (self.line[:, -1:].mT - x)  # (B, p, STAGES m)
-        if not bool(torch.isfinite(W).all()) or not bool(torch.isfinite(missing).all()):
-            return None
-        u = torch.linalg.pinv(W) @ missing
+        known = (torch.isfinite(W).all((1, 2)) & torch.isfinite(missing).all((1, 2)) & self.bounded).view(-1, 1, 1)
+        W, missing = torch.where(known, W, 0.0), torch.where(known, missing, torch.inf)
+        u = torch.linalg.pinv(W) @ torch.where(known, missing, 0.0)
         misses = (W @ u - missing).abs().amax((1, 2)) / (1.0 + (self.asked @ (x - start)).abs().amax((1, 2)))
         u = u.view(B, STAGES, m)
         path = [start]

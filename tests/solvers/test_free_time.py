@@ -1,0 +1,257 @@
+"""Least times against closed forms, from any guess; the batch contract; and what is told where no time does."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import torchgco
+from tests.problems import assert_same_bits
+from torchgco import (
+    Airframe,
+    ControlBounds,
+    FreeTime,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    Goal,
+    HorizonWarning,
+    InputError,
+    Problem,
+    QuadraticCost,
+    QuadrotorPlanning,
+    QuadrotorPlant,
+    RateBounds,
+    Solution,
+    Spheres,
+    StateBounds,
+    Status,
+    certify,
+    judge,
+)
+
+D = torch.float64
+INF = float("inf")
+
+
+def carts(N: int = 60, B: int = 8, fastest: float = INF, nominal: float = 3.0, **time: Any) -> Problem:
+    """Carts that come to rest at the origin in the least time, thrust at most 1, from drawn places and speeds."""
+    draws = torch.Generator().manual_seed(7)
+    d, v = -3.5 + 7.0 * torch.rand(B, generator=draws, dtype=D), -1.5 + 3.0 * torch.rand(B, generator=draws, dtype=D)
+    x0 = torch.stack((d, v.clamp(-fastest, fastest)), dim=-1)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, nominal / N, "rk4")
+    rows = [
+        ControlBounds(-1.0, 1.0),
+        FunctionConstraint(lambda x: x, "equality", knots=[-1], name="at rest"),
+        *([StateBounds([-INF, -fastest], [INF, fastest])] if fastest < INF else []),
+    ]
+    free = FreeTime(**{"least": 0.02, "most": 20.0, **time})
+    return Problem(model, FunctionCost(lambda x, u: 0.0 * u[..., 0]), rows, x0, N, time=free)
+
+
+def least_time(x0: torch.Tensor, fastest: float = INF) -> np.ndarray:
+    """Thrust one way and then the other, with the fastest speed between where that is reached."""
+    found = []
+    for x, v in x0.tolist():
+        side = 1.0 if x + 0.5 * v * abs(v) > 0 else -1.0  # thrust away from where it would stop
+        x, v = side * x, side * v
+        peak = (x + 0.5 * v * v) ** 0.5
+        if peak <= fastest:
+            found.append(v + 2.0 * peak)
+        else:
+            found.append(v + 2.0 * fastest + (x + 0.5 * v * v - fastest * fastest) / fastest)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("fastest", [INF, 1.0])
+@pytest.mark.parametrize("guess", [None, 0.1, 1.0, 10.0])
+def test_least_times_are_those_of_the_closed_form(fastest: float, guess: float | None) -> None:
+    best = torch.from_numpy(least_time(carts(fastest=fastest).x0, fastest))
+    problem = carts(fastest=fastest, guess=None if guess is None else (guess * best / 3.0).clamp(0.02, 20.0))
+    found = torchgco.solve(problem)
+    assert bool((found.status == Status.CONVERGED).all())
+    assert bool((found.violation <= 1e-6).all())
+    excess = found.duration / best - 1.0
+    assert bool((excess.abs() < 1e-3).all())  # stages are equally long: the switch falls within one
+    assert int(found.iterations.median()) <= 30
+    assert found.t.shape == (8, 61)
+    torch.testing.assert_close(found.cost, found.duration)
+
+
+def test_segments_switch_exactly() -> None:
+    problem = carts(N=20, segments=2)
+    found = torchgco.solve(problem)
+    excess = found.duration / torch.from_numpy(least_time(problem.x0)) - 1.0
+    assert int((excess.abs() < 1e-6).sum()) >= 6 and bool((excess.abs() < 1e-2).all())  # or within a stage of a segment
+    lengths = found.t.diff(dim=1)
+    torch.testing.assert_close(lengths[:, :10], lengths[:, :1].expand(-1, 10))
+    assert bool(((lengths[:, 0] - lengths[:, -1]).abs() > 1e-3).any())
+    certificate = certify(problem, found.X, found.U, times=found.t, multipliers=found.multipliers.lam)
+    assert bool((certificate.kkt_residual < 1e-6).all())
+
+
+def test_judge_certificate_tables_and_files_know_the_times(tmp_path: Path) -> None:
+    problem = carts()
+    found = torchgco.solve(problem)
+    verdict = judge(problem, found.U, times=found.t)
+    torch.testing.assert_close(verdict.cost, found.cost, rtol=0, atol=1e-9)
+    assert bool(verdict.feasible.all())
+    assert bool((judge(problem, found.U, times=1.5 * found.t).violation > 0.1).all())  # these controls, more slowly
+    assert bool((judge(problem, found.U, times=100.0 * found.t).violation > 10.0).all())  # longer than `most`
+    for lams in (None, found.multipliers.lam):
+        assert bool((certify(problem, found.X, found.U, None, lams, found.t).kkt_residual < 1e-5).all())
+    slower = torchgco.solve(carts(weight=1.0, least=2.0))  # some end at the least time, some above
+    at_least = certify(carts(least=2.0), slower.X, slower.U, times=slower.t, multipliers=slower.multipliers.lam)
+    assert bool((at_least.kkt_residual < 1e-3).all())
+    with pytest.raises(InputError, match="times: expected the times of the knots"):
+        judge(problem, found.U)
+    assert found.to_frame()["duration"].tolist() == found.duration.tolist()
+    assert "duration" in found.explain(0, problem)
+    found.save(tmp_path / "found.npz")
+    again = Solution.load(tmp_path / "found.npz")
+    assert torch.equal(again.t, found.t) and torch.equal(again.duration, found.duration)
+    assert torch.equal(again.take([3, 1]).t, found.t[[3, 1]])
+    assert int(torchgco.solve(problem, warm=again).iterations.max()) <= 5
+
+
+def test_a_held_time_that_is_optimal_has_no_slope_in_time() -> None:
+    """Slower or faster than the least, the residual says so: the certificate is one with respect to time."""
+    fixed = replace(carts(), time=None, cost=QuadraticCost([0.0] * 2, [1.0], [0.0] * 2))
+    problem = replace(fixed, time=FreeTime(0.2, 5.0))
+    at_nominal = torchgco.solve(fixed.take(slice(0, 1)))
+    even = fixed.dynamics.dt * torch.arange(61, dtype=D).unsqueeze(0)
+    one = problem.take(slice(0, 1))
+    assert float(certify(one, at_nominal.X, at_nominal.U, times=even).kkt_residual) > 0.1
+    best = torchgco.solve(one)
+    assert float(certify(one, best.X, best.U, times=best.t).kkt_residual) < 1e-5
+    assert float(best.cost) < float(judge(one, at_nominal.U, times=even).cost)
+
+
+@pytest.mark.parametrize("segments", [None, 2])
+def test_a_problem_has_the_same_bits_in_any_batch(segments: int | None) -> None:
+    problem = carts(N=30, segments=segments)
+    whole = torchgco.solve(problem)
+    order = torch.tensor([5, 2, 7])
+    part = torchgco.solve(problem.take(order), ids=order)
+    assert_same_bits(part, whole.take(order))
+    assert torch.equal(part.t, whole.t[order])
+
+
+def test_limits_on_rates_are_per_second() -> None:
+    problem = carts()
+    rates = RateBounds(-0.1, 0.1, previous=[0.0])
+    found = torchgco.solve(replace(problem, constraints=[*problem.constraints, rates]))
+    assert bool((found.status == Status.CONVERGED).all())
+    change = found.U.diff(dim=1, prepend=torch.zeros(8, 1, 1, dtype=D))[..., 0].abs()
+    speed = change / found.t.diff(dim=1)
+    torch.testing.assert_close(speed.amax(-1), torch.full((8,), 0.1 / 0.05, dtype=D))
+    assert bool((found.duration > torchgco.solve(problem).duration).all())
+    assert bool(judge(replace(problem, constraints=[*problem.constraints, rates]), found.U, times=found.t).feasible.all())
+
+
+def test_the_least_time_that_would_do_is_told() -> None:
+    problem = carts(most=0.8)
+    with pytest.warns(HorizonWarning, match=r"time\.most: \d of 8 problems need more time"):
+        found = torchgco.solve(problem)
+    best = torch.from_numpy(least_time(problem.x0))
+    late = best > 2.4
+    assert bool(late.any()) and not bool(late.all())
+    assert bool((found.status[late] == Status.INFEASIBLE).all())
+    assert found.needed is not None
+    torch.testing.assert_close(found.needed[late], best[late], rtol=1e-3, atol=0)
+    assert bool(found.needed[~late].isnan().all()) and bool((found.status[~late] == Status.CONVERGED).all())
+    assert f"{float(found.needed[late][0]):.4g} s would do" in found.explain(int(late.nonzero()[0]))
+
+
+def test_time_costs_what_it_is_said_to() -> None:
+    """From rest to rest over 1 m with cost u^2: 12 / T^3 + w T, which is least at T^4 = 36 / w."""
+    weights = torch.tensor([0.5, 4.0, 36.0], dtype=D)
+    problem = carts(B=3, weight=weights)
+    cost = FunctionCost(lambda x, u: 0.05 * u[..., 0].square())  # of a stage of dt = 0.05
+    x0 = torch.tensor([[1.0, 0.0]] * 3, dtype=D)
+    found = torchgco.solve(replace(problem, cost=cost, x0=x0, constraints=[problem.constraints[1]]))
+    expected = (36.0 / weights) ** 0.25
+    torch.testing.assert_close(found.duration, expected, rtol=1e-3, atol=0)
+    torch.testing.assert_close(found.cost, 12.0 / expected**3 + weights * expected, rtol=1e-3, atol=0)
+
+
+def flight(model: Any, rows: list[Any], rest: float) -> Problem:
+    """Twelve hundred metres from rest to rest, in the least time."""
+    x0 = torch.zeros(1, model.n, dtype=D)
+    x0[:, 6], x0[:, 13:] = 1.0, rest
+    end = torch.tensor([1200.0, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=D)
+    arrives = FunctionConstraint(lambda x: x[..., :6] - end, "equality", knots=[-1], name="at rest there")
+    cost = FunctionCost(lambda x, u: 0.0 * u[..., 0])
+    return Problem(model, cost, [*rows, arrives], x0, round(20.0 / model.dt), time=FreeTime(0.5, 3.0))
+
+
+def planning(integrator: str) -> Problem:
+    model = QuadrotorPlanning(0.2, integrator, rate_time_constant=0.3, thrust_time_constant=0.3)  # type: ignore[arg-type]
+    low, high = Airframe().accelerations
+    return flight(model, [ControlBounds([-2.0, -2.0, -2.0, low], [2.0, 2.0, 2.0, high])], 9.81)
+
+
+def plant() -> Problem:
+    low, high = Airframe().rotor_speeds
+    turns = StateBounds([-INF] * 10 + [-3.0] * 3 + [-INF] * 4, [INF] * 10 + [3.0] * 3 + [INF] * 4)
+    return flight(QuadrotorPlant(0.1), [ControlBounds(low, high), turns], Airframe().hover_thrust)
+
+
+@pytest.mark.parametrize("name", ["euler", "midpoint", "rk4", "plant"])
+def test_quaternions_keep_their_norm_at_the_least_time(name: str) -> None:
+    """Twenty seconds at the least time: the thrust isn't what the norm of a quaternion makes of it."""
+    problem = plant() if name == "plant" else planning(name)
+    found = torchgco.solve(problem, solver="interior_point")
+    assert float(found.violation) <= 1e-6 and float(found.duration) >= 20.0
+    torch.testing.assert_close(found.X[..., 6:10].norm(dim=-1), torch.ones_like(found.t), rtol=0, atol=1e-12)
+    v, t = found.X[0, :, 3:6], found.t[0]
+    gravity = torch.tensor([0.0, 0.0, -9.81], dtype=D)
+    push = (v.diff(dim=0) / t.diff().unsqueeze(-1) - gravity).norm(dim=-1)  # mean thrust acceleration of each stage
+    assert float(push.max()) <= Airframe().accelerations[1] * (1.0 + 1e-6)
+
+
+def test_solvers_that_hold_the_time_are_refused() -> None:
+    for solver in ("al_ilqr", "gco_paper", "mppi", "hold", "multistart"):
+        with pytest.raises(InputError, match="solver: expected interior_point, gco, gco_exact, ipopt or fatrop"):
+            torchgco.solve(carts(B=1), solver=solver)
+    with pytest.raises(InputError, match="problem: expected one of fixed times"):
+        torchgco.compile(carts(B=1))
+    with pytest.raises(InputError, match="solution: expected one of fixed times"):
+        torchgco.solve(carts(B=1, N=20)).shifted()
+    x0 = torch.tensor([[1.0, 0.0]], dtype=D, requires_grad=True)
+    with pytest.raises(InputError, match="a free time"):
+        torchgco.solve(replace(carts(B=1), x0=x0))
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_peers_find_the_same_times(solver: str) -> None:
+    problem = carts(B=2, N=30)
+    ours, theirs = (torchgco.solve(problem, solver=name).duration for name in ("gco", solver))
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=0)
+
+
+def test_the_time_frees_itself_of_its_guess_among_obstacles() -> None:
+    """A ball around two discs: the same time from short and long guesses, clear, and at the goal."""
+    x0 = torch.zeros(3, 4, dtype=D)
+    there = torch.tensor([4.0, 0.0, 0.0, 0.0], dtype=D)
+    cost = QuadraticCost([0.0] * 4, [0.01] * 2, [0.0] * 4, x_ref=there)
+    rows = [
+        ControlBounds(-2.0, 2.0),
+        Spheres([[1.5, 0.1], [2.8, -0.2]], [0.4, 0.5], vehicle_radius=0.1),
+        FunctionConstraint(lambda x: x - there, "equality", [-1], name="there"),
+    ]
+    guess = torch.tensor([0.5, 1.0, 4.0], dtype=D)
+    move = lambda x, u: torch.cat((x[..., 2:], u), dim=-1)
+    model = FunctionDynamics(move, 4, 2, 0.075, position=slice(0, 2))
+    time = FreeTime(0.2, 5.0, weight=1.0, guess=guess)
+    problem = Problem(model, cost, rows, x0, 40, Goal([4.0, 0.0], 0.2), time=time)
+    found = torchgco.solve(problem)
+    assert bool((found.violation <= 1e-6).all())
+    assert float(found.cost.max() / found.cost.min()) < 1.01
+    verdict = judge(problem, found.U, times=found.t)
+    assert bool(verdict.sound.all())
+    straight = least_time(torch.tensor([[-4.0, 0.0]], dtype=D))[0] / 2.0**0.5  # thrust 2, without discs
+    assert bool((found.duration > straight).all())
