@@ -200,7 +200,7 @@ def plant() -> Problem:
     return flight(QuadrotorPlant(0.1), [ControlBounds(low, high), turns], Airframe().hover_thrust)
 
 
-@pytest.mark.parametrize("name", ["euler", "midpoint", "rk4", "plant"])
+@pytest.mark.parametrize("name", ["euler", "midpoint", "rk4", pytest.param("plant", marks=pytest.mark.slow)])
 def test_quaternions_keep_their_norm_at_the_least_time(name: str) -> None:
     """Twenty seconds at the least time: the thrust isn't what the norm of a quaternion makes of it."""
     problem = plant() if name == "plant" else planning(name)

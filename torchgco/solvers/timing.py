@@ -125,7 +125,8 @@ class Timed:
             self._keep(rows, self.chooser.free.run(call))
             return
         if self.chooser.first is not None:
-            found = self.chooser.first.run(replace(call, warm=None))
+            at_once = self.chooser.free if given else self.chooser.first  # states that were chosen are worth the while
+            found = at_once.run(replace(call, warm=None))
             self._keep(rows, found)
             left = (found.status != Status.CONVERGED) | self._is_short(rows, found)
             left = left.nonzero().flatten()

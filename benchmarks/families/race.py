@@ -1,0 +1,131 @@
+"""The track of 19 gates for a quadrotor with four rotors, in the least time, with a duration for each leg.
+
+Foehn, Romero and Scaramuzza, "Time-optimal planning for quadrotor waypoint flight" (Science Robotics, 2021), publish
+17.56 s, found in 50 minutes. Gates, start, end and vehicle are retyped from github.com/FSC-Lab/TOGT-Planner (MIT
+licence), resources/racetrack/race_uzh_19wp.yaml and parameters/cpc/cpc_quad.yaml: seven places, 2.7 times around.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchgco import (
+    ControlBounds,
+    FreeTime,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    Problem,
+    Solution,
+    StateBounds,
+)
+
+D = torch.float64
+START, END, WITHIN = (-5.0, 4.5, 1.2), (4.75, -0.9, 1.2), 0.3  # m
+PLACES = (
+    (-1.1, -1.6, 3.6), (9.2, 6.6, 1.0), (9.2, -4.0, 1.2), (-4.5, -6.0, 3.5), (-4.5, -6.0, 0.8), (4.75, -0.9, 1.2),
+    (-2.8, 6.8, 1.2),
+)  # fmt: skip
+GATES = tuple(PLACES[i % 7] for i in range(19))
+MASS, GRAVITY, INERTIA = 0.85, 9.8066, (0.001, 0.001, 0.0017)  # kg, m/s^2, kg m^2
+ARM, TURN = 0.15, 0.05  # m, to each axis; yaw torque per newton, m
+STRONGEST, FASTEST = 6.879, (15.0, 15.0, 3.0)  # N per rotor, rad/s
+PACE = 8.0  # m/s, of the guess on straight lines
+
+
+def rates(x: Tensor, u: Tensor) -> Tensor:
+    """x' of x = [p, v, q, w] (..., 13) under the thrusts u (..., 4), N; the thrust's axis is divided by |q|^2."""
+    _, v, q, w = x.split((3, 3, 4, 3), dim=-1)
+    q0, q1, q2, q3 = q.unbind(-1)
+    w1, w2, w3 = w.unbind(-1)
+    f1, f2, f3, f4 = u.unbind(-1)
+    lift = (f1 + f2 + f3 + f4) / MASS / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    push = (
+        lift * 2 * (q1 * q3 + q0 * q2),
+        lift * 2 * (q2 * q3 - q0 * q1),
+        lift * (q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3) - GRAVITY,
+    )
+    turn = (
+        -0.5 * (q1 * w1 + q2 * w2 + q3 * w3),
+        0.5 * (q0 * w1 + q2 * w3 - q3 * w2),
+        0.5 * (q0 * w2 - q1 * w3 + q3 * w1),
+        0.5 * (q0 * w3 + q1 * w2 - q2 * w1),
+    )
+    J1, J2, J3 = INERTIA
+    spin = (
+        (ARM * (f1 - f2 - f3 + f4) - (J3 - J2) * w2 * w3) / J1,
+        (ARM * (-f1 - f2 + f3 + f4) - (J1 - J3) * w3 * w1) / J2,
+        (TURN * (f1 - f2 + f3 - f4) - (J2 - J1) * w1 * w2) / J3,
+    )
+    return torch.cat((v, torch.stack((*push, *turn, *spin), dim=-1)), dim=-1)
+
+
+def race(stages: int, gates: Tensor | None = None, within: float = WITHIN) -> tuple[Problem, Tensor, Tensor]:
+    """The race with so many stages a leg, and states and controls on straight lines at `PACE`.
+
+    Args:
+        gates: (B, G, 3), m; None: those of the track.
+        within: m, of each gate's centre.
+    """
+    places = torch.tensor([GATES], dtype=D) if gates is None else gates
+    (B, legs), ends = (len(places), places.shape[1] + 1), [torch.tensor(p, dtype=D) for p in (START, END)]
+    way = torch.cat([e.expand(B, 1, 3) if i else e.expand(B, 1, 3) for i, e in enumerate(ends[:1])], dim=1)
+    way = torch.cat((way, places, ends[1].expand(B, 1, 3)), dim=1)
+    N, firsts = legs * stages, [leg * stages for leg in range(1, legs)]
+    at_knots = torch.zeros(B, N + 1, 3, dtype=D)
+    at_knots[:, firsts] = places
+    rest = torch.cat((ends[1], torch.zeros(3, dtype=D)))
+    lengths = way.diff(dim=1).norm(dim=-1)
+    dt = float(lengths.mean()) / PACE / stages
+    rows = [
+        ControlBounds(0.0, STRONGEST),
+        StateBounds([-math.inf] * 10 + [-w for w in FASTEST], [math.inf] * 10 + list(FASTEST)),
+        FunctionConstraint(
+            lambda x, place: (x[..., :3] - place).square().sum(-1, keepdim=True) - within**2,
+            knots=firsts, name="gates", knot_values={"place": at_knots},
+        ),
+        FunctionConstraint(lambda x: x[..., :6] - rest, "equality", knots=[-1], name="at rest"),
+    ]  # fmt: skip
+    x0 = torch.zeros(B, 13, dtype=D)
+    x0[:, :3], x0[:, 6] = ends[0], 1.0
+    guess = lengths / PACE / stages / dt
+    time = FreeTime(0.02, 20.0, guess=guess.clamp(0.02, 20.0), segments=firsts)
+    model = FunctionDynamics(rates, 13, 4, dt, "rk4", slice(0, 3))
+    problem = Problem(model, FunctionCost(lambda x, u: 0.0 * u[..., 0]), rows, x0, N, time=time)
+    share = torch.arange(stages, dtype=D).view(1, 1, -1, 1) / stages
+    p = (way[:, :-1].unsqueeze(2) + share * way.diff(dim=1).unsqueeze(2)).flatten(1, 2)
+    X0 = torch.zeros(B, N + 1, 13, dtype=D)
+    X0[..., :3], X0[..., 6] = torch.cat((p, way[:, -1:]), dim=1), 1.0
+    v = PACE * way.diff(dim=1) / lengths.unsqueeze(-1)
+    X0[:, 1:-1, 3:6] = v.repeat_interleave(stages, dim=1)[:, 1:]
+    return problem, X0, torch.full((B, N, 4), MASS * GRAVITY / 4.0, dtype=D)
+
+
+def flown(solution: Solution, gates: Tensor, dt: float = 1e-3) -> dict[str, Tensor]:
+    """The plans flown open loop by RK4 at about `dt`, q renormalised at each step, as numbers (B,).
+
+    `gate`: the largest of the smallest distances to the gates, each within 0.15 s of its knot, m; `end`: how far from
+    the end the flight ends, m; `rate`: by how much a rate of turn passes its limit, as a share.
+    """
+    (B, N, _), legs = solution.U.shape, gates.shape[1] + 1
+    stages, t = N // legs, solution.t
+    count = max(1, math.ceil(float(t.diff(dim=1).max()) / dt))
+    x, nearest = solution.X[:, 0], torch.full((B, legs - 1), torch.inf, dtype=D)
+    knots, rate = t[:, stages::stages][:, : legs - 1], torch.zeros(B, dtype=D)
+    for k in range(N):
+        h, u = (t[:, k + 1] - t[:, k]).unsqueeze(-1) / count, solution.U[:, k]
+        for j in range(count):
+            k1 = rates(x, u)
+            k2 = rates(x + 0.5 * h * k1, u)
+            k3 = rates(x + 0.5 * h * k2, u)
+            x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rates(x + h * k3, u))
+            x = torch.cat((x[:, :6], x[:, 6:10] / x[:, 6:10].norm(dim=-1, keepdim=True), x[:, 10:]), dim=-1)
+            now = t[:, k : k + 1] + (j + 1) * h
+            away = (x[:, None, :3] - gates).norm(dim=-1)
+            nearest = torch.where((now - knots).abs() < 0.15, torch.minimum(nearest, away), nearest)
+            rate = torch.maximum(rate, (x[:, 10:].abs() / torch.tensor(FASTEST, dtype=D)).amax(-1) - 1.0)
+    end = (x[:, :3] - torch.tensor(END, dtype=D)).norm(dim=-1)
+    return {"gate": nearest.amax(-1), "end": end, "rate": rate}
