@@ -72,8 +72,7 @@ def race(stages: int, gates: Tensor | None = None, within: float = WITHIN) -> tu
     """
     places = torch.tensor([GATES], dtype=D) if gates is None else gates
     (B, legs), ends = (len(places), places.shape[1] + 1), [torch.tensor(p, dtype=D) for p in (START, END)]
-    way = torch.cat([e.expand(B, 1, 3) if i else e.expand(B, 1, 3) for i, e in enumerate(ends[:1])], dim=1)
-    way = torch.cat((way, places, ends[1].expand(B, 1, 3)), dim=1)
+    way = torch.cat((ends[0].expand(B, 1, 3), places, ends[1].expand(B, 1, 3)), dim=1)
     N, firsts = legs * stages, [leg * stages for leg in range(1, legs)]
     at_knots = torch.zeros(B, N + 1, 3, dtype=D)
     at_knots[:, firsts] = places

@@ -42,7 +42,7 @@ def problem(integrator: Any = "rk4", rates: bool = True, **time: Any) -> Problem
     )
     rows = [
         ControlBounds(-2.0, 2.0),
-        FunctionConstraint(lambda x, u: (x[..., :1] * u[..., 1:] - 0.4), of="xu", name="product"),
+        FunctionConstraint(lambda x, u: x[..., :1] * u[..., 1:] - 0.4, of="xu", name="product"),
         *([RateBounds([-0.3, -torch.inf], [0.2, 0.4], previous=[0.1, 0.0])] if rates else []),
         StateBounds([-5.0, -torch.inf, -5.0], [5.0, 3.0, 5.0]),
     ]

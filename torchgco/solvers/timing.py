@@ -221,8 +221,20 @@ def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | No
         X0: states (B, N+1, n) of the user's problem to begin with; None: those of the linear model, or on the straight
             line to the end.
     """
-    found = Timed(chooser, problem, replace(call, X0=X0)).run()
+    found = _found(chooser, problem, replace(call, X0=X0))
     return of_user(problem, found, told_of(chooser, problem, call, found))
+
+
+def _found(chooser: Chooser, problem: Problem, call: Any) -> Solution:
+    """What `Timed` finds, in the units of the call.
+
+    It works in units of cost: seconds alone are small beside the barrier where stages are many and short, and a method
+    then wanders before it sees them.
+    """
+    scaled, unit = call.in_cost_units()
+    found = Timed(chooser, problem, scaled).run()
+    cost, multipliers = call.problem.cost.total(found.X, found.U), found.multipliers.scaled(unit)
+    return replace(found, cost=cost, multipliers=multipliers)
 
 
 def of_user(problem: Problem, found: Solution, needed: Tensor | None = None) -> Solution:
@@ -256,7 +268,7 @@ def told_of(chooser: Chooser, problem: Problem, call: Any, found: Solution) -> T
     time = time.take(rows)
     freed = replace(time, least=time.most, most=BEYOND * time.most, guess=None, weight=torch.ones_like(time.weight))
     longer = some._with({"time": freed, "cost": _Nothing(some.cost)})
-    again = Timed(chooser, longer, replace(call.take(rows), problem=in_time(longer), X0=None, warm=None)).run()
+    again = _found(chooser, longer, replace(call.take(rows), problem=in_time(longer), X0=None, warm=None))
     needed = torch.full_like(found.cost, torch.nan)
     does = again.violation <= chooser.limit
     needed[rows[does]] = times_of(some, factors_in(some, again.X))[does, -1]
