@@ -22,6 +22,7 @@ from torchgco import (
     Solution,
     StateBounds,
 )
+from torchgco.problem.in_time import guessing_times
 
 D = torch.float64
 START, END, WITHIN = (-5.0, 4.5, 1.2), (4.75, -0.9, 1.2), 0.3  # m
@@ -101,6 +102,16 @@ def race(stages: int, gates: Tensor | None = None, within: float = WITHIN) -> tu
     v = PACE * way.diff(dim=1) / lengths.unsqueeze(-1)
     X0[:, 1:-1, 3:6] = v.repeat_interleave(stages, dim=1)[:, 1:]
     return problem, X0, torch.full((B, N, 4), MASS * GRAVITY / 4.0, dtype=D)
+
+
+def finer(problem: Problem, coarse: Solution, factor: int) -> tuple[Problem, Tensor, Tensor]:
+    """A problem with `factor` times the stages of a solution, and that solution as its guess of times, X0 and U0."""
+    share = torch.arange(factor, dtype=D).view(1, 1, -1, 1) / factor
+    X, U, t = coarse.X, coarse.U.repeat_interleave(factor, dim=1), coarse.t.unsqueeze(-1)
+    within = lambda z: torch.cat(
+        ((z[:, :-1, None] + share * z.diff(dim=1).unsqueeze(2)).flatten(1, 2), z[:, -1:]), dim=1
+    )
+    return guessing_times(problem, within(t).squeeze(-1)), within(X), U
 
 
 def flown(solution: Solution, gates: Tensor, dt: float = 1e-3) -> dict[str, Tensor]:
