@@ -17,7 +17,7 @@ from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
-from torchgco.judging.scale import SHARE, TIGHT, dwarfed
+from torchgco.judging.scale import MET, SHARE, dwarfed
 from torchgco.judging.worst import NONE, kind_of
 from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
@@ -237,7 +237,7 @@ def _warned_of_contact(problem: Problem, solution: Solution, U0: Tensor | None) 
 def _warn_of_scale(problem: Problem, U0: Tensor, solution: Solution) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    rows = (claims & (solution.violation > TIGHT)).nonzero().flatten()
+    rows = (claims & (solution.violation > SHARE * MET)).nonzero().flatten()
     if rows.numel() == 0:
         return
     part, found = problem.take(rows), (solution.X[rows], solution.U[rows])

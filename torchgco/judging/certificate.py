@@ -34,7 +34,6 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem, check_problem
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
-LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
 
 
@@ -272,7 +271,7 @@ def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]
     rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
     unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
     cost = (problem.cost.total(X, U) - problem.cost_scale.constant)[0].abs()
-    cost = cost + LEAST_COST * problem.N * problem.cost_unit[0]
+    cost = cost + problem.cost_scale.size[0]
     products = [torch.where(lam != 0, lam * c, 0.0).abs().flatten() for lam, c in zip(lams, rows, strict=True)]
     return torch.cat((unfit.view(1), *(product / cost for product in products))).amax()
 

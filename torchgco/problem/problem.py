@@ -174,9 +174,9 @@ class Problem:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
         X, U = self.at_rest
         stages = None if self.horizon is None else self.stages
-        if isinstance(self.cost, BoundQuadratic):
+        if type(self.cost) is BoundQuadratic:
             curvatures = self.cost.control_curvatures.expand(self.B, self.N, self.m)
-            return cost_scale(self.cost.total(X, U), curvatures, None, stages)
+            return cost_scale(self.cost.total(X, U), curvatures, None, stages, self.control_bounds)
         s = self.n + 1 + self.m
         H = self.x0.new_empty(self.B, self.N + 1, s, s)
         self.cost.expand(X, U, H)
@@ -193,7 +193,8 @@ class Problem:
         total, goal = self.cost.total(X, U), None if self.goal is None else self.goal.position
         changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
         changes = torch.maximum(changes, savings(slopes, curvatures))
-        return cost_scale(total, curvatures[:, :-1, self.n :], changes, None if self.horizon is None else self.stages)
+        stages = None if self.horizon is None else self.stages
+        return cost_scale(total, curvatures[:, :-1, self.n :], changes, stages, self.control_bounds)
 
     @property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
@@ -223,7 +224,7 @@ class Problem:
 
         No solver option then depends on the cost's scale or zero.
         """
-        unit, constant = self.cost_scale
+        unit, constant, _ = self.cost_scale
         cost = self.cost.scaled(1.0 / unit)
         if bool((constant != 0).any()):
             cost = ShiftedCost(cost, constant / (unit * self.N))
