@@ -51,6 +51,30 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
     return _place(alone(rows, k, *arguments), together(rows, k, *arguments))
 
 
+def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> bool:
+    """Whether rows of one knot (b, ...), or of its samples (b, S, ...), differ from those of all knots (b, K, ...).
+
+    Code that takes some of these forms alone is left to those who call it so.
+
+    Args:
+        function: of problems (b,), knots (K,) or one of them, an int, and arguments with these leading axes.
+        rows: two problems.
+        k: the numbers of the knots (K,).
+        arguments: (2, K, ...).
+    """
+    several = _tried(function, rows, k, *arguments)
+    whole = several is not None and several.shape[:2] == (len(rows), len(k))
+    for at in {0, len(k) // 2, len(k) - 1} if several is not None and whole else ():
+        one = [z[:, at] for z in arguments]
+        alone = _tried(function, rows, int(k[at]), *one)
+        samples = _tried(function, rows, int(k[at]), *(torch.stack((z, z, z), dim=1) for z in one))
+        for found in (alone, None if samples is None else samples[:, 0]):
+            fits = found is not None and several[:, at].shape == found.shape
+            if fits and bool(unlike(found, several[:, at]).any()):
+                return True
+    return False
+
+
 def _suspect(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> int | None:
     """`joined_knots`, and the place of one that changes where the function branches on values."""
     K, one = len(k), rows[:1]
