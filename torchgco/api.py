@@ -23,7 +23,7 @@ from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
 from torchgco.sensitivity import asks_for_gradients, attached
@@ -83,9 +83,9 @@ def solve(
             states X0, or an argument is of another kind or out of its range.
     """
     check_untransformed("solve")
-    check_problem(problem)
+    problem = current_problem(problem)
     warm = _checked(warm)
-    problem = asked = problem.anew()
+    asked = problem
     differentiates = asks_for_gradients(problem)
     solver = "gco" if solver is None else solver
     name = solver if isinstance(solver, str) else None
@@ -133,7 +133,7 @@ def compare(
     import pandas as pd
 
     check_untransformed("compare")
-    check_problem(problem)
+    problem = current_problem(problem)
     made = _named_solvers(problem, solvers)
     frames = []
     for name, solver in made.items():

@@ -31,7 +31,7 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.horizons import within_horizons
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
@@ -94,7 +94,7 @@ def certify(
     Raises:
         InputError: X, U, asked or multipliers don't fit the problem.
     """
-    check_problem(problem)
+    problem = current_problem(problem)
     problem, X, U = in_double(problem), doubled(X, "X", problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
     check_shape(X, (problem.B, problem.N + 1, problem.n), "X")

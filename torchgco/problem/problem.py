@@ -67,16 +67,13 @@ class Problem:
     free_start: Any = None
 
     known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
-    # What it was given, where tensors of that ask for gradients; the fields hold numbers alone.
-    given: ClassVar[Given | None] = None
+    given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
 
     def __post_init__(self) -> None:
         fields_given = {f.name: getattr(self, f.name) for f in fields(self)}
         given = Given.of(fields_given)
-        if given is not None:
-            object.__setattr__(self, "given", given)
-            for name, part in given.numbers.items():
-                object.__setattr__(self, name, part)
+        for name, part in (given.numbers | {"given": given}).items():
+            object.__setattr__(self, name, part)
         self._check_border()
         with computing_on(self.x0.device):
             self._bind(*(fields_given[name] for name in ("dynamics", "cost", "constraints")))
@@ -257,16 +254,15 @@ class Problem:
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
-        return self.anew()._with({})
+        return self.current()._with({})
 
-    def anew(self) -> Self:
-        """The same problems with their numbers as they are now, where an optimiser has changed tensors in place that
-        ask for gradients; else this one."""
-        return self.given.anew(type(self)) if self.given is not None and self.given.is_stale else self
+    def current(self) -> Self:
+        """The same problems with numbers as they are now, where these were changed in place since; else this one."""
+        return self if self.given is None else self.given.current(self)
 
     def recorded(self) -> Self:
         """The same problems with gradients recorded, from the tensors that were given on; itself without such."""
-        return self if self.given is None else self.given.recorded(self)
+        return self.given.recorded(self) if self.given is not None and self.given.asks else self
 
     def is_same(self, other: Problem) -> bool:
         """Whether both have the very same parts."""
@@ -422,10 +418,15 @@ def _is_whole(index: Rows, B: int) -> bool:
     return index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
 
 
-def check_problem(problem: Any) -> None:
-    """Raise InputError unless the argument is a Problem."""
+def current_problem(problem: Any) -> Problem:
+    """The problem with its numbers as they are now.
+
+    Raises:
+        InputError: the argument is no Problem.
+    """
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem", _named(problem))
+    return problem.current()
 
 
 def _check_constraints(constraints: Any) -> None:

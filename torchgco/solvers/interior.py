@@ -27,7 +27,7 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.solvers.ending import STATIONARY, constant_cost, least_cost, start_status
@@ -126,7 +126,7 @@ class InteriorPoint(Solver):
         Raises:
             InputError: X0 or U0 don't fit the problem.
         """
-        check_problem(problem)
+        problem = current_problem(problem)
         check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
         check_tensor(X0, "X0", problem.x0)
         return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
