@@ -83,3 +83,17 @@ def test_numbers_changed_in_place_are_those_of_the_next_solve(name: str, kind: C
     assert torchgco.judge(kept, found.U).feasible.all()
     torch.testing.assert_close(kept.current().cost.total(found.X, found.U), found.cost, rtol=1e-12, atol=0)
     assert kept.current() is kept.current()
+
+
+@pytest.mark.parametrize("name", [name for name in NUMBERS if name != "x0"])
+def test_a_problem_started_elsewhere_follows_too(name: str) -> None:
+    given = {key: make() for key, make in NUMBERS.items()}
+    kept = problem(given)
+    x0 = kept.x0 + 0.1
+    early = kept.started_at(x0, kept.constraints).started_at(x0, kept.constraints)
+    torchgco.solve(early, solver="interior_point")
+    change(given[name])
+    late = kept.started_at(x0, kept.constraints)
+    due = torchgco.solve(problem(given | {"x0": x0}), solver="interior_point")
+    for each in (early, late):
+        assert torch.equal(torchgco.solve(each, solver="interior_point").U, due.U)

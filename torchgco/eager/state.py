@@ -269,7 +269,7 @@ def find_solved(kinds: Kinds, t: State, test: Errors, running: Tensor) -> Tensor
 
 
 def barrier_share(kinds: Kinds, t: State) -> tuple[Tensor, Tensor]:
-    """The complementarity (b,), and the size of the cost: where units are small, a tolerance met isn't small beside it."""
+    """The complementarity, and the size of the cost, beside which a tolerance that is met may not be small, (b,)."""
     left = torch.where(kinds.inside(t), t.s * t.z, 0.0).sum(-1)
     constant, size = kinds.constant[t.rows], kinds.least_cost[t.rows]
     return left, (t.cost - t.scale * constant).abs() + t.scale * size

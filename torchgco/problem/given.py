@@ -7,7 +7,7 @@ for gradients, its parts are bound once more, with gradients recorded, when a so
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -57,6 +57,14 @@ class Given:
         """The same of what is made of a problem, `whole`."""
         return replace(self, whole=self.whole or whole, then=(*self.then, by), renewed=[])
 
+    def started(self, problem: Any, x0: Tensor, constraints: Sequence[Any], *others: Any) -> Given | None:
+        """The same of `problem`, which is of these parts, with other starts, constraints, cost and dynamics."""
+        if self.then:  # of a part of its batch
+            return None
+        fields = {"x0": x0, "constraints": replaced(constraints, problem.constraints, self.fields["constraints"])}
+        fields |= {name: part for name, part in zip(("cost", "dynamics"), others, strict=True) if part is not None}
+        return Given.of({**self.fields, **fields})
+
     def current(self, problem: Any) -> Any:
         """`problem`, which is of these parts; bound anew where their numbers have changed since."""
         facts = tuple(_facts(self.fields))
@@ -82,6 +90,17 @@ class Given:
         for step in self.then:
             problem = step(problem)
         return problem
+
+
+def place(part: Any, parts: Sequence[Any]) -> int | None:
+    """The place of this very part among others; None where it isn't there."""
+    return next((i for i, other in enumerate(parts) if other is part), None)
+
+
+def replaced(parts: Sequence[Any], old: Sequence[Any], new: Sequence[Any]) -> list[Any]:
+    """Parts, with those among `old` replaced by those that stand at their places in `new`."""
+    places = [place(part, old) for part in parts]
+    return [part if at is None else new[at] for part, at in zip(parts, places, strict=True)]
 
 
 def _facts(fields: Mapping[str, Any]) -> Iterator[Hashable]:

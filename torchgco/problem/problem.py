@@ -25,7 +25,7 @@ from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
-from torchgco.problem.given import Given
+from torchgco.problem.given import Given, place, replaced
 from torchgco.problem.goal import Goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
@@ -303,10 +303,11 @@ class Problem:
         if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
             raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", describe(x0))
         _check_constraints(constraints)
-        if cost is not None and not isinstance(cost, Cost):
-            raise InputError("cost", "a Cost", _named(cost))
-        if dynamics is not None and not isinstance(dynamics, Dynamics):
-            raise InputError("dynamics", "a Dynamics", _named(dynamics))
+        if (now := self.current()) is not self:
+            return now.started_at(x0, replaced(constraints, self.constraints, now.constraints), cost, dynamics)
+        for field, part, kind in (("cost", cost, Cost), ("dynamics", dynamics, Dynamics)):
+            if part is not None and not isinstance(part, kind):
+                raise InputError(field, f"a {kind.__name__}", _named(part))
         if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
             raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
         with computing_on(x0.device):
@@ -316,9 +317,8 @@ class Problem:
             dims = self._dimensions(x0, model)
             rows = _all_bound(constraints, dims)
             for i, part in enumerate(rows):
-                if not isinstance(part, Obstacles):
-                    continue
-                if part.position != dims.position or (part.moving and part.dt != dims.dt):
+                other = isinstance(part, Obstacles) and (part.position, part.dt if part.moving else dims.dt)
+                if other and other != (dims.position, dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
                     raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
             if [type(part) for part in rows] != [type(part) for part in self.constraints]:
@@ -332,10 +332,11 @@ class Problem:
                 if self.goal is None or self.goal.assumed:
                     parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
-            known = set(map(id, self.constraints))
-            new = [pair for pair in zip(constraints, rows, strict=True) if id(pair[0]) not in known]
-            model = None if dynamics is None else (dynamics, parts["dynamics"])
-            check_code(dims, started.x0, model, None if cost is None else (cost, parts["cost"]), new)
+            given = self.given and self.given.started(self, x0, constraints, cost, dynamics)
+            object.__setattr__(started, "given", given)
+            new = [pair for pair in zip(constraints, rows, strict=True) if place(pair[0], self.constraints) is None]
+            pair = lambda part, name: None if part is None else (part, parts[name])
+            check_code(dims, started.x0, pair(dynamics, "dynamics"), pair(cost, "cost"), new)
         return started
 
     def cast(self, dtype: torch.dtype) -> Self:
