@@ -119,4 +119,6 @@ def _facts(fields: Mapping[str, Any]) -> Iterator[Hashable]:
 
 def _sum(array: np.ndarray) -> int | None:
     """A sum over the bytes of numbers; None of other things."""
-    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).reshape(-1)) if array.dtype.kind in "biuf" else None
+    return (
+        zlib.crc32(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data) if array.dtype.kind in "biuf" else None
+    )

@@ -63,14 +63,15 @@ def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence
         arguments: (2, K, ...).
     """
     several = _tried(function, rows, k, *arguments)
-    whole = several is not None and several.shape[:2] == (len(rows), len(k))
-    for at in {0, len(k) // 2, len(k) - 1} if several is not None and whole else ():
+    if several is None or several.shape[:2] != (len(rows), len(k)):
+        return False
+    for at in {0, len(k) // 2, len(k) - 1}:
         one = [z[:, at] for z in arguments]
         alone = _tried(function, rows, int(k[at]), *one)
         samples = _tried(function, rows, int(k[at]), *(torch.stack((z, z, z), dim=1) for z in one))
         for found in (alone, None if samples is None else samples[:, 0]):
-            fits = found is not None and several[:, at].shape == found.shape
-            if fits and bool(unlike(found, several[:, at]).any()):
+            due = several[:, at]
+            if found is not None and found.shape == due.shape and bool(unlike(found, due).any()):
                 return True
     return False
 
@@ -108,7 +109,7 @@ def _foreign(*rows: Tensor) -> Iterator[list[Tensor]]:
         yield [part + NEAR * (1.0 + part.abs()) * scattered(part) for part in z]
 
 
-def _tried(function: Callable[..., Tensor], *arguments: Tensor) -> Tensor | None:
+def _tried(function: Callable[..., Tensor], *arguments: Tensor | int) -> Tensor | None:
     """The function's values; None where it refuses such arguments."""
     try:
         with warnings.catch_warnings():

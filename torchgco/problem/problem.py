@@ -317,10 +317,10 @@ class Problem:
             dims = self._dimensions(x0, model)
             rows = _all_bound(constraints, dims)
             for i, part in enumerate(rows):
-                other = isinstance(part, Obstacles) and (part.position, part.dt if part.moving else dims.dt)
-                if other and other != (dims.position, dims.dt):
+                other = (part.position, part.dt if part.moving else dims.dt) if isinstance(part, Obstacles) else None
+                if other is not None and other != (dims.position, dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
-                    raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
+                    raise InputError(f"constraints[{i}]", expected, f"bound ones for {other[1]} s and {other[0]}")
             if [type(part) for part in rows] != [type(part) for part in self.constraints]:
                 kinds = ", ".join(type(part).__name__ for part in self.constraints)
                 raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in rows))
