@@ -270,7 +270,9 @@ class Solution:
         rows = worst_rows(problem, self.X.detach(), self.U.detach(), self.times)
         return pd.DataFrame(rows).rename_axis("element")
 
-    if TYPE_CHECKING:  # pages know solutions: `torchgco` adds the method
+    if TYPE_CHECKING:  # pages and derivatives know solutions: `torchgco` adds these methods
+
+        def predict(self, changed: Problem, problem: Problem | None = None) -> Solution: ...
 
         def show(self, problem: Problem) -> HtmlPage: ...
 

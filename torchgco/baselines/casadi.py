@@ -22,7 +22,7 @@ from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
 from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Callback, Progress, Solver
 from torchgco.solvers.timing import Chooser
@@ -70,7 +70,7 @@ class CasADiSolver(Solver):
             InputError: a part of the problem that can't be traced, an operation without a counterpart in CasADi, an
                 option that the plugin refuses, or (FATROP) rows that join several knots.
         """
-        check_problem(problem)
+        problem = current_problem(problem)
         return self if problem.time is not None else self._prepared(problem)
 
     def _prepared(self, problem: Problem) -> PreparedCasADi:
@@ -156,7 +156,7 @@ class PreparedCasADi(Solver):
         Raises:
             InputError: a problem of another form.
         """
-        check_problem(problem)
+        problem = current_problem(problem)
         return replace(self, problem=problem, program=self.program.of(problem))
 
     def run_from(self, X0: Tensor, U0: Tensor) -> Solution:
