@@ -272,6 +272,9 @@ def _constraint(constraint: Constraint, problem: Problem) -> Constraint:
     n, m = problem.n, problem.m
     if isinstance(constraint, RateBounds):
         return _Rates(constraint.with_states_from(n + 1), n, m)
+    if isinstance(constraint, ControlBounds) and problem.time is not None and problem.time.count > 1:
+        return replace(constraint, lower=pad(constraint.lower, (0, 1), value=-torch.inf),
+                       upper=pad(constraint.upper, (0, 1), value=torch.inf))  # fmt: skip
     if isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE:
         return constraint
     return _Rows(constraint, n, m)
