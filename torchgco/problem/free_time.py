@@ -86,6 +86,7 @@ class FreeTime(PerElement):
 def _firsts(segments: Any, dims: Dimensions) -> tuple[int, ...]:
     """The first stage of every segment."""
     field, N = "time.segments", dims.N
+    given: Any = segments
     if segments is None:
         return (0,)
     if isinstance(segments, int) and not isinstance(segments, bool):
@@ -94,7 +95,7 @@ def _firsts(segments: Any, dims: Dimensions) -> tuple[int, ...]:
         return tuple(round(s * N / segments) for s in range(segments))
     if isinstance(segments, tuple) and segments[:1] == (0,) and all(type(k) is int and k < N for k in segments):
         return segments  # bound before
-    knots = resolve_knots(segments, N, field, dims.like.device)
+    knots = resolve_knots(given, N, field, dims.like.device)
     found = [int(k) for k in torch.arange(N + 1)[knots if isinstance(knots, slice) else knots.cpu()]]
     if found != sorted(found) or found[0] < 1 or found[-1] > N - 1:
         raise InputError(field, f"knots within 1..{N - 1}, in their order", found)

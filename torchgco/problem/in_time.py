@@ -210,8 +210,7 @@ class _Dynamics(WrappedDynamics):
 
 def _of_stages(values: Any, k: int | Tensor, like: Tensor) -> Tensor:
     """Values (N,) of stage k or stages k (K,), shaped to fit `like` (B,), (B, S) or (B, K)."""
-    found = values[k]
-    return found.expand(like.shape)
+    return values[k].expand(like.shape)
 
 
 def _cost(problem: Problem, time: FreeTime) -> Cost:
@@ -328,13 +327,14 @@ class _Rates(_Rows):
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         rates, one = self.constraint, X.shape[-1]
         upper, lower = rates.limits()
-        every = torch.arange(self.m, device=H.device)
+        every, before = torch.arange(self.m, device=H.device), rates.states
+        assert before is not None
         J = H.new_zeros(*torch.broadcast_shapes(upper.shape[:2], g.shape[:2]), g.shape[-1], H.shape[-1])
         first = 0
         for which, limit, sign in ((rates.above, upper, 1.0), (rates.below, lower, -1.0)):
             controls = every[which]
             rows = first + torch.arange(len(controls), device=H.device)
-            J[..., rows, one + 1 + controls], J[..., rows, rates.states[controls]] = sign, -sign
+            J[..., rows, one + 1 + controls], J[..., rows, before[controls]] = sign, -sign
             J[..., rows, self.n] = -sign * limit
             first += len(controls)
         slope = (g.unsqueeze(-2) @ J).squeeze(-2)

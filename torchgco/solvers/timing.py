@@ -90,7 +90,9 @@ class Timed:
         while rows.numel() > 0:
             self._tried(rows, guess[rows], given)
             best = self._found
-            over = (best.violation <= self.chooser.limit) | (best.status == Status.INVALID_START)
+            over = (best.status == Status.CONVERGED) | (best.status == Status.INVALID_START)
+            if self.chooser.paces:  # a search that found a way is followed by others anyway
+                over = over | (best.violation <= self.chooser.limit)
             short = over & self._is_short(torch.arange(len(over)), best) & (again == 0)  # once more, to be sure
             again += short
             left = (~over | short) & (guess < time.most).any(-1)
