@@ -319,7 +319,7 @@ def text(count: int, seed: int, stages: list[int], margin: float, tracks: int) -
 main = Command(
     __doc__, "free_time", text, "{count} drawn carts, {tracks} moved tracks, seed {seed}, processor time of one thread",
     "CasADi", count=(64, "carts"), seed=(7, "of carts and tracks"), stages=([20, 80], "of each leg of the race"),
-    margin=(0.001, "of the gates' radius in the plan, m"), tracks=(10, "races with moved gates"),
+    margin=(0.0, "of the gates' radius in the plan, m"), tracks=(0, "races with moved gates"),
 )  # fmt: skip
 
 if __name__ == "__main__":
