@@ -28,7 +28,7 @@ from torchgco.problem.free_start import checked_horizon, chooses_position, moved
 from torchgco.problem.given import Given, place, replaced
 from torchgco.problem.goal import Goal
 from torchgco.problem.known import Known
-from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
+from torchgco.problem.scale import CostScale, changes_of, cost_scale, reach, savings
 from torchgco.problem.summary import summary
 
 
@@ -188,10 +188,10 @@ class Problem:
         """
         X, U = self.at_rest
         total, goal = self.cost.total(X, U), None if self.goal is None else self.goal.position
-        changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
+        steps = reach(self.dynamics, X, self.control_bounds)
+        changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position, steps)
         changes = torch.maximum(changes, savings(slopes, curvatures))
-        stages = None if self.horizon is None else self.stages
-        return cost_scale(total, curvatures[:, :-1, self.n :], changes, stages, self.control_bounds)
+        return cost_scale(total, curvatures[:, :-1, self.n :], changes, self.horizon, self.control_bounds)
 
     @property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
