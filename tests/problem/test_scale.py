@@ -158,4 +158,4 @@ def test_constants_hide_nothing_in_small_units_either(s: float, constant: float)
     due, found = (torchgco.solve(made(more), solver="interior_point") for more in (0.0, constant))
     assert found.statuses == [Status.CONVERGED] * 16
     own = made(0.0).cost.total(found.X, found.U)
-    torch.testing.assert_close(own, due.cost, rtol=2e-3, atol=0)
+    torch.testing.assert_close(own, due.cost, rtol=5e-3, atol=0)
