@@ -27,7 +27,7 @@ from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import FARTHEST
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.plant import Plant, RotorPlant, hovering
+from torchgco.missions.plant import Plant, RotorPlant, flown, hovering
 from torchgco.missions.sensing.sensors import Depth, Lidar
 from torchgco.missions.tracker import Reference, Tracker, Tracking
 from torchgco.missions.unknown.exploration import Exploration
@@ -49,8 +49,8 @@ class Mission:
     Args:
         planner: makes a plan in every control period, which is a time step of the planning problems.
         tracker: its time step divides the control period, and is the plant's.
-        plant: the vehicle; parameters that differ between missions are (B,). Its airframe is the one of the planning
-            model, which planner and tracker use; its errors are deviations from that.
+        plant: what is flown; parameters that differ between missions are (B,). Its airframe is that of the planning
+            model, as those of planner, tracker and explorer are; its errors are deviations from that.
         disturbance: wind and noise.
         duration: s, after which a mission ends with TIMEOUT.
         goal_radius: m, within which the goal counts as reached; None: the problems' own.
@@ -88,10 +88,10 @@ class Mission:
 
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
-        frame, flown = airframe_of(dynamics), getattr(self.plant, "airframe", None)
-        if isinstance(flown, Airframe) and flown != frame:
-            named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(flown, f.name)]
-            planned, given = (", ".join(f"{name} {getattr(one, name)}" for name in named) for one in (frame, flown))
+        frame, other = airframe_of(dynamics), getattr(self.plant, "airframe", None)
+        if isinstance(other, Airframe) and other != frame:
+            named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(other, f.name)]
+            planned, given = (", ".join(f"{name} {getattr(one, name)}" for name in named) for one in (frame, other))
             raise InputError("plant.airframe", f"that of the planning model, {planned}", given)
         if self.substeps(float(dynamics.dt)) is None:
             raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
@@ -175,7 +175,7 @@ class _Flight:
         self.start = x[:, :3]
         self.problem, self.planned = problem, self.planner.problem(problem, x)
         self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
-        self.plant, self.x, self.rows, self.ids = mission.plant, x, torch.arange(problem.B), ids
+        self.plant, self.x, self.rows, self.ids = flown(mission.plant, self.airframe), x, torch.arange(problem.B), ids
         self.exploration = mission.exploration(problem, seed, ids)
         knots = (problem.N if self.exploration is None else mission.explorer.stages) + 1
         self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, knots)
