@@ -21,6 +21,11 @@ from torchgco.dynamics.integrators import Integrator
 Components = tuple[Tensor, ...]
 Row = tuple[float, float, float]
 Limits = tuple[float | None, ...]
+Texts = tuple[str, ...]
+POSE: Texts = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
+POSE_UNITS: Texts = (*["m"] * 3, *["m/s"] * 3, *[""] * 4, *["rad/s"] * 3)
+THRUSTS: Texts = ("thrust 1", "thrust 2", "thrust 3", "thrust 4")
+ROTORS: Texts = ("rotor 1", "rotor 2", "rotor 3", "rotor 4")
 
 
 @dataclass(frozen=True)
@@ -171,6 +176,10 @@ class QuadrotorPlanning(Dynamics):
     n: ClassVar[int] = 14
     m: ClassVar[int] = 4
     position: ClassVar[slice] = slice(0, 3)
+    state_names: ClassVar[Texts] = (*POSE, "a")
+    state_units: ClassVar[Texts] = (*POSE_UNITS, "m/s^2")
+    control_names: ClassVar[Texts] = ("wx command", "wy command", "wz command", "a command")
+    control_units: ClassVar[Texts] = ("rad/s", "rad/s", "rad/s", "m/s^2")
     per_element: ClassVar[tuple[str, ...]] = ("rate_time_constant", "thrust_time_constant")
 
     def __post_init__(self) -> None:
@@ -181,6 +190,10 @@ class QuadrotorPlanning(Dynamics):
         """The least and greatest controls that the vehicle can follow, None where there is no limit."""
         low, high = self.airframe.accelerations
         return (None, None, None, low), (None, None, None, high)
+
+    def derived(self, x: Tensor, u: Tensor) -> dict[str, Tensor]:
+        """The joint thrust of the rotors, m a."""
+        return {"thrust [N]": self.airframe.mass * x[..., 13]}
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         states, controls = components(x), components(u)
@@ -209,6 +222,10 @@ class QuadrotorPlant(Dynamics):
     n: ClassVar[int] = 17
     m: ClassVar[int] = 4
     position: ClassVar[slice] = slice(0, 3)
+    state_names: ClassVar[Texts] = (*POSE, *THRUSTS)
+    state_units: ClassVar[Texts] = (*POSE_UNITS, *["N"] * 4)
+    control_names: ClassVar[Texts] = ROTORS
+    control_units: ClassVar[Texts] = ("rpm",) * 4
 
     def __post_init__(self) -> None:
         check_options(self, "plant")
@@ -247,6 +264,10 @@ class RotorTracking(Dynamics):
 
     n: ClassVar[int] = 7
     m: ClassVar[int] = 4
+    state_names: ClassVar[Texts] = ("wx", "wy", "wz", *THRUSTS)
+    state_units: ClassVar[Texts] = (*["rad/s"] * 3, *["N"] * 4)
+    control_names: ClassVar[Texts] = ROTORS
+    control_units: ClassVar[Texts] = ("rpm",) * 4
 
     def __post_init__(self) -> None:
         check_options(self, "rotors")

@@ -21,6 +21,7 @@ from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
+from torchgco.dynamics.names import controls_of, states_of
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
@@ -389,6 +390,8 @@ class Problem:
         check_value(getattr(self.dynamics, "dt", None), Seconds | None, "dynamics.dt")
         if type(self.dynamics).step is Dynamics.step:
             check_value(self.dynamics.integrator, Integrator, "dynamics.integrator")
+        for named in (states_of, controls_of):
+            named(self.dynamics)
         where = self.dynamics.position
         if where is not None and where not in [slice(i, j) for j in range(1, self.n + 1) for i in range(j)]:
             raise InputError("dynamics.position", f"a slice of states within 0..{self.n}, or None", repr(where))
