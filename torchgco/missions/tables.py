@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 import torch
 
 from torchgco.base.errors import InputError
@@ -16,6 +16,9 @@ from torchgco.missions.contact import Contact
 from torchgco.missions.log import PARTS, MissionLog
 from torchgco.missions.outcome import Ending, judge_flight
 from torchgco.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Arrays = Mapping[str, np.ndarray]
 SCALARS = (
@@ -61,6 +64,8 @@ def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances:
 
     Commands `u1` to `u4` are the first of a control step; `u1_low` and `u1_high` the least and the largest of it.
     """
+    import pandas as pd
+
     frames = []
     for b, number in enumerate(ids):
         K = _steps(arrays, b)
@@ -91,6 +96,8 @@ def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float, airframe:
     A command holds from its row to the next one; the last row is the mission's end and repeats the last command.
     Arguments as `mission_frame`.
     """
+    import pandas as pd
+
     low, high = airframe.rotor_speeds
     frames = []
     for b, number in enumerate(ids):
