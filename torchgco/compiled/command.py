@@ -18,7 +18,7 @@ from torchgco.compiled.numbers import Numbers, as_floats, numbers_of, with_numbe
 from torchgco.compiled.stages import moved, stage_of, stages_between
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 
 CPU = torch.device("cpu")
 
@@ -51,7 +51,7 @@ class MPPIController:
         self, problem: Problem, sampler: MPPI | None = None, seed: int = 0, period: float | None = None
     ) -> None:
         check_untransformed("MPPIController")
-        check_problem(problem)
+        problem = current_problem(problem)
         if problem.x0.device.type != "cpu":
             raise InputError("problem", "one on the CPU", str(problem.x0.device))
         self.sampler = check_value(sampler or MPPI(), MPPI, "sampler")

@@ -19,7 +19,7 @@ from torchgco.compiled.numbers import Numbers, as_floats
 from torchgco.compiled.plan import Plan
 from torchgco.compiled.stages import stage_of, stages_between
 from torchgco.constraints.bounds import RateBounds
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 
 CONVERGED, FEASIBLE = int(Status.CONVERGED), int(Status.FEASIBLE)
@@ -62,7 +62,7 @@ class MPC:
         changes: Sequence[str] | None = None,
         tolerance: float | None = None,
     ) -> None:
-        check_problem(problem)
+        problem = current_problem(problem)
         for name, given in (("horizon", problem.horizon), ("free_start", problem.free_start)):
             if given is not None:
                 raise InputError(f"problem.{name}", "None in a loop, which starts from measured states", "one")

@@ -34,7 +34,7 @@ from torchgco.missions.tracker import Reference, Tracker, Tracking
 from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import Explorer, SensorName, Unknown
 from torchgco.native.compiler import find_compiler
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
@@ -141,7 +141,7 @@ class Mission:
         """
         if self.sensor != "full":
             raise InputError("mission.sensor", "full for first plans", self.sensor)
-        seed, ids = check_flown(self, problem, seed, ids)
+        problem, seed, ids = check_flown(self, problem, seed, ids)
         with computing_on(CPU):
             x = hovering(airframe_of(problem.dynamics), problem.x0[:, :3])
             period = float(problem.dynamics.dt)
@@ -158,9 +158,9 @@ class Mission:
         return self.planner if self.latency == 0 else replace(self.planner, first_step=False)
 
 
-def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | None) -> tuple[int, Tensor]:
-    """The seed and the ids (B,) of a flight, where the problems can be flown; see `Mission.fly`."""
-    check_problem(problem)
+def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | None) -> tuple[Problem, int, Tensor]:
+    """The problems, the seed and the ids (B,) of a flight, where they can be flown; see `Mission.fly`."""
+    problem = current_problem(problem)
     seed = check_value(seed, Seed, "seed")
     if ids is not None:
         check_ids(ids, problem)
@@ -171,7 +171,7 @@ def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | Non
     mission.check(problem.dynamics)
     if problem.x0.dtype != torch.float64:
         raise InputError("x0", "torch.float64 for a mission", problem.x0.dtype)
-    return seed, torch.arange(problem.B, device="cpu") if ids is None else ids
+    return problem, seed, torch.arange(problem.B, device="cpu") if ids is None else ids
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ class Flight:
         self, mission: Mission, problem: Problem, seed: int = 0, ids: Tensor | None = None, begin: Begin | None = None
     ) -> None:
         self.mission = mission
-        self.seed, ids = check_flown(mission, problem, seed, ids)
+        problem, self.seed, ids = check_flown(mission, problem, seed, ids)
         self.airframe = airframe_of(problem.dynamics)
         self.period = float(problem.dynamics.dt)
         self.substeps = mission.substeps(self.period) or 1

@@ -40,7 +40,7 @@ def asks_for_gradients(problem: Problem) -> bool:
         raise InputError("solve", "a call outside of forward_ad.dual_level: derivatives are reverse", "one inside")
     if not torch.is_grad_enabled() or torch.is_inference_mode_enabled() or problem.B == 0:
         return False
-    if problem.given is None and not _captures(problem):
+    if not (problem.given is not None and problem.given.asks) and not _captures(problem):
         return False
     for got, refused in (
         (problem.x0.dtype, problem.x0.dtype != torch.float64),
