@@ -67,7 +67,8 @@ def _of_position(dynamics: Dynamics, x: Tensor, u: Tensor, k: Tensor, taken: set
     if at is None or at.stop - at.start > 3 or not dynamics.is_integrated:
         return {}
     model, x, u = dynamics.at(k), x.unsqueeze(0), u.unsqueeze(0)
-    rates, change = jvp(lambda z: model.field(z, u), (x,), (model.field(x, u),))
+    rates = model.field(x, u)
+    change = jvp(lambda z: model.field(z, u), (x,), (rates,))[1]
     columns = {}
     for kind, unit, values in (("v", "m/s", rates), ("a", "m/s^2", change)):
         names = [f"{kind}{letter}" for letter in "xyz"[: at.stop - at.start]]

@@ -24,7 +24,7 @@ from torchgco.obstacles.oscillating import OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
-from torchgco.scenarios.base import Scenario
+from torchgco.scenarios.base import Family, Scenario
 from torchgco.scenarios.layouts import SINES, Layouts
 
 STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
@@ -120,8 +120,9 @@ class Vehicle:
         Raises:
             InputError: as `task`.
         """
-        sized = {"vehicle_radius": self.radius} if hasattr(scenario, "vehicle_radius") else {}
-        return self.task(self.at_rest(replace(scenario, **sized).draw(ids, seed)), **where)
+        if isinstance(scenario, Family):
+            scenario = replace(scenario, vehicle_radius=self.radius)
+        return self.task(self.at_rest(scenario.draw(list(ids), seed)), **where)
 
     @property
     def dimension(self) -> int:
