@@ -155,6 +155,16 @@ def test_rates_count_from_the_controls_that_were_returned() -> None:
     assert np.abs(last).max() > 0.4
 
 
+@pytest.mark.parametrize("context", [torch.inference_mode, lambda: torch.device("meta")], ids=["inference", "device"])
+def test_modes_and_default_devices_of_the_caller_change_nothing(context: Callable[[], Any]) -> None:
+    mpc, other = MPC(driven()), MPC(driven())
+    for k, late in enumerate((None, None, 1e-9)):
+        with context():
+            u, at = other.step(START + 0.1 * k, max_seconds=late), other.plan.at(0.1 * k + 0.03, START)
+        assert torch.equal(mpc.step(START + 0.1 * k, max_seconds=late), u)
+        assert torch.equal(mpc.plan.at(0.1 * k + 0.03, START).u, at.u)
+
+
 WRONG: dict[str, tuple[Callable[[MPC], Any], str]] = {
     "shape": (lambda mpc: mpc.step(np.zeros(3)), r"x: expected shape \(1, 4\), or \(4,\)"),
     "NaN": (lambda mpc: mpc.step(START * np.nan), "x: expected finite states, got NaN or infinity"),

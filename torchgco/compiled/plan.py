@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import computing_on
 from torchgco.compiled.numbers import as_floats
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.problem.between import between
 
+CPU = torch.device("cpu")
 ROUNDING = 1e-9  # of a stage: a time this close before a knot is the knot's
 
 
@@ -70,7 +72,10 @@ class Plan:
         """
         if isinstance(t, bool) or not isinstance(t, int | float) or not np.isfinite(t):
             raise InputError("t", "a time in seconds", shown(t))
-        given = None if x is None else self._states(x)
+        with computing_on(CPU):
+            return self._at(t, None if x is None else self._states(x))
+
+    def _at(self, t: float, given: Tensor | None) -> Instant:
         B, N, m = self.U.shape
         stages = np.clip((t - self.start) / self.dt, 0.0, N)
         k = np.minimum(np.floor(stages + ROUNDING), N - 1).astype(int)
