@@ -50,7 +50,7 @@ def rk4(x: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
 
 
 def test_steps_are_those_of_a_compiled_problem() -> None:
-    mpc, other, x = MPC(driven()), torchgco.compile(driven(), "interior_point", receding=True), START
+    mpc, other, x = MPC(driven()), torchgco.compile(driven(), receding=True), START
     for k in range(40):
         u, answer = mpc.step(x, x_ref=path(DT * k)), other(x0=x, x_ref=path(DT * k))
         assert torch.equal(u, answer.u[0]) and mpc.t == pytest.approx(DT * k)
@@ -135,6 +135,14 @@ def test_a_plan_between_its_knots() -> None:
     other = MPC(driven(model=step))
     other.step(START)
     torch.testing.assert_close(other.plan.at(0.125).x, 0.75 * other.plan.X[:, 1] + 0.25 * other.plan.X[:, 2])
+
+
+def test_the_solver_is_one_that_serves_the_problem() -> None:
+    """Among obstacles it is `gco`: a disc that is put into the way needs a search."""
+    assert MPC(driven()).compiled.solver == "gco"
+    free = Problem(CAR, QuadraticCost([1] * 4, [1] * 2, [1] * 4), [], START.tolist(), N)
+    assert MPC(free).compiled.solver == "interior_point"
+    assert MPC(driven(), "interior_point").compiled.solver == "interior_point"
 
 
 def test_a_reset_begins_again() -> None:

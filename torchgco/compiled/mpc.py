@@ -38,7 +38,9 @@ class MPC:
 
     Args:
         problem: B vehicles with stages of one length; its start isn't used.
-        solver: "interior_point" or "gco": of the first period, and of those that no plan before leads to.
+        solver: "gco" or "interior_point": of the first period, and of those that no plan before leads to, where an
+            obstacle has come into the way, say. None: "gco" among obstacles, as only it searches for other ways, else
+            "interior_point".
         period: s, from one step to the next; None: a stage.
         max_seconds: of a step; a solve that isn't ready by then is late. None: none is.
         changes, tolerance: as `torchgco.compile` takes them.
@@ -55,7 +57,7 @@ class MPC:
     def __init__(
         self,
         problem: Problem,
-        solver: str = "interior_point",
+        solver: str | None = None,
         period: float | None = None,
         *,
         max_seconds: float | None = None,
@@ -69,6 +71,8 @@ class MPC:
         self.dt = stage_of(problem)
         self.period = self.dt if period is None else check_value(period, Seconds, "period")
         self.max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
+        if solver is None:
+            solver = "gco" if problem.obstacles else "interior_point"
         self.compiled: Compiled = compile(problem, solver, changes, tolerance=tolerance)
         self._problem = problem
         self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if _follows(part)]
