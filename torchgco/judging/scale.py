@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.judging.worst import NONE
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
@@ -18,8 +20,8 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """The place (B,) of a constraint with a violation that is large beside a row's values; `NONE` where there is none.
 
     The size of a row is its largest value at rest, and of inequalities along the trajectory, too, where equalities are
-    met. Rows that have the value at rest still, such as those of a given start, say nothing; obstacles have sizes of
-    their own.
+    met; the two sides of a bound have one size. Rows that have the value at rest still, such as those of a given start,
+    say nothing; obstacles have sizes of their own.
 
     Args:
         X, U: trajectories, (B, N+1, n) and (B, N, m).
@@ -33,9 +35,19 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         if before.numel() == 0:
             continue
         sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
-        rows = sizes.amax(1, keepdim=True)
+        rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
         size = torch.where(rows > MET, rows, rows.amax(-1, keepdim=True))
         admitted = torch.where(size > MET, SHARE * size, ROUGH)
         large = (constraint.violation(X, U) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place
+
+
+def _of_both_sides(constraint: Constraint, sizes: Tensor) -> Tensor:
+    """Sizes (B, 1, p) of rows, of bounds the larger one of those above and below a component."""
+    if not isinstance(constraint, (ControlBounds, StateBounds, RateBounds)):
+        return sizes
+    every = torch.arange(constraint.upper.shape[-1], device=sizes.device)
+    place = torch.cat((every[constraint.above], every[constraint.below])).expand_as(sizes)
+    either = sizes.new_zeros(*sizes.shape[:2], len(every)).scatter_reduce(2, place, sizes, "amax")
+    return either.gather(2, place)
