@@ -45,10 +45,10 @@ class Peer:
     last: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def ready(cls, plant: ByHand, compiled: bool) -> Iterator[Peer]:
+    def ready(cls, plant: ByHand, compiled: bool, plugins: tuple[str, ...] = ("fatrop", "ipopt")) -> Iterator[Peer]:
         """All of them, or those that aren't compiled."""
         for name, plugin, is_compiled, shifted in CASES:
-            if compiled or not is_compiled:
+            if plugin in plugins and (compiled or not is_compiled):
                 yield cls(name, plugin, is_compiled, shifted, plant)
 
     def __post_init__(self) -> None:
