@@ -34,8 +34,10 @@ from torchgco.base.status import Status as Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
+from torchgco.compiled import MPC as MPC
 from torchgco.compiled import Answer as Answer
 from torchgco.compiled import Compiled as Compiled
+from torchgco.compiled import MPPIController as MPPIController
 from torchgco.compiled import compile as compile
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
@@ -98,9 +100,9 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets", "plan_batch",
-    "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap",
-    "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
+    "solve", "MPC", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets",
+    "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish",
+    "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,7 @@ from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
@@ -198,6 +199,28 @@ def numbers_of(problem: Problem) -> list[Number]:
         elif not isinstance(part, Obstacles):
             found += _of_part(part, name, i)
     return found
+
+
+def with_numbers_as_they_are(problem: Problem) -> Problem:
+    """The same problems after numbers were written, with nothing that was computed from the former ones."""
+    constraints = tuple(_renewed(part) for part in problem.constraints)
+    known = replace(problem.known, row_shapes=None, interior=None, packed=(None, None))
+    now = problem._with({"constraints": constraints}, known)
+    if now.goal is None or now.goal.assumed:
+        dims = now._dimensions(now.x0)
+        now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, known)
+    return now
+
+
+def _renewed(part: Any) -> Any:
+    """A part of a problem with what was derived from its numbers made again."""
+    if not isinstance(part, BoundSpheres):
+        return part
+    made = BoundSpheres.prepare(
+        part.centers, part.inflated_radii, part.velocities, part.absent, part.vehicle_radius, part.knots,
+        part.position, part.dt,
+    )  # fmt: skip
+    return replace(made, stops=part.stops)
 
 
 def _own(part: Any, B: int) -> Any:

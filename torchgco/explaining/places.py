@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
@@ -80,7 +82,7 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     constraint = problem.constraints[worst["constraint"]]
     length = " m" if constraint.geometric else ""
     where = knots_told([worst["knot"]], t)
-    row = row_told(constraint, worst["row"])
+    row = row_told(constraint, worst["row"], problem.dynamics)
     return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
 
 
@@ -89,14 +91,16 @@ def constraint_told(constraint: Constraint, i: int) -> str:
     return f"constraints[{i}] ({kind_of(constraint)})"
 
 
-def row_told(constraint: Constraint, row: int) -> str:
-    """A row of a constraint: which obstacle, or which bound of which component."""
+def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
+    """A row of a constraint: which obstacle, or which bound of which component, by its name where it has one."""
     if isinstance(constraint, Obstacles):
         return f"obstacle {row}, "
     if isinstance(constraint, ControlBounds | StateBounds):
         above, below = (_places(constraint, part) for part in (constraint.above, constraint.below))
         side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
-        return f"{side} bound of {'control' if constraint.of == 'u' else 'state'} {component}, "
+        kind, of = ("control", controls_of) if constraint.of == "u" else ("state", states_of)
+        named = getattr(dynamics, f"{kind}_names")
+        return f"{side} bound of {kind} {component}{f' ({of(dynamics)[component].label})' if len(named) else ''}, "
     return f"row {row}, "
 
 

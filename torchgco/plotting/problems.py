@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape
 from torchgco.constraints import ControlBounds, Separation, StateBounds
+from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.bodies import ABOVE, Plane
@@ -239,7 +240,7 @@ def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Cours
     count = problem.n + problem.m
     rows = ceil(count / COLUMNS)
     axes = list(figure.subplots(rows, min(COLUMNS, count), squeeze=False, sharex=True).flat)
-    names = _names(problem)
+    names = [one.label for one in (*states_of(problem.dynamics), *controls_of(problem.dynamics))]
     for i, ax in enumerate(axes[:count]):
         state, j = i < problem.n, i if i < problem.n else i - problem.n
         values = []
@@ -258,16 +259,6 @@ def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Cours
             ax.tick_params(labelbottom=True)
     for ax in axes[count:]:
         ax.remove()
-
-
-def _names(problem: Problem) -> list[str]:
-    """Titles of the histories: coordinates of the position by letter, other states and controls by number."""
-    at = problem.dynamics.position
-    place = range(0) if at is None else range(at.start, at.stop)
-    states = [
-        f"{'xyz'[j - place.start]} [m]" if j in place and len(place) <= 3 else f"x[{j}]" for j in range(problem.n)
-    ]
-    return [*states, *(f"u[{j}]" for j in range(problem.m))]
 
 
 def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.ndarray], state: bool, j: int) -> None:

@@ -24,6 +24,7 @@ from torchgco.constraints.base import Constraint, FunctionConstraint, innermost
 from torchgco.costs.base import Cost
 from torchgco.costs.function import FunctionCost
 from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.names import check_names
 from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
@@ -94,6 +95,7 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     """
     if not is_users(dynamics):
         return
+    check_names(dynamics)
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
     k = torch.arange(3, device=x0.device).clamp(max=N - 1)
