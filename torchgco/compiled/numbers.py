@@ -21,6 +21,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.base.values import Values
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
@@ -191,6 +192,8 @@ def numbers_of(problem: Problem) -> list[Number]:
         name = f"constraints[{i}]"
         if isinstance(part, ControlBounds | StateBounds):
             found += _of_bounds(part, name, i)
+        elif isinstance(part, NormBounds | Cone):
+            found += _of_vectors(part, name, i)
         elif isinstance(part, BoundSpheres):
             found += _of_spheres(part, name, i)
         elif isinstance(part, BoundBoxes) and not bool(part.absent.any()):
@@ -265,6 +268,27 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
     ]
 
 
+def _of_vectors(part: NormBounds | Cone, name: str, i: int) -> list[Number]:
+    """Of bounds on norms and of cones; an axis may have any length above 0."""
+
+    def joint(new: Mapping[str, Floats]) -> tuple[str, Any] | None:
+        lower, upper = (new.get(f"{name}.{side}", _view(getattr(part, side))) for side in ("lower", "upper"))
+        over = np.nonzero(~(lower < upper))
+        if not len(over[0]):
+            return None
+        return "lower bounds below the upper ones", f"{(lower + 0 * upper)[over][0]:g}"
+
+    checks: dict[str, Callable[[Floats], tuple[str, Any] | None]] = {
+        "lower": _lengths, "upper": _above_zero, "center": _finite, "apex": _finite, "angle": _angles, "axis": _axes,
+    }  # fmt: skip
+    both = all(getattr(part, side, None) is not None for side in ("lower", "upper"))
+    return [
+        Number(f"{name}.{field}", (_view(getattr(part, field)),), i, True, checks[field], joint=joint if both else None)
+        for field in part.per_element
+        if getattr(part, field) is not None
+    ]
+
+
 def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
     if bool(part.absent.any()):  # padding: which of them are there isn't a number
         return []
@@ -316,6 +340,18 @@ def _present(new: Floats) -> tuple[str, Any] | None:
 
 def _lengths(new: Floats) -> tuple[str, Any] | None:
     return _finite(new) or (None if (new >= 0).all() else ("lengths of at least 0", float(new.min())))
+
+
+def _above_zero(new: Floats) -> tuple[str, Any] | None:
+    return None if (new > 0).all() else ("numbers above 0, or infinity", float(new.min()))
+
+
+def _angles(new: Floats) -> tuple[str, Any] | None:
+    return None if ((new > 0) & (new < np.pi)).all() else ("angles in rad, above 0 and below pi", new.tolist())
+
+
+def _axes(new: Floats) -> tuple[str, Any] | None:
+    return _finite(new) or (None if (np.abs(new).max(-1) > 0).all() else ("vectors other than 0", new.tolist()))
 
 
 def _weights(new: Floats) -> tuple[str, Any] | None:

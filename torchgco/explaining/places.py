@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
@@ -97,6 +98,10 @@ def row_told(constraint: Constraint, row: int) -> str:
         above, below = (_places(constraint, part) for part in (constraint.above, constraint.below))
         side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
         return f"{side} bound of {'control' if constraint.of == 'u' else 'state'} {component}, "
+    if isinstance(constraint, NormBounds | Cone):
+        what = "cone of" if isinstance(constraint, Cone) else f"{constraint.sides[row]} bound of the norm of"
+        places = listed(constraint.components.tolist())  # type: ignore[union-attr]
+        return f"{what} {'controls' if constraint.of == 'u' else 'states'} {places}, "
     return f"row {row}, "
 
 

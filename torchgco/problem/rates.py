@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.constraints.separation import Separation
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -22,7 +23,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 
 # Besides obstacles, which read the position alone: kinds that find their states and controls among others, too.
-IN_PLACE = (ControlBounds, StateBounds, Separation)
+IN_PLACE = (ControlBounds, StateBounds, NormBounds, Cone, Separation)
 FORM = "with controls before"  # what is kept with the form of the problem for this one
 
 
