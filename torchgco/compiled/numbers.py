@@ -20,12 +20,14 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.base.values import Values
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.goal import Goal, GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
@@ -174,13 +176,21 @@ def with_own_numbers(problem: Problem) -> Problem:
         for name, length in (("x_ref", problem.N), ("u_ref", problem.N)):
             part = getattr(cost, name)
             object.__setattr__(cost, name, part.expand(B, length, part.shape[-1]).clone())
-    parts = {
-        "x0": problem.x0.clone(),
-        "dynamics": _own(problem.dynamics, B),
-        "cost": cost,
-        "constraints": tuple(_own(part, B) for part in problem.constraints),
-    }
+    rows = tuple(_own(part, B) for part in problem.constraints)
+    parts = {"x0": problem.x0.clone(), "dynamics": _own(problem.dynamics, B), "cost": cost, "constraints": rows}
+    if problem.goal is not None and problem.goal.required:
+        parts["goal"] = _goal_of(rows[-1], problem)
     return problem._with(parts)
+
+
+def _goal_of(row: Constraint, problem: Problem) -> Goal:
+    """The goal whose numbers lie in the memory of its row's."""
+    goal = problem.goal
+    assert goal is not None
+    if isinstance(row, GoalState):
+        return Goal(row.state[:, problem.position], goal.radius.clone(), True, row.state)
+    assert isinstance(row, GoalBall)
+    return Goal(row.center[:, 0], row.upper[:, 0], True)
 
 
 def numbers_of(problem: Problem) -> list[Number]:
@@ -192,6 +202,11 @@ def numbers_of(problem: Problem) -> list[Number]:
         name = f"constraints[{i}]"
         if isinstance(part, ControlBounds | StateBounds):
             found += _of_bounds(part, name, i)
+        elif isinstance(part, GoalBall):
+            found.append(Number("goal.position", (_view(part.center[:, 0]),), i, True, _finite))
+            found.append(Number("goal.radius", (_view(part.upper[:, 0]),), i, True, _radii))
+        elif isinstance(part, GoalState):
+            found.append(Number("goal.state", (_view(part.state),), i, True, partial(_fixed, part)))
         elif isinstance(part, NormBounds | Cone):
             found += _of_vectors(part, name, i)
         elif isinstance(part, BoundSpheres):
@@ -340,6 +355,16 @@ def _present(new: Floats) -> tuple[str, Any] | None:
 
 def _lengths(new: Floats) -> tuple[str, Any] | None:
     return _finite(new) or (None if (new >= 0).all() else ("lengths of at least 0", float(new.min())))
+
+
+def _radii(new: Floats) -> tuple[str, Any] | None:
+    return _finite(new) or _above_zero(new)
+
+
+def _fixed(part: GoalState, new: Floats) -> tuple[str, Any] | None:
+    free = np.isnan(_view(part.state)[0])
+    fits = (np.isnan(new) == free).all() and np.isfinite(new[..., ~free]).all()
+    return None if fits else ("finite numbers, and NaN in the components that are free at the end", new.tolist())
 
 
 def _above_zero(new: Floats) -> tuple[str, Any] | None:

@@ -13,6 +13,7 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
+from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 SHOWN = 4  # runs of knots, or obstacles, that are named
@@ -79,7 +80,7 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     if worst["constraint"] == NONE:
         return None
     constraint = problem.constraints[worst["constraint"]]
-    length = " m" if constraint.geometric else ""
+    length = " m" if constraint.geometric or isinstance(constraint, GoalBall) else ""
     where = knots_told([worst["knot"]], t)
     row = row_told(constraint, worst["row"])
     return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
@@ -98,6 +99,10 @@ def row_told(constraint: Constraint, row: int) -> str:
         above, below = (_places(constraint, part) for part in (constraint.above, constraint.below))
         side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
         return f"{side} bound of {'control' if constraint.of == 'u' else 'state'} {component}, "
+    if isinstance(constraint, GoalBall):
+        return "its radius, "
+    if isinstance(constraint, GoalState):
+        return f"state {constraint.components.tolist()[row]}, "  # type: ignore[union-attr]
     if isinstance(constraint, NormBounds | Cone):
         what = "cone of" if isinstance(constraint, Cone) else f"{constraint.sides[row]} bound of the norm of"
         places = listed(constraint.components.tolist())  # type: ignore[union-attr]

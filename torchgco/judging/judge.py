@@ -198,7 +198,8 @@ def _verdict(
     goal_distance, reached = torch.full_like(cost, torch.nan), torch.zeros_like(feasible)
     if goal is not None:
         goal_distance = (X[:, -1, problem.position] - goal[0]).square().sum(-1).sqrt()
-        reached = feasible & (goal_distance < goal[1])
+        required = problem.goal is not None and problem.goal.required  # rows among the others are kept as far as these
+        reached = feasible & (goal_distance < goal[1] + (OTHERS_WITHIN if required else 0.0))
     sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
     if problem.dynamics.position is None and not any(isinstance(part, Separation) for part in problem.constraints):
         clearance_knots = clearance = torch.full_like(cost, torch.nan)

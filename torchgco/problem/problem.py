@@ -26,7 +26,7 @@ from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
 from torchgco.problem.given import Given
-from torchgco.problem.goal import Goal
+from torchgco.problem.goal import Goal, with_goal, without_goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
 from torchgco.problem.summary import summary
@@ -41,9 +41,9 @@ class Problem:
         x0: (B, n), fixes batch, device and dtype: float64 or float32. Lists and arrays become a tensor, a single state
             (n,) is a batch of one.
         N: number of stages.
-        goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
-            terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
-            the cost names none.
+        goal: where the last knot should lie, or must, before any cost. None: derived from the cost, for the search of
+            paths alone, around the position in `Cost.goal` (the terminal reference of a quadratic cost) with 0.09 of
+            the distance from the start as radius; no goal where the cost names none.
         horizon: int64 (B,), from 1 to N: the number of stages of each problem, after which time stops for it; its
             terminal cost and rows are those of its own last knot, and no obstacle counts later. None: all have N.
             CasADi and missions take none, nor do costs with their own `total`.
@@ -87,9 +87,10 @@ class Problem:
         object.__setattr__(self, "dynamics", bound(self.dynamics, dims, "dynamics", Dynamics))
         self._check_dynamics()
         object.__setattr__(self, "cost", bound(self.cost, dims, "cost", Cost))
-        object.__setattr__(self, "constraints", _all_bound(self.constraints, dims))
+        rows = _all_bound(without_goal(self.goal, dims, self.constraints), dims)
+        object.__setattr__(self, "constraints", with_goal(self.goal, rows, dims))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
-        rows = zip(constraints, self.constraints, strict=True)
+        rows = zip(without_goal(self.goal, dims, constraints), rows, strict=True)
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
         for i, part in enumerate(self.constraints):
             if isinstance(part, Obstacles):
@@ -317,7 +318,8 @@ class Problem:
             if dynamics is not None:
                 model = bound(dynamics, self._dimensions(x0, dynamics), "dynamics", Dynamics)
             dims = self._dimensions(x0, model)
-            rows = _all_bound(constraints, dims)
+            constraints = without_goal(self.goal, dims, constraints)
+            rows = with_goal(self.goal, _all_bound(constraints, dims), dims)
             for i, part in enumerate(rows):
                 if not isinstance(part, Obstacles):
                     continue
@@ -336,7 +338,8 @@ class Problem:
                     parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
             known = set(map(id, self.constraints))
-            new = [pair for pair in zip(constraints, rows, strict=True) if id(pair[0]) not in known]
+            pairs = zip(constraints, without_goal(self.goal, dims, rows), strict=True)
+            new = [pair for pair in pairs if id(pair[0]) not in known]
             model = None if dynamics is None else (dynamics, parts["dynamics"])
             check_code(dims, started.x0, model, None if cost is None else (cost, parts["cost"]), new)
         return started

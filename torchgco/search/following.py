@@ -17,6 +17,7 @@ from torchgco.constraints.bounds import ControlBounds
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
 from torchgco.obstacles.base import Obstacles
+from torchgco.problem.goal import GoalBall
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Inflated, length, points_along
@@ -214,7 +215,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor)
 
 def limits_states(problem: Problem) -> bool:
     """Whether rows besides obstacles and control bounds may limit how fast a vehicle is."""
-    others = (part for part in problem.constraints if not isinstance(part, Obstacles | ControlBounds))
+    others = (part for part in problem.constraints if not isinstance(part, Obstacles | ControlBounds | GoalBall))
     return any(part.sense == "inequality" for part in others)
 
 
