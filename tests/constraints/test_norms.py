@@ -231,6 +231,21 @@ def test_compiled_numbers_have_names() -> None:
             mpc(numbers={name: np.full(mpc.numbers.find(name).shape, value)})
 
 
+def test_gradients_by_bounds_and_angles_are_those_of_differences() -> None:
+    solver = InteriorPoint(tolerance=1e-9)
+
+    def cost(upper: Tensor, angle: Tensor) -> Tensor:
+        found = torchgco.solve(lander(NormBounds("u", upper=upper), Cone([0.0, 0, 1], angle, "u")), solver=solver)
+        assert found.statuses == [Status.CONVERGED] * B
+        return found.cost
+
+    given = [torch.full((B,), value, dtype=D, requires_grad=True) for value in (0.8, 0.6)]
+    slopes = torch.autograd.grad(cost(*given).sum(), given)
+    for i in range(2):
+        more, less = ([part.detach() + sign * 1e-5 * (i == j) for j, part in enumerate(given)] for sign in (1, -1))
+        torch.testing.assert_close(slopes[i], (cost(*more) - cost(*less)) / 2e-5, rtol=1e-3, atol=1e-6)
+
+
 def test_explained_by_side_and_components() -> None:
     problem = lander(NormBounds(("x", [3, 4, 5]), upper=0.05), ControlBounds(-0.1, 0.1))
     found = torchgco.solve(problem)
