@@ -235,7 +235,7 @@ def test_gradients_by_bounds_and_angles_are_those_of_differences() -> None:
     solver = InteriorPoint(tolerance=1e-9)
 
     def cost(upper: Tensor, angle: Tensor) -> Tensor:
-        found = torchgco.solve(lander(NormBounds("u", upper=upper), Cone([0.0, 0, 1], angle, "u")), solver=solver)
+        found = torchgco.solve(lander(NormBounds("u", 0.2, upper), Cone([0.0, 0, 1], angle, "u")), solver=solver)
         assert found.statuses == [Status.CONVERGED] * B
         return found.cost
 
