@@ -41,6 +41,7 @@ from torchgco.constraints import Cone as Cone
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FunctionConstraint as FunctionConstraint
+from torchgco.constraints import Gates as Gates
 from torchgco.constraints import NormBounds as NormBounds
 from torchgco.constraints import RateBounds as RateBounds
 from torchgco.constraints import Separation as Separation
@@ -94,7 +95,7 @@ __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules",
-    "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Separation",
+    "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates", "Separation",
     "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",

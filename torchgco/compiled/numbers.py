@@ -22,6 +22,7 @@ from torchgco.base.tree import PerElement
 from torchgco.base.values import Values
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
 from torchgco.obstacles.base import Obstacles
@@ -207,6 +208,8 @@ def numbers_of(problem: Problem) -> list[Number]:
             found.append(Number("goal.radius", (_view(part.upper[:, 0]),), i, True, _radii))
         elif isinstance(part, GoalState):
             found.append(Number("goal.state", (_view(part.state),), i, True, partial(_fixed, part)))
+        elif isinstance(part, GateBalls | GateSquares):
+            continue  # at other knots they would be other gates
         elif isinstance(part, NormBounds | Cone):
             found += _of_vectors(part, name, i)
         elif isinstance(part, BoundSpheres):
@@ -300,7 +303,7 @@ def _of_vectors(part: NormBounds | Cone, name: str, i: int) -> list[Number]:
     return [
         Number(f"{name}.{field}", (_view(getattr(part, field)),), i, True, checks[field], joint=joint if both else None)
         for field in part.per_element
-        if getattr(part, field) is not None
+        if field in checks and getattr(part, field) is not None
     ]
 
 

@@ -14,6 +14,7 @@ from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.norms import NormBounds
+from torchgco.costs.base import Cost
 from torchgco.obstacles.base import ADMITTED
 
 RADIUS_SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
@@ -96,6 +97,11 @@ class Goal(PerElement):
         """Whether a position stands beside the state because this goal is bound already."""
         return isinstance(self.position, Tensor) and isinstance(self.state, Tensor) and self.state.dim() == 2
 
+    @property
+    def place(self) -> Tensor | None:
+        """The position (B, d) of a goal that is bound; None before that."""
+        return self.position if isinstance(self.position, Tensor) and self.position.dim() == 2 else None
+
     def rows(self, dims: Dimensions) -> Constraint:
         """The constraint of a required goal that `bind` accepts."""
         if self.state is None:
@@ -155,6 +161,17 @@ class GoalState(Constraint):
         H[:, -1, at, n] += g[:, 0]
         H[:, -1, n, at] += g[:, 0]
         H[:, -1, at, at] += h[:, 0]
+
+
+def bound_goal(goal: Goal | None, cost: Cost, dims: Dimensions) -> tuple[Goal | None, Dimensions]:
+    """The goal that was stated, else the one that the cost names, bound; and the dimensions with its position.
+
+    Raises:
+        InputError: see `Goal`.
+    """
+    stated = goal is not None and not goal.assumed
+    bound = goal.bind(dims) if stated else Goal.derived(cost.goal(dims.like), dims)  # type: ignore[union-attr]
+    return bound, dims if bound is None else replace(dims, goal=bound.position)
 
 
 def without_goal(goal: Goal | None, dims: Dimensions, constraints: Sequence[Constraint]) -> Sequence[Constraint]:

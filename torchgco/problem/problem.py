@@ -26,7 +26,7 @@ from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
 from torchgco.problem.given import Given
-from torchgco.problem.goal import Goal, with_goal, without_goal
+from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
 from torchgco.problem.summary import summary
@@ -87,6 +87,7 @@ class Problem:
         object.__setattr__(self, "dynamics", bound(self.dynamics, dims, "dynamics", Dynamics))
         self._check_dynamics()
         object.__setattr__(self, "cost", bound(self.cost, dims, "cost", Cost))
+        goal, dims = bound_goal(self.goal, self.cost, dims)
         rows = _all_bound(without_goal(self.goal, dims, self.constraints), dims)
         object.__setattr__(self, "constraints", with_goal(self.goal, rows, dims))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
@@ -95,15 +96,14 @@ class Problem:
         for i, part in enumerate(self.constraints):
             if isinstance(part, Obstacles):
                 warn_of_small(part, f"constraints[{i}]")
-        given = self.goal if self.goal is not None and not self.goal.assumed else None
-        goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "known", Known())
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
         first = 0 if chooses_position(self.free_start, model.position) else 1
-        return Dimensions(x0.shape[0], self.N, self.n, self.m, getattr(model, "dt", None), model.position, x0, first)
+        place, dt = self.goal and self.goal.place, getattr(model, "dt", None)
+        return Dimensions(len(x0), self.N, self.n, self.m, dt, model.position, x0, first, place, self.horizon)
 
     def __repr__(self) -> str:
         return summary(self)
