@@ -135,10 +135,12 @@ class GateSquares(Constraint):
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         p = X[:, self.knots][..., self.components]
+        assert self.slopes is not None and self.limits is not None
         return (self.slopes * p.unsqueeze(-2)).sum(-1) - self.limits
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         J = X.new_zeros(*g.shape, X.shape[-1])
+        assert self.slopes is not None
         J[..., self.components] = self.slopes
         add = H.new_zeros(*g.shape[:2], *H.shape[2:])
         add_blocks(add, X.shape[-1], (g.unsqueeze(-2) @ J).squeeze(-2), None, J.mT @ (h.unsqueeze(-1) * J), None)

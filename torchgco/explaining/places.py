@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
@@ -80,7 +81,7 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     if worst["constraint"] == NONE:
         return None
     constraint = problem.constraints[worst["constraint"]]
-    length = " m" if constraint.geometric or isinstance(constraint, GoalBall) else ""
+    length = " m" if constraint.geometric or isinstance(constraint, GoalBall | GateBalls | GateSquares) else ""
     where = knots_told([worst["knot"]], t)
     row = row_told(constraint, worst["row"])
     return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
@@ -99,7 +100,7 @@ def row_told(constraint: Constraint, row: int) -> str:
         above, below = (_places(constraint, part) for part in (constraint.above, constraint.below))
         side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
         return f"{side} bound of {'control' if constraint.of == 'u' else 'state'} {component}, "
-    if isinstance(constraint, GoalBall):
+    if isinstance(constraint, GoalBall | GateBalls):
         return "its radius, "
     if isinstance(constraint, GoalState):
         return f"state {constraint.components.tolist()[row]}, "  # type: ignore[union-attr]

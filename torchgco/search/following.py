@@ -198,6 +198,7 @@ class Follow:
         N, each = problem.N, path.shape[0] // max(1, problem.B)
         gates = seen.gates_of(problem)
         if gates is not None:  # which say when
+            assert gates.places is not None
             places, stages = (part.repeat_interleave(each, dim=0) for part in (gates.places, problem.stages))
             return timed(path, places, stages, N)
         center = path[:, -1:].repeat(1, N + 1, 1)
