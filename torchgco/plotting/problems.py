@@ -150,7 +150,10 @@ class _Map:
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
         boxes = [view(scene, [0], kept, others) for scene in world.scenes]
         box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
-        return cls(world, courses, planes, box, outlines(problem, courses[0].b))
+        gates = outlines(problem, courses[0].b)
+        for corners, radius in gates:
+            box = np.stack([np.minimum(box[0], corners.min(0) - radius), np.maximum(box[1], corners.max(0) + radius)])
+        return cls(world, courses, planes, box, gates)
 
     @property
     def shares(self) -> list[float]:
