@@ -95,6 +95,7 @@ class GateBalls(NormBounds):
     @property
     def sizes(self) -> Tensor:
         """Their radii (B, G), m."""
+        assert self.places is not None
         return self.upper.gather(1, self.places - 1)
 
 
