@@ -39,9 +39,12 @@ from torchgco.compiled import Answer as Answer
 from torchgco.compiled import Compiled as Compiled
 from torchgco.compiled import MPPIController as MPPIController
 from torchgco.compiled import compile as compile
+from torchgco.constraints import Cone as Cone
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FunctionConstraint as FunctionConstraint
+from torchgco.constraints import Gates as Gates
+from torchgco.constraints import NormBounds as NormBounds
 from torchgco.constraints import RateBounds as RateBounds
 from torchgco.constraints import Separation as Separation
 from torchgco.constraints import StateBounds as StateBounds
@@ -95,8 +98,8 @@ __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules",
-    "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "Separation", "FirstStepRates",
-    "FunctionConstraint", "FunctionCost",
+    "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates", "Separation",
+    "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it

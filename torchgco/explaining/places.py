@@ -10,10 +10,13 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
+from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 SHOWN = 4  # runs of knots, or obstacles, that are named
@@ -80,7 +83,7 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     if worst["constraint"] == NONE:
         return None
     constraint = problem.constraints[worst["constraint"]]
-    length = " m" if constraint.geometric else ""
+    length = " m" if constraint.geometric or isinstance(constraint, GoalBall | GateBalls | GateSquares) else ""
     where = knots_told([worst["knot"]], t)
     row = row_told(constraint, worst["row"], problem.dynamics)
     return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
@@ -101,6 +104,14 @@ def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
         kind, of = ("control", controls_of) if constraint.of == "u" else ("state", states_of)
         named = getattr(dynamics, f"{kind}_names")
         return f"{side} bound of {kind} {component}{f' ({of(dynamics)[component].label})' if len(named) else ''}, "
+    if isinstance(constraint, GoalBall | GateBalls):
+        return "its radius, "
+    if isinstance(constraint, GoalState):
+        return f"state {constraint.components.tolist()[row]}, "  # type: ignore[union-attr]
+    if isinstance(constraint, NormBounds | Cone):
+        what = "cone of" if isinstance(constraint, Cone) else f"{constraint.sides[row]} bound of the norm of"
+        places = listed(constraint.components.tolist())  # type: ignore[union-attr]
+        return f"{what} {'controls' if constraint.of == 'u' else 'states'} {places}, "
     return f"row {row}, "
 
 

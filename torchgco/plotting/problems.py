@@ -22,6 +22,7 @@ from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.bodies import ABOVE, Plane
+from torchgco.plotting.gates import Outline, draw_gates, outlines
 from torchgco.plotting.layouts import EDGE, MARKED, SIDE, STONE, draw_obstacles, draw_targets, marker, moving_handles
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import flown, leaving, passes, view
@@ -142,13 +143,18 @@ class _Map:
     courses: list[Course]
     planes: tuple[Plane, ...]
     box: np.ndarray  # (2, d): lower and upper corner, m
+    gates: list[Outline]
 
     @classmethod
     def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> _Map:
         world = world_of(problem, courses[0].b)
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
         boxes = [view(scene, [0], kept, others) for scene in world.scenes]
-        return cls(world, courses, planes, np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]))
+        box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+        gates = outlines(problem, courses[0].b)
+        for corners, radius in gates:
+            box = np.stack([np.minimum(box[0], corners.min(0) - radius), np.maximum(box[1], corners.max(0) + radius)])
+        return cls(world, courses, planes, box, gates)
 
     @property
     def shares(self) -> list[float]:
@@ -173,6 +179,7 @@ class _Map:
         for course in self.courses:
             drawn |= self._course(ax, plane, course)
         draw_targets(ax, self.world.first, 0, plane)
+        draw_gates(ax, self.gates, plane)
         for course in self.courses[1:]:
             start: dict[str, Any] = {"marker": "s", "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5}
             ax.plot(*course.paths[0][:1, plane].T, color=INK, zorder=2.5, linestyle="none", **start)

@@ -20,6 +20,7 @@ from torch import Tensor
 from torchgco.base.gradients import leaves, recording, without_gradients
 from torchgco.base.shapes import as_states, check_untransformed
 from torchgco.problem.free_start import moved_inside
+from torchgco.problem.goal import with_goal, without_goal
 
 PARTS = "dynamics", "cost", "constraints", "x0"  # a goal judges trajectories and changes none: it takes no gradients
 
@@ -83,7 +84,9 @@ class Given:
             x0 = as_states(self.fields["x0"])
             dims = whole._dimensions(x0)
             parts = {name: self.fields[name].bind(dims) for name in ("dynamics", "cost")}
-            parts["constraints"] = tuple(part.bind(dims) for part in self.fields["constraints"])
+            goal = self.fields["goal"]
+            rows = [part.bind(dims) for part in without_goal(goal, dims, self.fields["constraints"])]
+            parts["constraints"] = with_goal(goal, rows, dims)
             parts["x0"] = moved_inside(x0, whole.free_start, parts["constraints"])
             return self._applied(whole._with(parts))
 
