@@ -15,7 +15,7 @@ from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive,
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_model
 from torchgco.kernels import chord_clearance, measured
-from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.quality import leaves_goal
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps.ways import Ways, length
 from torchgco.obstacles.base import ADMITTED
@@ -175,7 +175,7 @@ class PathPursuit(Solver):
             end.iterations[rows] += new.iterations
             now[rows] = chord_clearance(part.problem, X)
             serves = (measured(part.problem, X, U) <= limit) & (now[rows] > held[rows])
-            serves &= has_arrived(part.problem, X) | ~has_arrived(part.problem, old.X)
+            serves &= ~leaves_goal(part.problem, X, old.X)
             kept = serves.nonzero().flatten()
             found = replace(take(new.best, kept), violation=measured(part.problem, X, U)[kept])
             put(best, rows[kept], found)

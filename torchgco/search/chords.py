@@ -16,7 +16,7 @@ from torchgco.base.options import Count, check_options
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.kernels import chord_clearance, measured
-from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.quality import leaves_goal
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued, mapped
@@ -98,6 +98,6 @@ class ClearChords(Row):
         found = replace(new.best, violation=measured(problem, new.best.X, new.best.U))
         clearance = chord_clearance(problem, found.X)
         serves = (found.violation <= search.solver.violation_tolerance) & (clearance > least)
-        serves &= has_arrived(problem, found.X) | ~has_arrived(problem, take(best.end.best, rows).X)
+        serves &= ~leaves_goal(problem, found.X, take(best.end.best, rows).X)
         best.replace(rows, serves, found, new)
         return serves, clearance
