@@ -20,6 +20,7 @@ from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps.ways import Ways, length
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.chords import MARGIN, MIN_GROWTH
@@ -206,22 +207,3 @@ def clearance(problem: Problem, points: Tensor) -> Tensor:
             away = part.signed_distance(points, points.new_zeros(points.shape[1]))[0]
             found = torch.minimum(found, away.masked_fill(part.absent[0], torch.inf).amin(-1))
     return found
-
-
-def evenly(way: Array, step: float) -> Array:
-    """Points (P, d) at equal distances of about `step`, m, along a way (Q, d)."""
-    along = np.concatenate(([0.0], np.linalg.norm(np.diff(way, axis=0), axis=1).cumsum()))
-    at = np.linspace(0.0, along[-1], max(2, round(along[-1] / step) + 1))
-    return np.stack([np.interp(at, along, x) for x in way.T], axis=1)
-
-
-def smoothed(points: Array, deviation: float) -> Array:
-    """Points (P, d) averaged by a Gaussian of so many points; the ends stay where they are."""
-    from scipy.ndimage import gaussian_filter1d
-
-    if deviation <= 0.0:
-        return points
-    between = points - np.linspace(points[0], points[-1], len(points))  # 0 at both ends
-    odd = np.concatenate((-between[:0:-1], between, -between[-2::-1]))  # about both: averages there are 0, too
-    averaged = gaussian_filter1d(odd, deviation, axis=0, mode="nearest")[len(points) - 1 : 2 * len(points) - 1]
-    return points - between + averaged

@@ -20,6 +20,7 @@ from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
+from torchgco.search.converge import mapped
 from torchgco.search.nearby import without_obstacles
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
@@ -88,7 +89,7 @@ class Direct(Row):
         """Whether the interior point is cheap for these problems: among few obstacles in the plane."""
         at = problem.position
         bodies = sum(part.absent.shape[1] for part in problem.geometric if isinstance(part, Obstacles))
-        return at.stop - at.start == 2 and bodies <= self.most
+        return at.stop - at.start == 2 and bodies <= self.most and not mapped(problem)
 
     def _compared(self, search: Search, rows: Tensor, call: Call, end: SolveEnd, bound: Tensor) -> Tensor:
         """Keep results of `rows` that are hardly dearer than a bound (b,); places (b',) of the others, which wait."""

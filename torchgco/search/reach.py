@@ -63,7 +63,7 @@ def longest_step(problem: Problem, climbs: int = 0) -> Tensor | None:
     """
     if problem.dynamics.position is None or problem.dynamics.at(0) is not problem.dynamics:
         return None
-    low, high = _box(problem)
+    low, high = bounds_at_inner_knots(problem)
     bounded = torch.isfinite(low) & torch.isfinite(high)
     draws = torch.Generator("cpu").manual_seed(SEED)  # the same for every problem and device
     share = torch.rand(1, SAMPLES, problem.n + problem.m, dtype=low.dtype, generator=draws, device="cpu").to(low.device)
@@ -101,7 +101,7 @@ def _way(problem: Problem, z: Tensor) -> Tensor:
     return (dynamics.dt * dynamics.field(x, u)[..., at]).square().sum(-1)
 
 
-def _box(problem: Problem) -> tuple[Tensor, Tensor]:
+def bounds_at_inner_knots(problem: Problem) -> tuple[Tensor, Tensor]:
     """The loosest bounds (B, n + m) of the states at knots 1..N-1 and of the controls; infinite without any."""
     low = problem.x0.new_full((problem.B, problem.n + problem.m), -torch.inf)
     high = -low

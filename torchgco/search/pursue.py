@@ -1,0 +1,104 @@
+"""Ways that keep clear of a map, driven along by vehicles that drive along their heading: see `steering`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.kernels import open_loop
+from torchgco.roadmap.clear import evenly, smoothed
+from torchgco.roadmap.lattice import Array
+from torchgco.roadmap.mapped import even, length
+from torchgco.roadmap.roadmap import Roadmap
+from torchgco.roadmap.search import HOPS
+from torchgco.search.attempts import Search
+from torchgco.search.candidates import Candidates
+from torchgco.search.directly import BOTH, in_order, solved
+from torchgco.search.following import Paths
+from torchgco.search.proposals import Part
+from torchgco.search.steering import Tracks, driven, steered
+
+WAYS = 3  # of different homotopy classes
+SHARES = (0.2, 0.3, 0.4, 0.5, 0.75)  # of the horizon in which they are driven
+TOP = 4  # candidates that are solved, the cheapest as driven
+FINE = 0.25  # R between the points of a way
+ROUNDED = 2.0  # R: the standard deviation over which its corners are averaged
+AHEAD = 2.4  # R that the vehicle looks ahead
+EACH = 2 * len(SHARES)  # candidates of a way: forwards and backwards at each pace
+
+
+def pursue(search: Search, rows: Tensor) -> None:
+    """Solve the problems in `rows` from trajectories that are driven along ways through their maps."""
+    problem = search.call.problem.take(rows)
+    rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+    part = Part(problem.in_cost_units(), rest, search.call.rows[rows], search.record)
+    if part.scene is None:
+        return
+    found = [_driven(part, b) for b in range(problem.B)]
+    if not any(ways for ways, _ in found):
+        return
+    search.best.worked[rows] = True
+    paths, candidates = _candidates(part, found)
+    chosen = candidates.pick(in_order(candidates)[:, :TOP])
+    ends = solved(search, rows, chosen)
+    if search.record is not None:
+        every = torch.arange(problem.B, device=rows.device)
+        good = ends.cost[ends.best].isfinite()
+        part.note(every, paths, BOTH, candidates, chosen, chosen.live, ends, good)
+
+
+def _driven(part: Part, b: int) -> tuple[list[Array], Array]:
+    """Ways of the problem at place b, and controls (W * EACH, N, m) along these; none for other vehicles."""
+    assert part.scene is not None
+    one = part.problem.take(torch.tensor([b], device=part.rest.device))
+    R, unit = (float(scale[b]) for scale in part.scales)
+    vehicle = steered(one) if np.isfinite(unit) and unit > 0 and bool(torch.isfinite(one.x0).all()) else None
+    none = np.empty((0, one.N, one.m))
+    if vehicle is None:
+        return [], none
+    step = FINE * R
+    ways = [smoothed(evenly(way, step), ROUNDED / FINE) for way in Roadmap().clear_ways(part.scene, b, WAYS)]
+    ways = [way for way in ways if length(way) > 0.0]
+    if not ways:
+        return [], none
+    return ways, driven(one, vehicle, _tracks(ways, float(one.stages[0]) * float(one.dynamics.dt)))
+
+
+def _tracks(ways: list[Array], duration: float) -> Tracks:
+    """Each way at each pace, forwards and backwards."""
+    longest, lengths = max(map(len, ways)), np.array([length(way) for way in ways])
+    points = np.stack([np.concatenate((way, np.repeat(way[-1:], longest - len(way), axis=0))) for way in ways])
+    last, steps = np.array([len(way) - 1 for way in ways]), lengths / np.array([len(way) - 1 for way in ways])
+    count = len(ways)
+    speed = (lengths[:, None] / (np.array(SHARES) * duration)).repeat(2, axis=1).ravel()
+    return Tracks(
+        points.repeat(EACH, axis=0), last.repeat(EACH), steps.repeat(EACH), round(AHEAD / FINE), speed,
+        np.tile([False, True], count * len(SHARES)),
+    )  # fmt: skip
+
+
+def _candidates(part: Part, found: list[tuple[list[Array], Array]]) -> tuple[Paths, Candidates]:
+    """The trajectories along the ways of each problem, with the ways as paths, those that there aren't not live."""
+    assert part.scene is not None
+    problem, rest, (R, unit) = part.problem, part.rest, part.scales
+    K = max(len(ways) for ways, _ in found)
+    live = torch.tensor([[k < len(ways) for k in range(K)] for ways, _ in found], device=rest.device)
+    corners = (
+        torch.stack((part.scene.start, part.scene.goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1).repeat(1, K, 1, 1)
+    )
+    U = rest.unsqueeze(1).repeat(1, K * EACH, 1, 1)
+    for b, (ways, controls) in enumerate(found):
+        for k, way in enumerate(ways):
+            corners[b, k] = corners.new_tensor(even(way, HOPS + 1))
+        U[b, : len(controls)] = U.new_tensor(controls)
+    unit = torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0)
+    classes = torch.arange(K, device=rest.device).expand(problem.B, K)
+    paths = Paths(corners, classes, live, R, unit, part.scene.obstacles)
+    made = Candidates.begin(problem, U, R, unit, live.repeat_interleave(EACH, dim=1))
+    rows = made.live.nonzero().flatten()
+    X = made.X.clone()
+    X[rows] = open_loop(made.of(rows), made.U[rows])
+    return paths, replace(made, X=X)
