@@ -19,15 +19,19 @@ from torchgco.search.candidates import Candidates
 from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Paths
 from torchgco.search.proposals import Part
-from torchgco.search.steering import Tracks, driven, steered
+from torchgco.search.steering import Steered, Tracks, driven, speed_limit, steered
 
+FREE_ITERATIONS = 40  # of the trajectory without constraints, at most
 WAYS = 3  # of different homotopy classes
-SHARES = (0.2, 0.3, 0.4, 0.5, 0.75)  # of the horizon in which they are driven
+PACES = 6  # at which a way is driven
+# The fastest pace takes half the time that the trajectory without constraints takes for as long a way, the slowest a
+# share of the horizon; the others lie between, by equal ratios.
+FASTEST, LATEST_FREE, LATEST = 0.5, 0.55, 0.75
 TOP = 4  # candidates that are solved, the cheapest as driven
 FINE = 0.25  # R between the points of a way
 ROUNDED = 2.0  # R: the standard deviation over which its corners are averaged
 AHEAD = 2.4  # R that the vehicle looks ahead
-EACH = 2 * len(SHARES)  # candidates of a way: forwards and backwards at each pace
+EACH = 2 * PACES  # candidates of a way: forwards and backwards at each pace
 
 
 def pursue(search: Search, rows: Tensor) -> None:
@@ -43,6 +47,7 @@ def pursue(search: Search, rows: Tensor) -> None:
     search.best.worked[rows] = True
     paths, candidates = _candidates(part, found)
     chosen = candidates.pick(in_order(candidates)[:, :TOP])
+    search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
     ends = solved(search, rows, chosen)
     if search.record is not None:
         every = torch.arange(problem.B, device=rows.device)
@@ -64,19 +69,27 @@ def _driven(part: Part, b: int) -> tuple[list[Array], Array]:
     ways = [way for way in ways if length(way) > 0.0]
     if not ways:
         return [], none
-    return ways, driven(one, vehicle, _tracks(ways, float(one.stages[0]) * float(one.dynamics.dt)))
+    duration = float(one.stages[0]) * float(one.dynamics.dt)
+    straight = float((part.scene.goal[b] - part.scene.start[b]).square().sum().sqrt())
+    free = part.free(FREE_ITERATIONS)
+    return ways, driven(one, vehicle, _tracks(vehicle, ways, duration, float((free.share * free.slower)[b]) / straight))
 
 
-def _tracks(ways: list[Array], duration: float) -> Tracks:
-    """Each way at each pace, forwards and backwards."""
+def _tracks(vehicle: Steered, ways: list[Array], duration: float, free: float) -> Tracks:
+    """Each way at each pace, forwards and backwards; `free`: share of the duration, s, per metre without constraints."""
     longest, lengths = max(map(len, ways)), np.array([length(way) for way in ways])
     points = np.stack([np.concatenate((way, np.repeat(way[-1:], longest - len(way), axis=0))) for way in ways])
     last, steps = np.array([len(way) - 1 for way in ways]), lengths / np.array([len(way) - 1 for way in ways])
-    count = len(ways)
-    speed = (lengths[:, None] / (np.array(SHARES) * duration)).repeat(2, axis=1).ravel()
+    first = FASTEST * np.minimum(free * lengths, LATEST_FREE)[:, None]
+    shares = first * (LATEST / first) ** np.linspace(0.0, 1.0, PACES)
+    speed = (lengths[:, None] / (shares * duration)).repeat(2, axis=1).ravel()
+    ahead = round(AHEAD / FINE)
+    limit = np.zeros(points.shape[:2])
+    for own, way, step in zip(limit, ways, steps, strict=True):
+        own[: len(way)] = speed_limit(vehicle, way, step, ahead)
     return Tracks(
-        points.repeat(EACH, axis=0), last.repeat(EACH), steps.repeat(EACH), round(AHEAD / FINE), speed,
-        np.tile([False, True], count * len(SHARES)),
+        points.repeat(EACH, axis=0), last.repeat(EACH), steps.repeat(EACH), ahead, speed, limit.repeat(EACH, axis=0),
+        np.tile([False, True], shares.size),
     )  # fmt: skip
 
 

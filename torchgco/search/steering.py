@@ -154,6 +154,7 @@ class Tracks:
         step: between points, (C,), m.
         ahead: points that the vehicle looks ahead.
         speed: (C,), m/s.
+        limit: the speed from which it still slows down in time for what is ahead at each point, (C, P), m/s.
         backward: whether it drives backwards, (C,).
     """
 
@@ -162,6 +163,7 @@ class Tracks:
     step: Array
     ahead: int
     speed: Array
+    limit: Array
     backward: NDArray[np.bool_]
 
 
@@ -183,7 +185,7 @@ def driven(problem: Problem, vehicle: Steered, tracks: Tracks) -> Array:
         slowing = np.sqrt(2.0 * braking * tracks.step * (tracks.last - nearest))
         error = np.arctan2(sign * (aim[:, 1] - y), sign * (aim[:, 0] - x)) - heading
         error = (error + math.pi) % (2.0 * math.pi) - math.pi
-        wanted = sign * np.minimum(tracks.speed, slowing)
+        wanted = sign * np.minimum(np.minimum(tracks.speed, tracks.limit[each, nearest]), slowing)
         wanted = wanted * np.maximum(np.cos(error), CREEP if vehicle.by_curvature else 0.0)
         push, turn, u = _steered(vehicle, np.clip(wanted, *vehicle.fastest), speed, TURNING * error, dt)
         U[:, k, vehicle.push.control], U[:, k, vehicle.turn.control] = u
@@ -192,6 +194,26 @@ def driven(problem: Problem, vehicle: Steered, tracks: Tracks) -> Array:
         x, y = x + along * np.cos(toward), y + along * np.sin(toward)
         heading, speed = heading + dt * turn, speed + dt * push
     return U
+
+
+def speed_limit(vehicle: Steered, points: Array, step: float, ahead: int) -> Array:
+    """The speeds (P,), m/s, at points (P, 2) of a way, from which the vehicle slows down in time for each bend.
+
+    In a bend it turns as fast as it can, where its turn rate is what is bounded; braking is as hard as it can be. How a
+    way bends is looked at over as many points as the vehicle looks ahead: it cuts tighter bends.
+    """
+    if vehicle.by_curvature:
+        return np.full(len(points), np.inf)
+    half, last = max(1, ahead // 2), len(points) - 1
+    at = np.arange(len(points))
+    toward, before = points[np.minimum(at + half, last)] - points, points - points[np.maximum(at - half, 0)]
+    cross, along = toward[:, 0] * before[:, 1] - toward[:, 1] * before[:, 0], (toward * before).sum(1)
+    bend = np.abs(np.arctan2(cross, along)) / (half * step)
+    turning = min(-vehicle.turn.effect[0], vehicle.turn.effect[-1])
+    braking = min(-vehicle.push.effect[0], vehicle.push.effect[-1])
+    # v^2 at a point is at most that at any later one, and twice the braking times the way there.
+    energy = (turning / np.maximum(bend, 1e-12)) ** 2 + 2.0 * braking * step * at
+    return np.sqrt(np.minimum.accumulate(energy[::-1])[::-1] - 2.0 * braking * step * at)
 
 
 def _steered(
