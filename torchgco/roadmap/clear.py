@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.mapped import Price, even, in_each, in_one, length, one_of_each_class, ways_of
+from torchgco.roadmap.mapped import MARGIN, Price, even, in_each, in_one, length, one_of_each_class, ways_of
 from torchgco.roadmap.search import HOPS
 
 WIDE = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide
@@ -27,15 +27,19 @@ def clear_path_in_maps(scene: Scene, overlap: float) -> tuple[Tensor, Tensor]:
 def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
     """Ways (P, d), m, of the problem at place b, from block to block; in the plane one of each homotopy class.
 
-    Up to `count`, the cheapest first; in space one.
+    Of up to `count` classes, the cheapest first, and of as many more that are the cheapest where only the last of the
+    room is dear, as for paths that are drawn taut: a wide way round may be far dearer to fly. In space one.
     """
 
     def search(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
         ways = ways_of(lattice, ends, price, radius, WIDE * unit)
         if ways is None:
             return []
-        blocks = one_of_each_class(ways, count) if lattice.d == 2 else [int(ways.total.argmin())]
-        return [ways.path(v) for v in blocks]
+        if lattice.d == 3:
+            return [ways.path(int(ways.total.argmin()))]
+        wide, near = one_of_each_class(ways), one_of_each_class(ways.nearer(MARGIN * unit))
+        kinds = dict.fromkeys([*list(wide)[:count], *list(near)[:count]])
+        return [ways.path(wide[kind]) for kind in kinds if kind in wide]
 
     return in_one(scene, b, overlap, search)
 

@@ -108,6 +108,7 @@ class Ways:
 
     def __init__(self, blocks: Blocks, ends: Array, price: Price, margin: float, least: float = 0.0) -> None:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
+        self.parts = blocks, ends, price, least
         self.least = least_at(blocks.lattice, ends)
         close = 1.0 + np.clip(1.0 - blocks.clearance / margin, 0.0, 1.0)
         rate = _smoothed(price, self.points, blocks.counts)
@@ -120,6 +121,11 @@ class Ways:
             apart = np.linalg.norm(self.points[seeds] - end, axis=1)
             self.seeds.append((seeds, apart * self.weight[seeds]))
             self.costs[i], self.before[i] = blocks.costs(self.weight, *self.seeds[i])
+
+    def nearer(self, margin: float) -> Ways:
+        """The same, but only nearer to obstacles than another margin, m, costs more."""
+        blocks, ends, price, least = self.parts
+        return Ways(blocks, ends, price, margin, least)
 
     @property
     def total(self) -> Array:
@@ -209,11 +215,11 @@ def ways_of(lattice: Lattice, ends: Array, price: Price, radius: float, margin: 
 
 def _in_the_plane(ways: Ways, count: int) -> list[Array]:
     """The cheapest way of each homotopy class, drawn taut."""
-    return [ways.taut(v) for v in one_of_each_class(ways, count)]
+    return [ways.taut(v) for v in itertools.islice(one_of_each_class(ways).values(), count)]
 
 
-def one_of_each_class(ways: Ways, count: int) -> list[int]:
-    """Blocks on the cheapest way of each homotopy class, up to `count`, the cheapest first, in the plane.
+def one_of_each_class(ways: Ways) -> dict[int, int]:
+    """Blocks on the cheapest way of each homotopy class in the plane, by what the class sweeps, the cheapest first.
 
     Of each class that leads through one block on the cheapest ways from both ends.
     """
@@ -223,8 +229,9 @@ def one_of_each_class(ways: Ways, count: int) -> list[int]:
     kind = (sums[0] - sums[1])[live]
     order = np.argsort(total[live], kind="stable")
     _, first = np.unique(kind[order], return_index=True)
-    chosen = live[order[np.sort(first)[:count]]]
-    return [int(v) for v in chosen[total[chosen] <= LONGEST * total[chosen[0]]]]
+    chosen = order[np.sort(first)]
+    chosen = chosen[total[live[chosen]] <= LONGEST * total[live[chosen[0]]]]
+    return dict(zip(kind[chosen].tolist(), live[chosen].tolist(), strict=True))
 
 
 def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
