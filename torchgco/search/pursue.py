@@ -1,4 +1,9 @@
-"""Ways that keep clear of a map, driven along by vehicles that drive along their heading: see `steering`."""
+"""Ways that keep clear of a map, driven along by vehicles that drive along their heading.
+
+A trajectory that iLQR draws to a moving point changes its direction wherever the point outruns the vehicle, and the
+interior point keeps many of these cusps. One that is steered along the way has none (`steering`), and what it costs
+says which of the trajectories will be the cheapest when solved.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +26,22 @@ from torchgco.search.following import Paths
 from torchgco.search.proposals import Part
 from torchgco.search.steering import Steered, Tracks, driven, speed_limit, steered
 
+PURSUED_AT_ONCE = 16  # problems: bounds the memory
 FREE_ITERATIONS = 40  # of the trajectory without constraints, at most
 WAYS = 3  # of different homotopy classes
 PACES = 6  # at which a way is driven
 # The fastest pace takes half the time that the trajectory without constraints takes for as long a way, the slowest a
 # share of the horizon; the others lie between, by equal ratios.
 FASTEST, LATEST_FREE, LATEST = 0.5, 0.55, 0.75
+SHORTEST = 0.01  # share of the horizon that such a trajectory counts for, at least
 TOP = 4  # candidates that are solved, the cheapest as driven
 FINE = 0.25  # R between the points of a way
 ROUNDED = 2.0  # R: the standard deviation over which its corners are averaged
 AHEAD = 2.4  # R that the vehicle looks ahead
+DOES = (
+    f"what drives along its heading is steered along ways that keep clear, of {WAYS} to {2 * WAYS} classes, "
+    f"{PACES} paces, forwards and backwards; interior point from the {TOP} cheapest"
+)
 EACH = 2 * PACES  # candidates of a way: forwards and backwards at each pace
 
 
@@ -76,11 +87,15 @@ def _driven(part: Part, b: int) -> tuple[list[Array], Array]:
 
 
 def _tracks(vehicle: Steered, ways: list[Array], duration: float, free: float) -> Tracks:
-    """Each way at each pace, forwards and backwards; `free`: share of the duration, s, per metre without constraints."""
+    """Each way at each pace, forwards and backwards.
+
+    Args:
+        free: share of the duration, s, in which the trajectory without constraints makes a metre.
+    """
     longest, lengths = max(map(len, ways)), np.array([length(way) for way in ways])
     points = np.stack([np.concatenate((way, np.repeat(way[-1:], longest - len(way), axis=0))) for way in ways])
     last, steps = np.array([len(way) - 1 for way in ways]), lengths / np.array([len(way) - 1 for way in ways])
-    first = FASTEST * np.minimum(free * lengths, LATEST_FREE)[:, None]
+    first = FASTEST * np.clip(np.nan_to_num(free * lengths, nan=np.inf), SHORTEST, LATEST_FREE)[:, None]
     shares = first * (LATEST / first) ** np.linspace(0.0, 1.0, PACES)
     speed = (lengths[:, None] / (shares * duration)).repeat(2, axis=1).ravel()
     ahead = round(AHEAD / FINE)

@@ -168,7 +168,7 @@ class Tracks:
 
 
 def driven(problem: Problem, vehicle: Steered, tracks: Tracks) -> Array:
-    """Controls (C, N, m) of the vehicle of a batch of one that drives along each of the ways; at rest behind the end."""
+    """Controls (C, N, m) of the vehicle of a batch of one that drives along each way; at rest behind its end."""
     dt, stages, sign = float(problem.dynamics.dt), int(problem.stages[0]), np.where(tracks.backward, -1.0, 1.0)
     at, x0 = problem.position.start, problem.x0[0].double().cpu().numpy()
     held = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))[0].double().cpu().numpy()

@@ -24,7 +24,7 @@ from torchgco.search.converge import mapped
 from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Follow, Free, Paths
 from torchgco.search.proposals import Part
-from torchgco.search.pursue import EACH, WAYS, pursue
+from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
 from torchgco.search.row import Row
 
 AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
@@ -43,9 +43,11 @@ TOP = 8  # candidates of a problem that are solved, those of least cost as track
 class Tube(Row):
     """Tracks paths closely at several paces, solves the cheapest by the interior point, and keeps the best.
 
-    Among the paths is one that keeps clear of a map's obstacles, with its corners averaged. A vehicle that can turn on
-    the spot follows each from rest and after either turn: else it reverses along much of a way behind it. The first
-    pace is that of the trajectory without obstacles, the last takes the whole horizon; the others lie evenly between.
+    In maps, a vehicle that drives along its heading is steered along ways that keep clear of them first (`pursue`).
+    Where that doesn't arrive, and for all others, paths are tracked; among these is one that keeps clear of a map's
+    obstacles, with its corners averaged. A vehicle that can turn on the spot follows each from rest and after either
+    turn: else it reverses along much of a way behind it. The first pace is that of the trajectory without obstacles,
+    the last takes the whole horizon; the others lie evenly between.
     Candidates count where they end feasible and at the goal.
 
     Args:
@@ -75,9 +77,11 @@ class Tube(Row):
 
     @property
     def does(self) -> str:
-        more = " and one that keeps clear" if self.among == "maps" else ""
+        more, first = "", ""
+        if self.among == "maps":
+            more, first = " and one that keeps clear", f"{DOES}; others, or without success: "
         tracked = f"{self.num_paths} paths{more}: {FOLLOW}, {PACES} paces"
-        return f"{tracked}; not relaxed; interior point from the {TOP} cheapest"
+        return f"{first}{tracked}; not relaxed; interior point from the {TOP} cheapest"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -85,7 +89,7 @@ class Tube(Row):
         if rows.numel() == 0 or not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
             return
         if self.among == "maps":
-            for some in rows.split(max(1, AT_ONCE // (WAYS * EACH))):
+            for some in rows.split(PURSUED_AT_ONCE):
                 if not search.call.late:
                     pursue(search, some)
             rows = search.rows("unarrived")
