@@ -22,6 +22,7 @@ from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import mapped
 from torchgco.search.nearby import without_obstacles
+from torchgco.search.pursue import pursue
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
@@ -77,13 +78,15 @@ class Direct(Row):
             free = FREE.solved(replace(call, problem=bare))
             bound = free.best.cost
             search.best.end.iterations[rows] += free.iterations
-        solver = InteriorPoint(max_iterations=LIMIT)
+        solver = InteriorPoint()
         left = self._compared(search, rows, call, solver.solved(call), bound)
         if left.numel() > 0:
             start = take(search.caught.last, rows[left])
             call = replace(call.take(left), U0=start.U)
             solver = replace(solver, initial_barrier=FROM_CAUGHT)
-            self._compared(search, rows[left], call, solver.solved(call, start.X), bound[left])
+            left = left[self._compared(search, rows[left], call, solver.solved(call, start.X), bound[left])]
+        if left.numel() > 0:
+            pursue(search, rows[left])
 
     def serves(self, problem: Problem) -> bool:
         """Whether the interior point is cheap for these problems: among few obstacles in the plane."""

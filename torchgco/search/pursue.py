@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.kernels import open_loop
+from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.mapped import even, length
@@ -28,6 +29,7 @@ from torchgco.search.steering import Steered, Tracks, driven, speed_limit, steer
 
 PURSUED_AT_ONCE = 16  # problems: bounds the memory
 FREE_ITERATIONS = 40  # of the trajectory without constraints, at most
+ROADMAP, PATHS = Roadmap(max_overlap=0.02), 6  # between bodies, before those of one homotopy class are merged
 WAYS = 3  # of different homotopy classes
 PACES = 6  # at which a way is driven
 # The fastest pace takes half the time that the trajectory without constraints takes for as long a way, the slowest a
@@ -60,6 +62,8 @@ def pursue(search: Search, rows: Tensor) -> None:
     chosen = candidates.pick(in_order(candidates)[:, :TOP])
     search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
     ends = solved(search, rows, chosen)
+    for place, (ways, _) in enumerate(found):
+        search.steered[rows[place]] |= bool(ways) and not part.scene.obstacles.maps
     if search.record is not None:
         every = torch.arange(problem.B, device=rows.device)
         good = ends.cost[ends.best].isfinite()
@@ -75,15 +79,30 @@ def _driven(part: Part, b: int) -> tuple[list[Array], Array]:
     none = np.empty((0, one.N, one.m))
     if vehicle is None:
         return [], none
-    step = FINE * R
-    ways = [smoothed(evenly(way, step), ROUNDED / FINE) for way in Roadmap().clear_ways(part.scene, b, WAYS)]
-    ways = [way for way in ways if length(way) > 0.0]
+    step = FINE * (_radius(one) or 0.5 * R)
+    ways = [smoothed(evenly(way, step), ROUNDED / FINE) for way in _ways(part, b) if length(way) > 0.0]
     if not ways:
         return [], none
     duration = float(one.stages[0]) * float(one.dynamics.dt)
     straight = float((part.scene.goal[b] - part.scene.start[b]).square().sum().sqrt())
     free = part.free(FREE_ITERATIONS)
     return ways, driven(one, vehicle, _tracks(vehicle, ways, duration, float((free.share * free.slower)[b]) / straight))
+
+
+def _ways(part: Part, b: int) -> list[Array]:
+    """Ways of the problem at place b: those that keep clear of a map, or paths between bodies, one of each class."""
+    assert part.scene is not None
+    if part.scene.obstacles.maps:
+        return Roadmap().clear_ways(part.scene, b, WAYS)
+    rows = torch.tensor([b], device=part.rest.device)
+    paths = part.seek(rows, (ROADMAP,), PATHS)
+    corners = paths.corners[0][paths.live[0]].double().cpu().numpy()
+    return [way[np.append(True, np.any(way[1:] != way[:-1], axis=1))] for way in corners]
+
+
+def _radius(problem: Problem) -> float:
+    """The largest radius of the vehicle in a batch of one, m; 0 where it is a point."""
+    return max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
 
 
 def _tracks(vehicle: Steered, ways: list[Array], duration: float, free: float) -> Tracks:

@@ -93,8 +93,9 @@ class Tube(Row):
                 if not search.call.late:
                     pursue(search, some)
             rows = search.rows("unarrived")
-            if rows.numel() == 0:
-                return
+        rows = rows[~search.steered[rows]]
+        if rows.numel() == 0:
+            return
         each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
         for some in rows.split(max(1, AT_ONCE // each)):
             if search.call.late:
