@@ -21,15 +21,13 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import mapped
-from torchgco.search.nearby import without_obstacles
+from torchgco.search.nearby import FREE, without_obstacles
 from torchgco.search.pursue import pursue
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little
-LIMIT = 100  # iterations
-FREE = InteriorPoint(tolerance=1e-4, max_iterations=LIMIT)  # of the trajectory without obstacles
 
 
 @dataclass(frozen=True)
