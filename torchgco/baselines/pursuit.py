@@ -14,16 +14,14 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_model
-from torchgco.kernels import chord_clearance, measured
-from torchgco.lagrangian.quality import has_arrived
-from torchgco.lagrangian.state import SolveEnd
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.maps.ways import Ways, length
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.scene import scene_of
-from torchgco.search.chords import MARGIN, MIN_GROWTH
+from torchgco.search.chords import cleared, serving
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.infeasible import least_violated
@@ -160,28 +158,18 @@ class PathPursuit(Solver):
         as they are, arrives where the old one did, and keeps more clearance.
         """
         problem, best = call.problem, end.best
-        if not problem.obstacles:
-            return end
-        held, limit = chord_clearance(problem, best.X), ADMITTED
-        by, now = torch.zeros_like(held), held.clone()
-        for _ in range(self.rounds):
-            rows = ((best.violation <= limit) & (held < 0)).nonzero().flatten()
-            if rows.numel() == 0 or call.late:
-                break
-            by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
-            part, old = call.take(rows), take(best, rows)
-            grown = replace(part, problem=part.problem.grown(by[rows]), U0=old.U, warm=old.multipliers, X0=None)
+
+        def once(rows: Tensor, grown: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
             new = self.solver.solved(replace(grown, callback=None), old.X)
-            X, U = new.best.X, new.best.U
             end.iterations[rows] += new.iterations
-            now[rows] = chord_clearance(part.problem, X)
-            serves = (measured(part.problem, X, U) <= limit) & (now[rows] > held[rows])
-            serves &= has_arrived(part.problem, X) | ~has_arrived(part.problem, old.X)
+            serves, found, clearance = serving(problem.take(rows), new.best, old, least, ADMITTED)
             kept = serves.nonzero().flatten()
-            found = replace(take(new.best, kept), violation=measured(part.problem, X, U)[kept])
-            put(best, rows[kept], found)
+            put(best, rows[kept], take(found, kept))
             end.status[rows[kept]] = new.status[kept]
-            held[rows[kept]] = now[rows[kept]]
+            return serves, clearance
+
+        if problem.obstacles:
+            cleared(call, best, self.rounds, ADMITTED, once)
         return end
 
 
