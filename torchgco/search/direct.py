@@ -1,5 +1,8 @@
 """The interior point beside a search, where it is cheap: from the guess, and from where the first solve was caught.
 
+A vehicle that drives along its heading is steered along the paths, too (`pursue`); where that arrives there is no
+search, and where it doesn't, only samples are left: tracking the same paths by iLQR takes a hundred times as long.
+
 A first solve is stopped where a knot lies millimetres inside one obstacle, and may be at the optimum there. Among few
 obstacles in the plane an interior point from there, or from the guess, takes a hundredth of the iterations that a
 search takes. Its results compete with the search's by cost, at the end; they spare it only where it could save little.
@@ -35,7 +38,8 @@ class Direct(Row):
     """Solves caught problems by the interior point too; the results are compared with the search's at its end.
 
     Where one arrives and costs little more than the trajectory without obstacles, which keeps all other constraints,
-    there is no search: it could save no more than that.
+    there is no search: it could save no more than that. Nor is there where a vehicle that is steered along the paths
+    arrives.
 
     Args:
         gap: how much more it may cost, as a share.
@@ -56,12 +60,13 @@ class Direct(Row):
 
     @property
     def problems(self) -> str:
-        return f"caught in the plane among at most {self.most} obstacles"
+        return f"caught in the plane among at most {self.most} obstacles and no map"
 
     @property
     def does(self) -> str:
         return (
-            f"interior point from the guess and from there; over {self.gap:.0%} dearer than without obstacles, search"
+            f"interior point from the guess and from there; over {self.gap:.0%} dearer than without obstacles, what "
+            "drives along its heading is steered along the paths; search"
         )
 
     def run(self, search: Search) -> None:
