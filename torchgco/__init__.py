@@ -75,6 +75,7 @@ from torchgco.scenarios import Layouts as Layouts
 from torchgco.search import MultiStart as MultiStart
 from torchgco.search import PathProposals as PathProposals
 from torchgco.search import Restarts as Restarts
+from torchgco.sensitivity import predicted
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
@@ -115,7 +116,12 @@ def _shown(self: Solution, problem: Problem) -> HtmlPage:
     return show(problem, self)
 
 
-Solution.show = _shown
+def _predicted(self: Solution, changed: Problem, problem: Problem | None = None) -> Solution:
+    return predicted(self, changed, problem)
+
+
+_predicted.__doc__ = predicted.__doc__
+Solution.show, Solution.predict = _shown, _predicted
 
 # On some processors the library behind PyTorch's matrix products (MKL) picks a kernel by a matrix's address in memory,
 # and so by its place in the batch: a problem's bits would depend on the other problems. Read at MKL's first use.

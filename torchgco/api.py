@@ -17,13 +17,13 @@ from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
-from torchgco.judging.scale import SHARE, TIGHT, dwarfed
+from torchgco.judging.scale import MET, SHARE, dwarfed
 from torchgco.judging.worst import NONE, kind_of
 from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
 from torchgco.sensitivity import asks_for_gradients, attached
@@ -83,9 +83,9 @@ def solve(
             states X0, or an argument is of another kind or out of its range.
     """
     check_untransformed("solve")
-    check_problem(problem)
+    problem = current_problem(problem)
     warm = _checked(warm)
-    problem = asked = problem.anew()
+    asked = problem
     differentiates = asks_for_gradients(problem)
     solver = "gco" if solver is None else solver
     name = solver if isinstance(solver, str) else None
@@ -133,7 +133,7 @@ def compare(
     import pandas as pd
 
     check_untransformed("compare")
-    check_problem(problem)
+    problem = current_problem(problem)
     made = _named_solvers(problem, solvers)
     frames = []
     for name, solver in made.items():
@@ -237,7 +237,7 @@ def _warned_of_contact(problem: Problem, solution: Solution, U0: Tensor | None) 
 def _warn_of_scale(problem: Problem, U0: Tensor, solution: Solution) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    rows = (claims & (solution.violation > TIGHT)).nonzero().flatten()
+    rows = (claims & (solution.violation > SHARE * MET)).nonzero().flatten()
     if rows.numel() == 0:
         return
     part, found = problem.take(rows), (solution.X[rows], solution.U[rows])

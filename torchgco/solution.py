@@ -251,7 +251,9 @@ class Solution:
         check_shape(self.U, (problem.B, problem.N, problem.m), "problem: solution.U")
         return pd.DataFrame(worst_rows(problem, self.X.detach(), self.U.detach())).rename_axis("element")
 
-    if TYPE_CHECKING:  # pages know solutions: `torchgco` adds the method
+    if TYPE_CHECKING:  # pages and derivatives know solutions: `torchgco` adds these methods
+
+        def predict(self, changed: Problem, problem: Problem | None = None) -> Solution: ...
 
         def show(self, problem: Problem) -> HtmlPage: ...
 

@@ -16,17 +16,20 @@ from torchgco import (
     ControlBounds,
     Cost,
     FunctionConstraint,
+    FunctionCost,
     InputError,
     Planar,
     Problem,
     QuadraticCost,
     Spheres,
     StateBounds,
+    Status,
 )
 from torchgco.base.shapes import Dimensions
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.kernels import use_native
 from torchgco.obstacles import Obstacles
+from torchgco.obstacles.spheres import BoundSpheres
 
 D, N = torch.float64, 10
 WEIGHTS = {"Q": [1.0] * 6, "R": [0.1] * 2, "Qf": [10.0] * 6, "x_ref": [1.0, 0, 0, 0, 0, 0]}
@@ -91,8 +94,8 @@ def test_new_parts_of_a_problem_are_looked_at_as_well() -> None:
 class Late(FunctionConstraint):
     """Its class stays what it is: its own rows are those that hold."""
 
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return super().value(X, U) - 0.1
+    def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
+        return super().rows_at(k, *arguments) - 0.1
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,110 @@ def test_classes_that_keep_their_methods_pass() -> None:
     assert float((rows + 0.6).abs().max()) < 1e-12
     scaled = problem(cost=Scaled(**WEIGHTS))
     assert isinstance(scaled.cost, BoundQuadratic) and bool((scaled.cost.R == 0.2).all())
+
+
+def made(kind: type[Cost | Constraint], bound: Cost | Constraint) -> Any:
+    """The bound part as one of a user's class."""
+    return kind(**vars(bound))
+
+
+class Hinge(BoundQuadratic):
+    """A term that is 0 where problems are tried, so that no difference shows it."""
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return super().stage(x, u, k) + 4.0 * (x[..., 0] - 0.3).relu().square()
+
+
+class Landing(BoundQuadratic):
+    def terminal(self, x: Tensor) -> Tensor:
+        return super().terminal(x) + 4.0 * (x[..., 0] - 0.3).relu().square()
+
+
+class OwnSlopes(Hinge):
+    """The weights alone are scaled to the unit of cost, not the hinge."""
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        Cost.expand(self, X, U, H)
+
+
+class Whole(OwnSlopes):
+    def scaled(self, factor: Tensor) -> Cost:
+        return Cost.scaled(self, factor)
+
+
+class Larger(BoundSpheres):
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().value(X, U) + 0.1 * (X[:, self.knots, :1] - 0.3).relu()
+
+
+class Nearer(BoundSpheres):
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        return super().signed_distance(p, t) - 0.1
+
+
+class Narrower(StateBounds):
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().value(X, U) + (X[:, self.knots, :1] - 0.3).relu()
+
+
+class Later(FunctionConstraint):
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().value(X, U) + (X[:, self.knots, :1] - 0.3).relu()
+
+
+def of_bound_cost(kind: type[BoundQuadratic]) -> Problem:
+    return problem(cost=made(kind, problem().cost))
+
+
+def of_bound_spheres(kind: type[BoundSpheres]) -> Problem:
+    return problem(made(kind, problem(Spheres([[0.5, 0.5]], [0.1], 0.05)).constraints[0]))
+
+
+TORN = {
+    "cost.expand": lambda: of_bound_cost(Hinge),
+    "cost.expand ": lambda: of_bound_cost(Landing),
+    "cost.scaled": lambda: of_bound_cost(OwnSlopes),
+    "constraints[0].accumulate": lambda: of_bound_spheres(Larger),
+    "constraints[0].violation": lambda: of_bound_spheres(made_violation()),
+    "constraints[0].value": lambda: of_bound_spheres(Nearer),
+    "constraints[0].accumulate ": lambda: problem(Narrower(-9.0, 9.0)),
+    "constraints[0].accumulate  ": lambda: problem(Later(lambda x: x[..., :1] - 0.5)),
+}
+
+
+def made_violation() -> type[BoundSpheres]:
+    """A class with rows and slopes of its own, whose penetration is that of the spheres."""
+
+    class Both(Larger):
+        def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+            super().accumulate(X, U, g, h, H)
+
+    return Both
+
+
+@pytest.mark.parametrize("field", TORN)
+def test_an_inherited_method_that_does_not_know_a_class_own_one_is_refused(field: str) -> None:
+    with pytest.raises(InputError, match="which doesn't call this") as told:
+        TORN[field]()
+    assert told.value.field == field.strip()
+
+
+def test_a_class_with_all_of_its_own_methods_is_solved() -> None:
+    found, due = (
+        torchgco.solve(p, solver="interior_point")
+        for p in (of_bound_cost(Whole), problem(cost=FunctionCost(hinged, ended)))
+    )
+    assert found.statuses == due.statuses == [Status.CONVERGED] * 2
+    assert float((found.cost - due.cost).abs().max()) < 1e-9
+
+
+def hinged(x: Tensor, u: Tensor) -> Tensor:
+    away = x - torch.tensor(WEIGHTS["x_ref"], dtype=D)
+    return 0.5 * away.square().sum(-1) + 0.05 * u.square().sum(-1) + 4.0 * (x[..., 0] - 0.3).relu().square()
+
+
+def ended(x: Tensor) -> Tensor:
+    return 5.0 * (x - torch.tensor(WEIGHTS["x_ref"], dtype=D)).square().sum(-1)
 
 
 @dataclass(frozen=True)

@@ -175,3 +175,22 @@ def test_what_no_point_shows_is_seen_in_the_trace() -> None:
     hidden = problem(constraints=[window])
     with pytest.raises(InputError, match="own knot alone"):
         trace_rows(hidden, 0)
+
+
+def flat(x: Tensor) -> Tensor:
+    """Another number for states (B, n) than for states (B, K, n)."""
+    return x[..., 0].square() * (3.0 if x.dim() == 2 else 1.0)
+
+
+BY_AXES: dict[str, Callable[[], Problem]] = {
+    "cost.stage": lambda: problem(FunctionCost(lambda x, u: flat(x) + u.square().sum(-1), lambda x: x[..., 0])),
+    "cost.terminal": lambda: problem(FunctionCost(lambda x, u: u.square().sum(-1), flat)),
+    "constraint.function": lambda: problem(constraints=[FunctionConstraint(lambda x: flat(x).unsqueeze(-1) - 2.0)]),
+}
+
+
+@pytest.mark.parametrize("field", BY_AXES)
+def test_numbers_that_depend_on_the_axes_before_a_state_are_refused(field: str) -> None:
+    with pytest.raises(InputError, match="whatever axes lie before the last") as told:
+        BY_AXES[field]()
+    assert told.value.field == field

@@ -7,7 +7,20 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import FunctionCost, FunctionDynamics, Problem, QuadraticCost, Spheres, kernels, presets
+from torchgco import (
+    ControlBounds,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    Problem,
+    QuadraticCost,
+    ScaleWarning,
+    Spheres,
+    StateBounds,
+    Status,
+    kernels,
+    presets,
+)
 from torchgco.costs.base import ShiftedCost
 
 D = torch.float64
@@ -91,3 +104,41 @@ def test_a_far_goal_is_no_constant(goal: float) -> None:
     assert not bool(problem.cost_scale.constant.any())
     constant = FunctionCost(lambda x, u: 1e12 + 0.1 * u.square().sum(-1), terminal)
     assert bool(Problem(base.dynamics, constant, [], 0.0 * base.x0, 40).cost_scale.constant.all()) == (goal < 1e4)
+
+
+def in_units(s: float, kind: str) -> Problem:
+    """Sixteen drawn points with drag, where a metre is 1 / s units of length: the same costs whatever s is."""
+    drag = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u - 0.3 * x[..., 2:]), -1), 4, 2, 0.2, "euler")
+    x0 = torch.randn(16, 4, dtype=D, generator=torch.Generator().manual_seed(5)) * torch.tensor([0.5, 0.5, 0.2, 0.2])
+    weights = {"Q": [1.0, 1.0, 0.1, 0.1], "R": [0.1, 0.1], "Qf": [20.0, 20.0, 1.0, 1.0]}
+    cost = QuadraticCost(**{name: [w / s**2 for w in W] for name, W in weights.items()}, x_ref=[s, 0.0, 0.0, 0.0])
+    slow = StateBounds([-9.0 * s, -9.0 * s, -0.5 * s, -0.5 * s], [9.0 * s, 9.0 * s, 0.5 * s, 0.5 * s], slice(5, 9))
+    rows = {
+        "controls": [ControlBounds(-s, s)],
+        "states": [slow, ControlBounds(-2.0 * s, 2.0 * s)],
+        "rows of order 1": [FunctionConstraint(lambda u: torch.cat((u / s - 1.0, -u / s - 1.0), -1), of="u")],
+        "norm": [FunctionConstraint(lambda u: u.square().sum(-1, keepdim=True) - s**2, of="u")],
+    }[kind]
+    return Problem(drag, cost, rows, s * x0, 8)
+
+
+@pytest.mark.filterwarnings("ignore::torchgco.ScaleWarning")
+@pytest.mark.parametrize("kind", ["controls", "states", "rows of order 1", "norm"])
+@pytest.mark.parametrize("native", [True, False])
+def test_small_units_change_no_answer(kind: str, native: bool) -> None:
+    kernels.use_native(native)
+    try:
+        due = torchgco.solve(in_units(1.0, kind), solver="interior_point").cost
+        for s in (1e-4, 1e-6, 1e-7):
+            found = torchgco.solve(in_units(s, kind), solver="interior_point")
+            solved = found.status == Status.CONVERGED
+            assert bool(solved.all()) or (s < 1e-5 and kind not in ("controls", "states"))
+            torch.testing.assert_close(found.cost[solved], due[solved], rtol=1e-3, atol=0)
+    finally:
+        kernels.use_native(True)
+
+
+@pytest.mark.parametrize("kind", ["controls", "states", "norm"])
+def test_tolerances_that_are_large_beside_the_rows_are_named(kind: str) -> None:
+    with pytest.warns(ScaleWarning, match="over 5% of the constraint's own values"):
+        torchgco.solve(in_units(1e-6, kind), solver="al_ilqr")

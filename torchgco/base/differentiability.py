@@ -17,6 +17,7 @@ class Differentiability(IntEnum):
     DEPENDENT_ROWS = 6
     WEAKLY_ACTIVE = 7
     LEAVES_GOAL = 8
+    ROWS_CHANGE = 9
 
     @property
     def sentence(self) -> str:
@@ -33,5 +34,7 @@ _SENTENCES = {
     Differentiability.NOT_STATIONARY: "The optimality conditions can't be met to the precision that derivatives need.",
     Differentiability.NOT_STRICT: "The minimum isn't strict: along some direction the cost is flat, or falls.",
     Differentiability.DEPENDENT_ROWS: "Constraints that hold depend on each other, so their multipliers aren't unique.",
+    Differentiability.ROWS_CHANGE: "The change is too large for first order: on the way a constraint begins or ceases "
+    "to hold.",
     Differentiability.WEAKLY_ACTIVE: "A constraint is on the edge of holding, and derivatives differ on its two sides.",
 }

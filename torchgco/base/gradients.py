@@ -30,18 +30,23 @@ def is_recording() -> bool:
     return _recording.get()
 
 
-def asking(tree: Any) -> list[Tensor]:
-    """The tensors in nested sequences, mappings and dataclasses that ask for gradients."""
-    found: list[Tensor] = []
+def leaves(tree: Any) -> list[Any]:
+    """All that nested sequences, mappings and dataclasses hold, but for these themselves."""
+    found: list[Any] = []
     waiting, seen = [tree], set[int]()
     while waiting:
         part = waiting.pop()
-        if isinstance(part, Tensor):
-            found += [part] if part.requires_grad else []
+        if not isinstance(part, (Mapping, tuple, list)) and (isinstance(part, type) or not is_dataclass(part)):
+            found.append(part)
         elif id(part) not in seen:  # parts may hold each other
             seen.add(id(part))
             waiting += [held for _, held in _parts(part)]
     return found
+
+
+def asking(tree: Any) -> list[Tensor]:
+    """The tensors in nested sequences, mappings and dataclasses that ask for gradients."""
+    return [leaf for leaf in leaves(tree) if isinstance(leaf, Tensor) and leaf.requires_grad]
 
 
 def without_gradients(tree: Any) -> Any:

@@ -22,7 +22,7 @@ from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
 from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Callback, Progress, Solver
 
@@ -71,7 +71,7 @@ class CasADiSolver(Solver):
 
         from torchgco.baselines.nlp import transcribe
 
-        check_problem(problem)
+        problem = current_problem(problem)
         program = transcribe(problem)
         nlp = {"x": program.variables, "p": program.parameters, "f": program.objective, "g": program.rows}
         try:
@@ -146,7 +146,7 @@ class PreparedCasADi(Solver):
         Raises:
             InputError: a problem of another form.
         """
-        check_problem(problem)
+        problem = current_problem(problem)
         return replace(self, problem=problem, program=self.program.of(problem))
 
     def run_from(self, X0: Tensor, U0: Tensor) -> Solution:

@@ -32,7 +32,7 @@ from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.presets import named
 from torchgco.problem.goal import Goal
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.ending import constant_cost, least_cost
 from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
@@ -104,7 +104,7 @@ def compile(
         InputError: another solver, a name that isn't there, or a problem on another device.
     """
     check_untransformed("compile")
-    check_problem(problem)
+    problem = current_problem(problem)
     if solver not in SOLVERS:
         raise InputError("solver", " or ".join(f'"{name}"' for name in SOLVERS), shown(solver))
     check_value(receding, bool, "receding")

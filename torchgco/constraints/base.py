@@ -208,8 +208,8 @@ class FunctionConstraint(Constraint):
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._along(X)(*self._arguments(X, U))
 
-    def rows_at(self, k: Tensor, *arguments: Tensor) -> Tensor:
-        """Rows (B, K, p) for the arguments (B, K, n|m) of the function at knots k (K,)."""
+    def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
+        """Rows (B, K, p) for the arguments (B, K, n|m) of the function at knots k (K,), or all at one knot."""
         return self.values.call(self.function, *arguments, k=k)
 
     def _along(self, X: Tensor) -> Callable[..., Tensor]:
@@ -217,7 +217,7 @@ class FunctionConstraint(Constraint):
         return lambda *z: self.rows_at(k, *z)
 
     def at(self, x: Tensor, k: int) -> Tensor:
-        return self.values.call(self.function, x, k=k)
+        return self.rows_at(k, x)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n = X.shape[-1]

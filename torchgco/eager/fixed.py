@@ -166,6 +166,7 @@ def readmit(kinds: Kinds, model: Model, t: State, of: Tensor, admitted: float) -
     some.mu = kinds.barrier[some.rows]
     some.watching, some.shortened = torch.zeros_like(some.watching), torch.zeros_like(some.shortened)
     some.least = torch.full_like(some.least, torch.inf)
+    some.left = torch.full_like(some.left, torch.inf)
     settle(kinds, part, some)
     renew(kinds, part, some)
     t.put(rows, some)
@@ -185,7 +186,7 @@ def relax(kinds: Kinds, model: Model, t: State) -> None:
     some.rows_relaxed = torch.ones_like(some.rows_relaxed)
     at: Derivatives = part.slopes(some.X, some.U)
     change = at.push(_responses(at.F, *_changes(part, some)), some.c)
-    room = kinds.how.relaxes * kinds.how.violation * change.abs().clamp(max=1.0)
+    room = kinds.how.relaxes * kinds.how.violation * torch.minimum(change.abs(), some.room)
     some.relaxed = torch.where(kinds.inside(some) & torch.isfinite(room), room, 0.0)
     some.s = some.s + some.relaxed
     settle(kinds, part, some)

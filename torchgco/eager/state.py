@@ -56,6 +56,7 @@ class State:
     slope: Tensor  # of phi, and the step length, before steps on trial
     alpha: Tensor
     least: Tensor  # the smallest error of the end test so far
+    left: Tensor  # the smallest complementarity so far, of those that counted
     idle: Tensor  # iterations since it fell by half, int64 as the counts that follow
     made: Tensor
     failures: Tensor
@@ -119,7 +120,7 @@ def blank(problem: Problem, X: Tensor, U: Tensor, z: Tensor) -> State:
         **own, "out": never, "fixes": never, "room": torch.ones_like(z), "relaxed": none, "mu": zero, "scale": one,
         "objective": one, "soft": zero, "shift": zero, "theta": zero, "phi": zero, "highest": inf, "lowest": zero,
         "filter": X.new_full((b, PAIRS, 2), torch.inf), "last": zero, "forced": zero, "entered": zero, "slope": zero,
-        "alpha": zero, "least": inf, "idle": count, "made": count, "failures": count, "shortened": count,
+        "alpha": zero, "least": inf, "left": inf, "idle": count, "made": count, "failures": count, "shortened": count,
         "ahead": count, "restoring": no, "crawls": no, "rows_relaxed": no, "presses": no, "watching": no,
         "rows": torch.arange(b, device=X.device),
     }  # fmt: skip
@@ -248,23 +249,27 @@ def find_solved(kinds: Kinds, t: State, test: Errors, running: Tensor) -> Tensor
     """Which of `running` end here.
 
     Tolerances below the usual rounding are met as well as the iterate can be: a problem goes on while the error falls,
-    and ends above them where rounding keeps it there. So does one whose barrier counts.
+    and ends above them where rounding keeps it there. So does one whose barrier counts, for as long as this share
+    falls.
     """
     how, error = kinds.how, test.whole
     t.idle = torch.where(running, torch.where(error <= 0.5 * t.least, 0, t.idle + 1), t.idle)
     t.least = torch.where(running & (error < t.least), error, t.least)
-    feasible, rests = running & ~t.restoring & (test.primal <= how.violation), t.idle >= how.idle
+    feasible = running & ~t.restoring & (test.primal <= how.violation)
     met = feasible & (error <= how.tolerance)
-    counts = met & barrier_counts(kinds, t)
-    t.presses = t.presses | counts
+    left, size = barrier_share(kinds, t)
+    counts = met & (left > how.counts * size)
+    t.idle = torch.where(counts & (left <= 0.5 * t.left), 0, t.idle)
+    t.left = torch.where(counts, torch.minimum(left, t.left), t.left)
+    t.presses, rests = t.presses | counts, t.idle >= how.idle
     met = met & (~counts | rests)
     loose = ~t.presses if how.tolerance >= how.rounding else torch.zeros_like(met)
     met = met & (loose | (error <= 2.0 * t.mu) | (t.idle >= 1))
     return met | (feasible & rests & (error <= how.rounding))
 
 
-def barrier_counts(kinds: Kinds, t: State) -> Tensor:
-    """Where the barrier is a part of the cost that counts, as a complementarity within its tolerance isn't small."""
+def barrier_share(kinds: Kinds, t: State) -> tuple[Tensor, Tensor]:
+    """The complementarity, and the size of the cost, beside which a tolerance that is met may not be small, (b,)."""
     left = torch.where(kinds.inside(t), t.s * t.z, 0.0).sum(-1)
     constant, size = kinds.constant[t.rows], kinds.least_cost[t.rows]
-    return left > kinds.how.counts * ((t.cost - t.scale * constant).abs() + t.scale * size)
+    return left, (t.cost - t.scale * constant).abs() + t.scale * size

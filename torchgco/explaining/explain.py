@@ -21,7 +21,7 @@ from torchgco.judging.judge import columns as judged
 from torchgco.lagrangian.unmoved import unmoved
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import within_horizons
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def _explanation(solved: Solved, b: int, problem: Problem | None, what: str | No
     account = solved.account or Account()
     whole = account.problem if problem is None else problem
     if problem is not None:
-        check_problem(problem)
+        problem = current_problem(problem)
         check_shape(solved.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
         check_shape(solved.U, (problem.B, problem.N, problem.m), "problem: solution.U")
     one = None if whole is None else _One(whole, solved, b)

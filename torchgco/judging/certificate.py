@@ -31,10 +31,9 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.horizons import within_horizons
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
-LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
 
 
@@ -95,7 +94,7 @@ def certify(
     Raises:
         InputError: X, U, asked or multipliers don't fit the problem.
     """
-    check_problem(problem)
+    problem = current_problem(problem)
     problem, X, U = in_double(problem), doubled(X, "X", problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
     check_shape(X, (problem.B, problem.N + 1, problem.n), "X")
@@ -272,7 +271,7 @@ def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]
     rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
     unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
     cost = (problem.cost.total(X, U) - problem.cost_scale.constant)[0].abs()
-    cost = cost + LEAST_COST * problem.N * problem.cost_unit[0]
+    cost = cost + problem.cost_scale.size[0]
     products = [torch.where(lam != 0, lam * c, 0.0).abs().flatten() for lam, c in zip(lams, rows, strict=True)]
     return torch.cat((unfit.view(1), *(product / cost for product in products))).amax()
 

@@ -25,7 +25,7 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.goal import Goal
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 
 OTHERS_WITHIN = ADMITTED  # how far all constraints but the obstacles may be violated by a feasible trajectory
 SUCCESS_VIOLATION = ADMITTED  # full radii, in metres
@@ -91,7 +91,7 @@ def judge(
         InputError: U, goal, radius or start don't fit the problem, a goal is given without a radius, or for dynamics
             without a position, starts are free and none are given, or obstacles are of a kind that can't be judged.
     """
-    check_problem(problem)
+    problem = current_problem(problem)
     single = problem.x0.dtype == torch.float32
     problem, U = in_double(problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
@@ -363,7 +363,7 @@ def columns(problem: Problem, U: Tensor, start: Tensor | None = None) -> dict[st
     Raises:
         InputError: as `judge`.
     """
-    check_problem(problem)
+    problem = current_problem(problem)
     if problem.dynamics.position is None:
         return {}
     names = ["clearance"] if any(isinstance(c, tuple(CLEARANCES)) for c in problem.constraints) else []

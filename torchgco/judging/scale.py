@@ -10,7 +10,8 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
 
 SHARE = 0.05  # of a constraint's values: a larger violation leaves little of the constraint
-TIGHT = 1e-6  # no violation below it counts as large: that of solves by the interior point
+MET = 1e-15  # values of rows that the guess meets up to rounding say nothing of a constraint's size: in such rows, ...
+ROUGH = 1e-6  # ... and in equalities, no violation up to this counts as large, which the interior point may leave
 
 
 def dwarfed(problem: Problem, guess: tuple[Tensor, Tensor], found: tuple[Tensor, Tensor]) -> Tensor:
@@ -30,6 +31,8 @@ def dwarfed(problem: Problem, guess: tuple[Tensor, Tensor], found: tuple[Tensor,
         if before.numel() == 0:
             continue
         size = before.abs().flatten(1).amax(-1).view(-1, 1, 1)
-        large = (constraint.violation(*found) > (SHARE * size).clamp(min=TIGHT)) & (now != before)
+        rough = (size <= MET) | (constraint.sense == "equality")
+        admitted = torch.where(rough, (SHARE * size).clamp(min=ROUGH), SHARE * size)
+        large = (constraint.violation(*found) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place

@@ -33,7 +33,7 @@ from torchgco.missions.tracker import Reference, Tracker, Tracking
 from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import Explorer, SensorName, Unknown
 from torchgco.native.compiler import find_compiler
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
@@ -141,7 +141,7 @@ class Mission:
             return flight.planner.first(problem, measured(flight.x, flight.noise[:, 0]), flight.seed, flight.ids)
 
     def _flight(self, problem: Problem, seed: int, ids: Tensor | None) -> _Flight:
-        check_problem(problem)
+        problem = current_problem(problem)
         seed = check_value(seed, Seed, "seed")
         if ids is not None:
             check_ids(ids, problem)

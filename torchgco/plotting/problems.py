@@ -26,7 +26,7 @@ from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import flown, leaving, passes, view
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.world import World, distances, world_of
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
 
@@ -55,7 +55,7 @@ class Course:
 
 def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
     """The figure of `torchgco.plot`; see there."""
-    check_problem(problem)
+    problem = current_problem(problem)
     check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
     check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
     courses, unit = _courses(problem, solution, _places(b, problem.B))

@@ -13,10 +13,20 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, describe
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
+from torchgco.costs.base import Cost
+from torchgco.dynamics.base import Dynamics
+from torchgco.obstacles.base import Obstacles
 
 Part = TypeVar("Part")
 # What a class says of its own fields, which a bound part of another class has no use for.
 OF_FIELDS = {"bind", "batched", "per_element"}
+# Methods that say what a part is, and those that a class of ours computes beside them from its own fields alone.
+SAID = "stage", "terminal", "total", "value", "at", "signed_distance", "field", "step"
+COMPUTED = (
+    "expand", "scaled", "value", "accumulate", "violation", "worst", "at", "signed_distance", "segment_clearance",
+    "chord_clearance", "jacobians",
+)  # fmt: skip
+INTERFACES = Cost, Constraint, Obstacles, Dynamics  # what these compute, they compute by a part's own methods
 
 
 def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
@@ -24,7 +34,8 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
 
     Raises:
         InputError: `bind` returns another kind of thing, or one of torchgco's own classes that doesn't do what the
-            user's class does: a subclass of `QuadraticCost`, say, whose `stage` would never be called.
+            user's class does: a subclass of `QuadraticCost`, say, whose `stage` would never be called. Or a user's
+            class has one method of its own and inherits another that doesn't know it, such as `stage` and `expand`.
     """
     found = part.bind(dims)
     if not isinstance(found, kind):
@@ -36,19 +47,40 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
     for name in _lost(part, found):
         expected = f"a class whose own methods are called: {type(found).__name__} takes its place"
         raise InputError(f"{field}.{name}", expected, f"one of {type(part).__name__}")
+    for own, name, heir in _torn(found):
+        expected = f"a method of {type(found).__name__}, which has a `{own}` of its own, or a class without {heir}'s"
+        raise InputError(f"{field}.{name}", expected, f"the one of {heir}, which doesn't call this `{own}`")
     return found
 
 
 def _lost(part: Any, found: Any) -> Iterator[str]:
     """Names that a user's class defines anew and that are other ones in the class of what its `bind` returned."""
-    if isinstance(found, type(part)) or type(found).__module__.partition(".")[0] != "torchgco":
+    if isinstance(found, type(part)) or not _is_ours(type(found)):
         return
     values = {field.name for field in fields(part)} if is_dataclass(part) else set[str]()
     for cls in type(part).__mro__:
-        if cls.__module__.partition(".")[0] == "torchgco":
+        if _is_ours(cls):
             return
         for name, value in vars(cls).items():
             if name.startswith("__") or name in OF_FIELDS or name in values:
                 continue
             if hasattr(type(found), name) and getattr(type(found), name) is not value:
                 yield name
+
+
+def _torn(found: Any) -> Iterator[tuple[str, str, str]]:
+    """A user's own method, one that is inherited from a class of ours and computes without it, and this class."""
+    line = type(found).__mro__
+    for name in COMPUTED:
+        at = next((i for i, cls in enumerate(line) if name in vars(cls)), None)
+        unused = name == "at" and isinstance(found, Constraint) and not found.geometric
+        if at is None or unused or line[at] in INTERFACES or not _is_ours(line[at]):
+            continue
+        users = [cls for cls in line[:at] if not _is_ours(cls)]
+        own = next((own for own in SAID if own != name and any(own in vars(cls) for cls in users)), None)
+        if own is not None:
+            yield own, name, line[at].__name__
+
+
+def _is_ours(cls: type) -> bool:
+    return cls.__module__.partition(".")[0] == "torchgco"

@@ -1,20 +1,22 @@
-"""A problem's parts as the user gave them, where tensors in them ask for gradients.
+"""A problem's parts as the user gave them, from which it is bound anew where their numbers have changed since.
 
-A problem holds numbers alone: solvers, pictures and judges never meet a gradient. What it was given is kept beside
-them, and bound once more, with gradients recorded, where a solution is to be differentiated; or bound anew where an
-optimiser has changed these tensors since.
+A problem holds numbers alone: solvers, pictures and judges never meet a gradient. Where tensors that it was given ask
+for gradients, its parts are bound once more, with gradients recorded, when a solution is to be differentiated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+import zlib
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from torchgco.base.gradients import asking, recording, without_gradients
-from torchgco.base.shapes import as_states
+from torchgco.base.gradients import leaves, recording, without_gradients
+from torchgco.base.shapes import as_states, check_untransformed
 from torchgco.problem.free_start import moved_inside
 
 PARTS = "dynamics", "cost", "constraints", "x0"  # a goal judges trajectories and changes none: it takes no gradients
@@ -22,42 +24,55 @@ PARTS = "dynamics", "cost", "constraints", "x0"  # a goal judges trajectories an
 
 @dataclass(frozen=True)
 class Given:
-    """The parts of a problem, some tensors of which ask for gradients.
+    """The parts of a problem.
 
     Attributes:
         fields: all of the problem's fields as they were given.
-        tensors: those that ask for gradients, with the numbers of changes that they had seen when they were bound.
+        facts: what tells of their numbers whether they have changed.
+        asks: whether a tensor asks for gradients.
         whole, then: what was made of the problem `whole` afterwards, such as a part of its batch.
+        renewed: the problem that was bound last, and the facts then; none where nothing has changed.
     """
 
     fields: Mapping[str, Any]
-    tensors: tuple[tuple[Tensor, int], ...]
+    facts: tuple[Hashable, ...]
+    asks: bool
     whole: Any = None
     then: tuple[Callable[[Any], Any], ...] = ()
+    renewed: list[tuple[Any, tuple[Hashable, ...]]] = field(default_factory=list)
 
     @classmethod
-    def of(cls, fields: Mapping[str, Any]) -> Given | None:
-        """That of a problem's fields; None where nothing asks for gradients."""
-        found = asking([fields[name] for name in PARTS])
-        return cls(dict(fields), tuple((tensor, tensor._version) for tensor in found)) if found else None
+    def of(cls, fields: Mapping[str, Any]) -> Given:
+        """That of a problem's fields; InputError within a transform of torch.func or torch.compile."""
+        check_untransformed("Problem")
+        asks = any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves([fields[name] for name in PARTS]))
+        return cls(dict(fields), tuple(_facts(fields)), asks)
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The same fields without gradients."""
-        return {name: without_gradients(part) if name in PARTS else part for name, part in self.fields.items()}
-
-    @property
-    def is_stale(self) -> bool:
-        """Whether any of the tensors has been changed in place since they were bound."""
-        return any(tensor._version != version for tensor, version in self.tensors)
+        """The fields that hold tensors that ask for gradients, without these."""
+        return {name: without_gradients(self.fields[name]) for name in PARTS} if self.asks else {}
 
     def followed(self, whole: Any, by: Callable[[Any], Any]) -> Given:
         """The same of what is made of a problem, `whole`."""
-        return replace(self, whole=self.whole or whole, then=(*self.then, by))
+        return replace(self, whole=self.whole or whole, then=(*self.then, by), renewed=[])
 
-    def anew(self, kind: Callable[..., Any]) -> Any:
-        """The problem of these parts with their numbers as they are now."""
-        return self._applied(kind(**self.fields))
+    def started(self, problem: Any, x0: Tensor, constraints: Sequence[Any], *others: Any) -> Given | None:
+        """The same of `problem`, which is of these parts, with other starts, constraints, cost and dynamics."""
+        if self.then:  # of a part of its batch
+            return None
+        fields = {"x0": x0, "constraints": replaced(constraints, problem.constraints, self.fields["constraints"])}
+        fields |= {name: part for name, part in zip(("cost", "dynamics"), others, strict=True) if part is not None}
+        return Given.of({**self.fields, **fields})
+
+    def current(self, problem: Any) -> Any:
+        """`problem`, which is of these parts; bound anew where their numbers have changed since."""
+        facts = tuple(_facts(self.fields))
+        if facts == self.facts:
+            return problem
+        if not self.renewed or self.renewed[0][1] != facts:
+            self.renewed[:] = [(self._applied(type(problem)(**self.fields)), facts)]
+        return self.renewed[0][0]
 
     def recorded(self, problem: Any) -> Any:
         """`problem`, which is of these parts, with gradients recorded: its tensors lead to those that were given."""
@@ -75,3 +90,35 @@ class Given:
         for step in self.then:
             problem = step(problem)
         return problem
+
+
+def place(part: Any, parts: Sequence[Any]) -> int | None:
+    """The place of this very part among others; None where it isn't there."""
+    return next((i for i, other in enumerate(parts) if other is part), None)
+
+
+def replaced(parts: Sequence[Any], old: Sequence[Any], new: Sequence[Any]) -> list[Any]:
+    """Parts, with those among `old` replaced by those that stand at their places in `new`."""
+    places = [place(part, old) for part in parts]
+    return [part if at is None else new[at] for part, at in zip(parts, places, strict=True)]
+
+
+def _facts(fields: Mapping[str, Any]) -> Iterator[Hashable]:
+    """Numbers, how often tensors were written into, and sums over the bytes: `.data` and NumPy write unseen."""
+    for leaf in leaves(fields):
+        if isinstance(leaf, Tensor):
+            yield 0 if leaf.is_inference() else leaf._version
+            plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
+            if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
+                yield _sum(leaf.detach().resolve_conj().resolve_neg().numpy())
+        elif isinstance(leaf, np.ndarray):
+            yield _sum(leaf)
+        elif isinstance(leaf, (int, float)):
+            yield leaf
+
+
+def _sum(array: np.ndarray) -> int | None:
+    """A sum over the bytes of numbers; None of other things."""
+    return (
+        zlib.crc32(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data) if array.dtype.kind in "biuf" else None
+    )

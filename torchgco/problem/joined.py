@@ -51,6 +51,31 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
     return _place(alone(rows, k, *arguments), together(rows, k, *arguments))
 
 
+def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> bool:
+    """Whether rows of one knot (b, ...), or of its samples (b, S, ...), differ from those of all knots (b, K, ...).
+
+    Code that takes some of these forms alone is left to those who call it so.
+
+    Args:
+        function: of problems (b,), knots (K,) or one of them, an int, and arguments with these leading axes.
+        rows: two problems.
+        k: the numbers of the knots (K,).
+        arguments: (2, K, ...).
+    """
+    several = _tried(function, rows, k, *arguments)
+    if several is None or several.shape[:2] != (len(rows), len(k)):
+        return False
+    for at in {0, len(k) // 2, len(k) - 1}:
+        one = [z[:, at] for z in arguments]
+        alone = _tried(function, rows, int(k[at]), *one)
+        samples = _tried(function, rows, int(k[at]), *(torch.stack((z, z, z), dim=1) for z in one))
+        for found in (alone, None if samples is None else samples[:, 0]):
+            due = several[:, at]
+            if found is not None and found.shape == due.shape and bool(unlike(found, due).any()):
+                return True
+    return False
+
+
 def _suspect(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> int | None:
     """`joined_knots`, and the place of one that changes where the function branches on values."""
     K, one = len(k), rows[:1]
@@ -84,7 +109,7 @@ def _foreign(*rows: Tensor) -> Iterator[list[Tensor]]:
         yield [part + NEAR * (1.0 + part.abs()) * scattered(part) for part in z]
 
 
-def _tried(function: Callable[..., Tensor], *arguments: Tensor) -> Tensor | None:
+def _tried(function: Callable[..., Tensor], *arguments: Tensor | int) -> Tensor | None:
     """The function's values; None where it refuses such arguments."""
     try:
         with warnings.catch_warnings():

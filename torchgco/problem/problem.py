@@ -25,7 +25,7 @@ from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
-from torchgco.problem.given import Given
+from torchgco.problem.given import Given, place, replaced
 from torchgco.problem.goal import Goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
@@ -67,16 +67,13 @@ class Problem:
     free_start: Any = None
 
     known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
-    # What it was given, where tensors of that ask for gradients; the fields hold numbers alone.
-    given: ClassVar[Given | None] = None
+    given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
 
     def __post_init__(self) -> None:
         fields_given = {f.name: getattr(self, f.name) for f in fields(self)}
         given = Given.of(fields_given)
-        if given is not None:
-            object.__setattr__(self, "given", given)
-            for name, part in given.numbers.items():
-                object.__setattr__(self, name, part)
+        for name, part in (given.numbers | {"given": given}).items():
+            object.__setattr__(self, name, part)
         self._check_border()
         with computing_on(self.x0.device):
             self._bind(*(fields_given[name] for name in ("dynamics", "cost", "constraints")))
@@ -174,9 +171,9 @@ class Problem:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
         X, U = self.at_rest
         stages = None if self.horizon is None else self.stages
-        if isinstance(self.cost, BoundQuadratic):
+        if type(self.cost) is BoundQuadratic:
             curvatures = self.cost.control_curvatures.expand(self.B, self.N, self.m)
-            return cost_scale(self.cost.total(X, U), curvatures, None, stages)
+            return cost_scale(self.cost.total(X, U), curvatures, None, stages, self.control_bounds)
         s = self.n + 1 + self.m
         H = self.x0.new_empty(self.B, self.N + 1, s, s)
         self.cost.expand(X, U, H)
@@ -193,7 +190,8 @@ class Problem:
         total, goal = self.cost.total(X, U), None if self.goal is None else self.goal.position
         changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
         changes = torch.maximum(changes, savings(slopes, curvatures))
-        return cost_scale(total, curvatures[:, :-1, self.n :], changes, None if self.horizon is None else self.stages)
+        stages = None if self.horizon is None else self.stages
+        return cost_scale(total, curvatures[:, :-1, self.n :], changes, stages, self.control_bounds)
 
     @property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
@@ -223,7 +221,7 @@ class Problem:
 
         No solver option then depends on the cost's scale or zero.
         """
-        unit, constant = self.cost_scale
+        unit, constant, _ = self.cost_scale
         cost = self.cost.scaled(1.0 / unit)
         if bool((constant != 0).any()):
             cost = ShiftedCost(cost, constant / (unit * self.N))
@@ -256,16 +254,15 @@ class Problem:
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
-        return self.anew()._with({})
+        return self.current()._with({})
 
-    def anew(self) -> Self:
-        """The same problems with their numbers as they are now, where an optimiser has changed tensors in place that
-        ask for gradients; else this one."""
-        return self.given.anew(type(self)) if self.given is not None and self.given.is_stale else self
+    def current(self) -> Self:
+        """The same problems with numbers as they are now, where these were changed in place since; else this one."""
+        return self if self.given is None else self.given.current(self)
 
     def recorded(self) -> Self:
         """The same problems with gradients recorded, from the tensors that were given on; itself without such."""
-        return self if self.given is None else self.given.recorded(self)
+        return self.given.recorded(self) if self.given is not None and self.given.asks else self
 
     def is_same(self, other: Problem) -> bool:
         """Whether both have the very same parts."""
@@ -306,10 +303,11 @@ class Problem:
         if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
             raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", describe(x0))
         _check_constraints(constraints)
-        if cost is not None and not isinstance(cost, Cost):
-            raise InputError("cost", "a Cost", _named(cost))
-        if dynamics is not None and not isinstance(dynamics, Dynamics):
-            raise InputError("dynamics", "a Dynamics", _named(dynamics))
+        if (now := self.current()) is not self:
+            return now.started_at(x0, replaced(constraints, self.constraints, now.constraints), cost, dynamics)
+        for field, part, kind in (("cost", cost, Cost), ("dynamics", dynamics, Dynamics)):
+            if part is not None and not isinstance(part, kind):
+                raise InputError(field, f"a {kind.__name__}", _named(part))
         if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
             raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
         with computing_on(x0.device):
@@ -319,11 +317,10 @@ class Problem:
             dims = self._dimensions(x0, model)
             rows = _all_bound(constraints, dims)
             for i, part in enumerate(rows):
-                if not isinstance(part, Obstacles):
-                    continue
-                if part.position != dims.position or (part.moving and part.dt != dims.dt):
+                other = (part.position, part.dt if part.moving else dims.dt) if isinstance(part, Obstacles) else None
+                if other is not None and other != (dims.position, dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
-                    raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
+                    raise InputError(f"constraints[{i}]", expected, f"bound ones for {other[1]} s and {other[0]}")
             if [type(part) for part in rows] != [type(part) for part in self.constraints]:
                 kinds = ", ".join(type(part).__name__ for part in self.constraints)
                 raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in rows))
@@ -335,10 +332,11 @@ class Problem:
                 if self.goal is None or self.goal.assumed:
                     parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
-            known = set(map(id, self.constraints))
-            new = [pair for pair in zip(constraints, rows, strict=True) if id(pair[0]) not in known]
-            model = None if dynamics is None else (dynamics, parts["dynamics"])
-            check_code(dims, started.x0, model, None if cost is None else (cost, parts["cost"]), new)
+            given = self.given and self.given.started(self, x0, constraints, cost, dynamics)
+            object.__setattr__(started, "given", given)
+            new = [pair for pair in zip(constraints, rows, strict=True) if place(pair[0], self.constraints) is None]
+            pair = lambda part, name: None if part is None else (part, parts[name])
+            check_code(dims, started.x0, pair(dynamics, "dynamics"), pair(cost, "cost"), new)
         return started
 
     def cast(self, dtype: torch.dtype) -> Self:
@@ -421,10 +419,15 @@ def _is_whole(index: Rows, B: int) -> bool:
     return index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
 
 
-def check_problem(problem: Any) -> None:
-    """Raise InputError unless the argument is a Problem."""
+def current_problem(problem: Any) -> Problem:
+    """The problem with its numbers as they are now.
+
+    Raises:
+        InputError: the argument is no Problem.
+    """
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem", _named(problem))
+    return problem.current()
 
 
 def _check_constraints(constraints: Any) -> None:

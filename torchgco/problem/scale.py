@@ -7,9 +7,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bounds import ControlBounds
 from torchgco.costs.base import Cost
 
 LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
+LEAST_COST = 1e-6  # share of the cost of staying at the start, as which a cost counts at least
+BOUNDED, UNBOUNDED = 3e-5, 1e-10  # controls that cost nothing: as shares of their bounds, of 1 at most; without bounds
 DWARFS = 100.0  # times the rest of the cost: a smaller constant leaves tests relative to the cost meaningful
 
 
@@ -18,9 +21,16 @@ class CostScale(NamedTuple):
 
     unit: Tensor  # above 0
     constant: Tensor  # in the cost of a whole trajectory; 0 where it doesn't dwarf the rest
+    size: Tensor  # as how much a whole trajectory's cost counts at least where a share of it is meant, above 0
 
 
-def cost_scale(total: Tensor, curvatures: Tensor, changes: Tensor | None, stages: Tensor | None = None) -> CostScale:
+def cost_scale(
+    total: Tensor,
+    curvatures: Tensor,
+    changes: Tensor | None,
+    stages: Tensor | None = None,
+    bounds: ControlBounds | None = None,
+) -> CostScale:
     """The mean cost per stage of staying at the start at rest, without its constant.
 
     A thousandth of the controls' mean curvature is added; only this is left where the start is the goal.
@@ -31,6 +41,7 @@ def cost_scale(total: Tensor, curvatures: Tensor, changes: Tensor | None, stages
         changes: by how much the cost changes elsewhere, (B,). Where `total` is over `DWARFS` times as large, all but
             the change is a constant. None: the cost has none.
         stages: how many of the N stages are a problem's own, (B,); None: all.
+        bounds: of the controls; None: they have none.
     """
     (count, m), N = curvatures.shape[1:], curvatures.shape[1]
     if stages is not None:
@@ -38,13 +49,21 @@ def cost_scale(total: Tensor, curvatures: Tensor, changes: Tensor | None, stages
         curvatures, N = torch.where(own.unsqueeze(-1), curvatures, 0.0), stages
     # Contiguous and one axis at a time: the order of summation must not depend on the batch.
     curvature = curvatures.abs().contiguous().sum(-1).sum(-1) / (N * m)
+    idle = torch.full_like(curvatures[:, 0], UNBOUNDED)
+    if bounds is not None:
+        half = 0.5 * bounds.range
+        idle = torch.where(torch.isfinite(half), BOUNDED * half.clamp(max=1.0), idle)
+    idly = (curvatures.abs() * idle.square().unsqueeze(1)).contiguous().sum(-1).sum(-1) / m
     least, constant = LEAST_UNIT * curvature, torch.zeros_like(total)
     if changes is not None:
         rest = total.abs() - torch.maximum(changes, N * least)
         dwarfs = (rest > DWARFS * torch.maximum(changes, N * least)) & torch.isfinite(rest)
         constant = torch.where(dwarfs, total.sign() * rest, constant)
     unit = (total - constant).abs() / N + least
-    return CostScale(torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0), constant)
+    size = LEAST_COST * (total - constant).abs() + idly
+    usable = torch.isfinite(unit) & (unit > 0)
+    size = torch.where(usable & (size > 0), size, LEAST_COST * torch.where(usable, unit * N, 1.0))
+    return CostScale(torch.where(usable, unit, 1.0), constant, size)
 
 
 def changes_of(cost: Cost, X: Tensor, U: Tensor, total: Tensor, goal: Tensor | None, position: slice | None) -> Tensor:

@@ -2,3 +2,4 @@
 
 from torchgco.sensitivity.attach import asks_for_gradients as asks_for_gradients
 from torchgco.sensitivity.attach import attached as attached
+from torchgco.sensitivity.predict import predicted as predicted

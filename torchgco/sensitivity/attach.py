@@ -24,10 +24,7 @@ from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
 NEAR = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
-REFUSED = (
-    "a problem in float64 with one horizon, a given start and no RateBounds, as tensors in it ask for gradients, "
-    "or torch.no_grad()"
-)
+SERVED = "a problem in float64 with one horizon, a given start and no RateBounds"
 
 
 def asks_for_gradients(problem: Problem) -> bool:
@@ -40,8 +37,14 @@ def asks_for_gradients(problem: Problem) -> bool:
         raise InputError("solve", "a call outside of forward_ad.dual_level: derivatives are reverse", "one inside")
     if not torch.is_grad_enabled() or torch.is_inference_mode_enabled() or problem.B == 0:
         return False
-    if problem.given is None and not _captures(problem):
+    if not (problem.given is not None and problem.given.asks) and not _captures(problem):
         return False
+    refuse_forms(problem, "tensors in it that ask for gradients (or torch.no_grad())")
+    return True
+
+
+def refuse_forms(problem: Problem, what: str) -> None:
+    """Raise InputError for forms of problems that have no derivatives here, of which `what` asks for them."""
     for got, refused in (
         (problem.x0.dtype, problem.x0.dtype != torch.float64),
         ("horizons per problem", problem.horizon is not None),
@@ -49,8 +52,7 @@ def asks_for_gradients(problem: Problem) -> bool:
         ("RateBounds", any(isinstance(part, RateBounds) for part in problem.constraints)),
     ):
         if refused:
-            raise InputError("problem", REFUSED, got)
-    return True
+            raise InputError("problem", f"{SERVED}, for {what}", got)
 
 
 def _captures(problem: Problem) -> bool:

@@ -23,7 +23,7 @@ from torchgco.kernels import cost_unit, current, open_loop, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.horizons import at_rest_after, for_solvers
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 
 
@@ -179,8 +179,7 @@ class Solver(Brief):
                 solver can't begin with states.
         """
         check_untransformed("solve")
-        check_problem(problem)
-        problem = problem.anew()
+        problem = current_problem(problem)
         with computing_on(problem.x0.device):
             if problem.B == 0:  # nothing to trace code with
                 Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)

@@ -19,7 +19,6 @@ from torchgco.problem.problem import Problem
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
-LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
 FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
 
 
@@ -67,7 +66,8 @@ def constant_cost(problem: Problem) -> Tensor:
 
 def least_cost(problem: Problem) -> Tensor:
     """As how much each problem's cost counts at least where a share of it is meant, (B,)."""
-    return LEAST_COST * problem.N * cost_unit(problem)
+    cost_unit(problem)  # by native kernels, where PyTorch would differentiate
+    return problem.cost_scale.size
 
 
 def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:

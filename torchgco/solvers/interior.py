@@ -27,7 +27,7 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.solvers.ending import STATIONARY, constant_cost, least_cost, start_status
@@ -43,7 +43,7 @@ FILTER: dict[str, Any] = {
     "boundary": 0.99, "closest": 1.0 - 1e-12,  # share of the way to where a slack is 0 (tau_min), and at most: above 0
     "central": 1e10,  # factor by which s z may leave mu (kappa_Sigma)
     "barrier_error": 10.0, "barrier_share": 0.2, "barrier_floor": 0.1,  # kappa_epsilon, kappa_mu; tolerance times this
-    "barrier_least": 1e-20, "counts": STATIONARY,  # where complementarity makes up more than this share of the cost
+    "barrier_least": 1e-30, "counts": STATIONARY,  # where complementarity makes up more than this share of the cost
     "usual_multiplier": 100.0, "largest_multiplier": 1e3,  # s_max; costates at the start are 0 where larger
     "highest": 1e4, "lowest": 1e-4,  # theta_max, theta_min, as multiples of theta at the start, of 1 at least
     "gain_theta": 1e-5, "gain_phi": 1e-8, "armijo": 1e-4,  # gamma_theta, gamma_phi, eta_phi
@@ -126,7 +126,7 @@ class InteriorPoint(Solver):
         Raises:
             InputError: X0 or U0 don't fit the problem.
         """
-        check_problem(problem)
+        problem = current_problem(problem)
         check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
         check_tensor(X0, "X0", problem.x0)
         return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)

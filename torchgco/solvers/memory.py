@@ -9,7 +9,7 @@ from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import check_device
 from torchgco.kernels import kernels_of
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 
 CPU_LIMIT = 256  # a larger batch is no faster on a core: the overhead that problems share is negligible by then
 FREE_MEMORY_SHARE = 0.5  # of the free memory; the rest is the system's and other processes'
@@ -45,7 +45,7 @@ def plan_batch(problem: Problem, device: str | torch.device | None = None, proce
     Raises:
         InputError: fewer than one process, or a device that isn't there.
     """
-    check_problem(problem)
+    problem = current_problem(problem)
     check_value(processes, Count, "processes")
     where = problem.x0.device if device is None else check_device(device)
     free = torch.cuda.mem_get_info(where)[0] if where.type == "cuda" else free_memory()

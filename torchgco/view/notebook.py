@@ -8,7 +8,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
 from torchgco.view.document import Document
@@ -24,7 +24,7 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
     Raises:
         InputError: a problem of another form, an empty one, or dynamics without a position in the plane or in space.
     """
-    check_problem(problem)
+    problem = current_problem(problem)
     check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
     check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
     dimension = problem.position.stop - problem.position.start

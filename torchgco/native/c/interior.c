@@ -46,6 +46,7 @@ static void begin(Barrier *t, Track *k, I of) {
     k->last = tgco_choose(of, zero, k->last); k->forced = tgco_choose(of, zero, k->forced);
     k->made = tgco_choose(of, zero, k->made);
     k->least = tgco_choose(of, SET(INFINITY), k->least);
+    k->left = tgco_choose(of, SET(INFINITY), k->left);
     t->shift = tgco_choose(of, zero, t->shift); /* gains of a problem that ends at once don't know the lane's last one */
     k->restoring &= ~of; k->watching &= ~of;
     k->relaxed &= ~of; k->presses &= ~of;
@@ -166,30 +167,34 @@ static void resume(Barrier *t, Track *k) {
 }
 
 /* Lanes `of` whose barrier is a part of their cost that counts: where the units are small, so is the scaled cost, and a
-   complementarity within its tolerance isn't small beside it. */
-static I barrier_counts(Barrier *t, I of) {
+   complementarity within its tolerance, in all `left`, isn't small beside it. */
+static I barrier_counts(Barrier *t, I of, V *left) {
+    *left = SET(0.0);
     if (!any(of)) return of;
-    V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), left = SET(0.0), size;
-    ROWS(t, 0, left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)))
+    V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
+    ROWS(t, 0, *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)))
     for (int l = 0; l < LANES; l++) {
         int64_t e = t->lanes.element[l];
         size[l] = __builtin_fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
     }
-    return of & (left > SET(t->how->counts) * size);
+    return of & (*left > SET(t->how->counts) * size);
 }
 
 /* Lanes of `running` that end here. Tolerances below the usual rounding are met as well as the iterate can be, as the
    rollout of its controls amplifies gaps: a lane goes on while the error falls, and ends above them where rounding keeps
-   it there. So does one whose barrier counts. */
+   it there. So does one whose barrier counts, for as long as this share falls. */
 static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
     const Interior *how = t->how;
-    V zero = SET(0.0), one = SET(1.0);
+    V zero = SET(0.0), one = SET(1.0), left;
     V idle = tgco_choose(error <= SET(0.5) * k->least, zero, k->idle + one);
     k->idle = tgco_choose(running, idle, k->idle);
     k->least = tgco_choose(running & (error < k->least), error, k->least);
-    I feasible = running & ~k->restoring & (primal <= SET(how->violation)), rests = k->idle >= SET((double)how->idle);
-    I met = feasible & (error <= SET(how->tolerance)), counts = barrier_counts(t, met);
+    I feasible = running & ~k->restoring & (primal <= SET(how->violation));
+    I met = feasible & (error <= SET(how->tolerance)), counts = barrier_counts(t, met, &left);
+    k->idle = tgco_choose(counts & (left <= SET(0.5) * k->left), zero, k->idle);
+    k->left = tgco_choose(counts, least(left, k->left), k->left);
     k->presses |= counts;
+    I rests = k->idle >= SET((double)how->idle);
     met &= ~counts | rests;
     met &= ((SET(how->tolerance) >= SET(how->rounding)) & ~k->presses) | (error <= SET(2.0) * t->mu) | (k->idle >= one);
     return met | (feasible & rests & (error <= SET(how->rounding)));
@@ -223,6 +228,7 @@ static I readmit(Barrier *t, Track *k, I of, double admitted) {
         k->watching[l] = k->shortened[l] = 0;
     }
     k->least = tgco_choose(changed, SET(INFINITY), k->least);
+    k->left = tgco_choose(changed, SET(INFINITY), k->left);
     settle(t, k, changed, 0);
     renew(t, changed);
     return changed;

@@ -170,14 +170,15 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) 
     }
 }
 
-/* Rows are relaxed by a share of the violation tolerance, and by less where the controls change them little. */
+/* Rows are relaxed by a share of the violation tolerance, and by less where bounds leave less room or the controls change
+   them little. */
 static void loosen(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
     V change[con->rows], most_room = SET(t->how->relaxes * t->how->violation);
     along(t, i, k, at->x, k < t->lanes.of->N ? at->x + NX : 0, at->z, change);
     for (int j = 0; j < con->rows; j++, q++) {
-        V room = most_room * least(tgco_fabs(change[j]), SET(1.0));
+        V room = most_room * least(tgco_fabs(change[j]), t->room[q]);
         room = tgco_if(of & ~t->out[q] & finite(room), room);
         t->relaxed[q] = tgco_choose(of, room, t->relaxed[q]);
         t->s[q] += room;

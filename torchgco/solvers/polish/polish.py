@@ -21,7 +21,7 @@ from torchgco.base.tree import copied, put
 from torchgco.kernels import chord_clearance, current, measured
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, binding
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.ending import final_status, optimality
 from torchgco.solvers.polish.active_set import multipliers, projected
@@ -101,7 +101,7 @@ class Polish:
 
     def check(self, problem: Problem) -> None:
         """Raise InputError for a problem that isn't float64: its rounding exceeds any useful tolerance."""
-        check_problem(problem)
+        problem = current_problem(problem)
         if problem.x0.dtype != torch.float64:
             raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
 

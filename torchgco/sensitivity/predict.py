@@ -1,0 +1,110 @@
+"""What a solution becomes when its problem changes a little: to first order, without a solve."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.differentiability import Differentiability as Why
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import computing_on
+from torchgco.base.status import Status
+from torchgco.explaining.account import Account
+from torchgco.kernels import current, followed, measured
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.problem import Problem, current_problem
+from torchgco.sensitivity.attach import refuse_forms
+from torchgco.sensitivity.function import System
+from torchgco.sensitivity.points import Points, points_of
+from torchgco.sensitivity.residual import Residual, residual
+from torchgco.solution import Solution
+
+CROSSED = 1e-6  # by more than this a row that didn't hold is violated (the interior point's violation_tolerance)
+
+
+def predicted(solution: Solution, changed: Problem, problem: Problem | None = None) -> Solution:
+    """The solution of a problem that has changed a little, to first order: one step of Newton's method on its KKT
+    conditions, with the rows that hold as they were, and the rollout that tracks where this leads.
+
+    It costs a linear solve instead of iterations (Fiacco 1983); its error is of second order in the change. Whatever
+    the problem is made of may have changed: starts, obstacles, weights, models.
+
+    Args:
+        solution: of the problem before.
+        changed: the problem as it is now, of the same form.
+        problem: as it was; None: the one that the solution knows.
+
+    Returns:
+        X, U, multipliers, cost and violation of the changed problem, FEASIBLE where the violation is at most 1e-3 and
+        INFEASIBLE elsewhere; a solve may begin with it (`warm=`). `differentiable` says where the prediction holds,
+        and `why_not` why it doesn't: ROWS_CHANGE where a row begins or ceases to hold on the way, and the reasons of
+        the solution itself, where the controls are those of before.
+
+    Raises:
+        InputError: a problem of another form, one in float32 or with horizons per problem, a free start or RateBounds,
+            or a solution that no longer knows its problem.
+    """
+    changed = current_problem(changed)
+    before = problem if problem is not None else solution.account and solution.account.problem
+    if before is None:
+        raise InputError("problem", "the problem that was solved", "a solution that no longer knows it")
+    before = current_problem(before)
+    for one in (before, changed):
+        refuse_forms(one, "a prediction")
+    _check_same(before, changed)
+    with torch.no_grad(), computing_on(changed.x0.device):
+        points = points_of(current(before), solution.detach())
+        live = changed.grown(points.growth) if bool((points.growth > 0).any()) else changed
+        of = residual(live, points.solution.X, points.solution.U, points.costates, points.lam)
+        return _stepped(changed, points, of)
+
+
+def _check_same(before: Problem, changed: Problem) -> None:
+    """Raise InputError unless both problems have the same numbers of states, stages and rows."""
+
+    def form(problem: Problem) -> tuple[object, ...]:
+        return problem.B, problem.N, problem.n, problem.m, problem.row_shapes
+
+    if form(before) != form(changed):
+        raise InputError("changed", f"a problem with B, N, n, m, rows as before, {form(before)}", form(changed))
+
+
+def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:
+    """The points one step further."""
+    old, holds = at.solution, at.reason == Why.DIFFERENTIABLE
+    system = System(at.problem, old.X, old.U, old.multipliers.lam, at.active)
+    x, u, _, v = (
+        part[0].detach() for part in system.solve(*(z.detach()[None] for z in (of.x, of.u, of.gaps, of.rows)))
+    )
+    holds &= torch.isfinite(x).flatten(1).all(-1) & torch.isfinite(u).flatten(1).all(-1)
+    keep = holds.view(-1, 1, 1)
+    X = torch.cat((problem.x0.unsqueeze(1), old.X[:, 1:] + torch.where(keep, x[:, 1:], 0.0)), dim=1)
+    X, U = followed(problem, X, old.U + torch.where(keep, u, 0.0), old.K)
+    lam = at.lam + torch.where(holds.unsqueeze(-1) & at.active, v, 0.0)
+    reason = torch.where(_rows_change(problem, at, X, U, lam) & holds, int(Why.ROWS_CHANGE), at.reason)
+    worst = measured(problem, X, U)
+    status = torch.where(worst <= ADMITTED, int(Status.FEASIBLE), int(Status.INFEASIBLE))
+    sizes = [part[0].numel() for part in old.multipliers.lam]
+    parts = zip(lam.split(sizes, dim=1), old.multipliers.lam, strict=True)
+    none = torch.zeros_like(old.iterations)
+    return replace(
+        old, X=X, U=U, multipliers=Multipliers(tuple(new.view_as(was) for new, was in parts), old.multipliers.mu),
+        cost=problem.cost.total(X, U), violation=worst, status=status, reason=reason, iterations=none,
+        outer_iterations=none, guided=none, account=Account(problem),
+    )  # fmt: skip
+
+
+def _rows_change(problem: Problem, at: Points, X: Tensor, U: Tensor, lam: Tensor) -> Tensor:
+    """Where an inequality that held pulls now, or one that didn't hold is violated, (B,) bool."""
+    change, sizes = torch.zeros(problem.B, dtype=torch.bool, device=X.device), [0]
+    for part in problem.constraints:
+        c = part.value(X, U).flatten(1)
+        own = slice(sizes[-1], sizes[-1] + c.shape[1])
+        sizes.append(own.stop)
+        if part.sense == "inequality":
+            active = at.active[:, own]
+            change |= (torch.where(active, -lam[:, own], c - CROSSED) > 0).any(-1)
+    return change
