@@ -55,8 +55,8 @@ class FirstSolve(Row):
         single = "" if after is None else f", or one after {after} outer iterations"
         return (
             "without obstacles: interior point from the guess or the start held; where no path can be sought: AL-iLQR "
-            f"to the end; else until caught (two obstacles at a knot{single}); {Direct().problems}: interior point too, "
-            "and what drives along its heading is steered along the paths"
+            f"to the end; else until caught (two obstacles at a knot{single}); {Direct().problems}: interior point "
+            "too, and what drives along its heading is steered along the paths"
         )
 
 
