@@ -26,6 +26,7 @@ from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
+IN_MAPS = 2  # times as many rounds, which are short there
 GROWN_BARRIER = 1e-4  # of warm solves among grown obstacles, which lie deeper than rounding
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
 
@@ -40,7 +41,8 @@ class ClearChords(Row):
     dearer trajectory of the passes before that is clear is taken back.
 
     Args:
-        rounds: solves at most, each with larger obstacles than the one before.
+        rounds: solves at most, each with larger obstacles than the one before; in maps, by the interior point alone,
+            twice as many.
 
     Raises:
         InputError: a field out of its range.
@@ -78,7 +80,8 @@ class ClearChords(Row):
             return serves, torch.where(too, clear, now)
 
         limit = search.solver.violation_tolerance
-        best.restore(*cleared(search.call, best.end.best, self.rounds, limit, once))
+        rounds = self.rounds * (IN_MAPS if mapped(search.call.problem) else 1)
+        best.restore(*cleared(search.call, best.end.best, rounds, limit, once))
 
     def _kept(self, search: Search, rows: Tensor, new: SolveEnd, least: Tensor) -> tuple[Tensor, Tensor]:
         """Where new trajectories of `rows` serve, with more clearance than `least`, they replace the best.

@@ -19,6 +19,7 @@ from torchgco.search.converge import solved_nearby
 from torchgco.solvers.interior import InteriorPoint
 
 DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all others
+CUT = 0.3  # depth between two knots, in R, of solved ones that don't count: a step through a wall can't be mended
 # From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
 SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
 BOTH = Refine(top=2)  # marks candidates as solved in the record
@@ -39,7 +40,10 @@ def in_order(candidates: Candidates) -> Tensor:
 
 
 def solved(search: Search, rows: Tensor, chosen: Candidates) -> Refined:
-    """Every chosen candidate solved; of each problem in `rows` the best that is feasible and arrives is kept."""
+    """Every chosen candidate solved; of each problem in `rows` the best that is feasible and arrives is kept.
+
+    None that steps over an obstacle from one knot to the next counts.
+    """
     problem, limit = chosen.problem, search.solver.violation_tolerance
     finite = [torch.isfinite(part).flatten(1).all(-1) for part in (chosen.X, chosen.U)]
     some = (chosen.live & finite[0] & finite[1]).nonzero().flatten()
@@ -49,13 +53,13 @@ def solved(search: Search, rows: Tensor, chosen: Candidates) -> Refined:
         return Refined(chosen, multipliers, some.new_zeros(problem.B), cost)
     call = replace(search.call.take(rows[some // chosen.count]), U0=chosen.U[some], warm=None, callback=None)
     end = solved_nearby(SOLVER, call, chosen.X[some])
-    good = (end.best.violation <= limit) & has_arrived(call.problem, end.best.X)
-    cost[some] = torch.where(good, end.best.cost, torch.inf)
     made = made.index_add(0, some // chosen.count, end.iterations)
-    clear, fits = torch.full_like(cost, torch.inf), good.nonzero().flatten()
+    fits = ((end.best.violation <= limit) & has_arrived(call.problem, end.best.X)).nonzero().flatten()
+    clear = cost.clone()
     if fits.numel() > 0:  # others may end anywhere
-        misses = chord_clearance(call.problem.take(fits), end.best.X[fits]) >= 0
-        clear[some[fits]] = torch.where(misses, end.best.cost[fits], torch.inf)
+        clearance = chord_clearance(call.problem.take(fits), end.best.X[fits])
+        for merit, least in ((cost, -CUT * chosen.R[some[fits]]), (clear, torch.zeros_like(clearance))):
+            merit[some[fits]] = torch.where(clearance >= least, end.best.cost[fits], torch.inf)
     for merit in (clear, cost):  # the cheapest that is clear between knots, too, is remembered by `Best.keep`
         _keep(search, rows, chosen.count, some, end, merit, made)
         made = torch.zeros_like(made)
