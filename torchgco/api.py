@@ -104,7 +104,7 @@ def solve(
         watcher.close()
     if name is not None and found.account is not None:
         found = replace(found, account=found.account.of_preset(name))
-    found = _warned_of_contact(problem, found, None if warm is not None else U0)
+    found = _warned_of_contact(problem, found)
     return attached(asked, problem, found) if differentiates else found
 
 
@@ -211,17 +211,12 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
     return problem, _guess(problem, traced)
 
 
-def _warned_of_contact(problem: Problem, solution: Solution, U0: Tensor | None) -> Solution:
+def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
     """The solution, with a ContactWarning at the caller's caller where trajectories touch obstacles between knots.
 
     Only trajectories with a status of CLAIMS count; obstacles of a kind that the judge doesn't know are left out.
-
-    Args:
-        U0: the guess, by which `_warn_of_scale` measures; None: that of a warm start, which keeps the constraints
-            already, so that its values are no size.
     """
-    if U0 is not None:
-        _warn_of_scale(problem, U0, solution)
+    _warn_of_scale(problem, solution)
     touching = touches(problem, solution).nonzero().flatten().tolist()
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
@@ -234,15 +229,13 @@ def _warned_of_contact(problem: Problem, solution: Solution, U0: Tensor | None) 
     return solution
 
 
-def _warn_of_scale(problem: Problem, U0: Tensor, solution: Solution) -> None:
+def _warn_of_scale(problem: Problem, solution: Solution) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
     rows = (claims & (solution.violation > SHARE * MET)).nonzero().flatten()
     if rows.numel() == 0:
         return
-    part, found = problem.take(rows), (solution.X[rows], solution.U[rows])
-    guess = open_loop(part.held_at(found[0][:, 0]), U0[rows]), U0[rows]
-    place = dwarfed(part, guess, found)
+    place = dwarfed(problem.take(rows), solution.X[rows], solution.U[rows])
     large = (place != NONE).nonzero().flatten().tolist()
     if large:
         b, i = int(rows[large[0]]), int(place[large[0]])

@@ -122,3 +122,40 @@ def test_no_result_depends_on_the_rest_of_the_batch(solver: str) -> None:
 def test_bad_horizons(horizon: Any) -> None:
     with pytest.raises(InputError, match="horizon"):
         cars(30, slice(0, 3), False, horizon)
+
+
+def ends(kind: str, N: int, rows: slice, horizon: Any = None) -> Problem:
+    """Points that end at numbers of their own last knots."""
+    goals = torch.linspace(0.0, 1.0, 11, dtype=D).view(1, 11, 1)[:, : N + 1]
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1, "euler")
+    stage, constraints = lambda x, u: 0.1 * u.square().sum(-1), []
+    if kind == "reference":
+        path = torch.cat((goals[0], torch.zeros_like(goals[0])), -1)
+        cost: Any = QuadraticCost([0.0, 0.0], [0.2], [10.0, 0.0], x_ref=path)
+    elif kind == "terminal cost":
+        last = lambda x, goal: 5.0 * (x[..., 0] - goal[..., 0]).square()
+        cost = FunctionCost(stage, last, knot_values={"goal": goals})
+    else:
+        cost = FunctionCost(stage)
+        row = lambda x, goal: x[..., :1] - goal
+        constraints = [FunctionConstraint(row, "equality", [-1], knot_values={"goal": goals})]
+    x0 = torch.tensor([[1.0, 0.0], [-0.2, -0.4]], dtype=D)[rows]
+    return Problem(model, cost, constraints, x0, N, horizon=horizon)
+
+
+@pytest.mark.parametrize("kind", ["reference", "terminal cost", "terminal row"])
+def test_last_knots_have_numbers_of_their_own(kind: str) -> None:
+    found = torchgco.solve(ends(kind, 10, slice(0, 2), [4, 7]), solver="interior_point")
+    for b, h in enumerate((4, 7)):
+        alone = torchgco.solve(ends(kind, h, slice(b, b + 1)), solver="interior_point")
+        torch.testing.assert_close(found.cost[b : b + 1], alone.cost, rtol=1e-9, atol=0.0)
+
+
+def test_functions_that_take_the_last_knot_are_refused() -> None:
+    base, late = ends("reference", 10, slice(0, 2)), lambda x, k: (x[..., :1] - 0.1 * k).sum(-1)
+    cost = FunctionCost(lambda x, u: u.square().sum(-1), late)
+    with pytest.raises(InputError, match="a terminal function without an argument k"):
+        torchgco.solve(Problem(base.dynamics, cost, [], base.x0, 10, horizon=[4, 7]))
+    row = FunctionConstraint(lambda x, k: x[..., :1] - 0.1 * k.view(-1, 1), knots=[-1])
+    with pytest.raises(InputError, match=r"without an argument k at the last knots.* constraints\[0\]"):
+        torchgco.solve(Problem(base.dynamics, base.cost, [row], base.x0, 10, horizon=[4, 7]))

@@ -53,6 +53,12 @@ class Values(PerElement):
                 return function(*arguments, **more)
         return function(*arguments, **more)
 
+    def ending_at(self, last: Tensor) -> Values:
+        """The same where the last knot stands for the knots `last` (B,), each problem's own."""
+        each = torch.arange(len(last), device=last.device)
+        rows = (torch.cat((row[:, :-1], row[each, last].unsqueeze(1)), dim=1) for row in self.knot_rows)
+        return replace(self, knot_rows=tuple(rows))
+
 
 NONE = Values()
 

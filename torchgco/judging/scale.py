@@ -5,34 +5,49 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.judging.worst import NONE
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
 
-SHARE = 0.05  # of a constraint's values: a larger violation leaves little of the constraint
-MET = 1e-15  # values of rows that the guess meets up to rounding say nothing of a constraint's size: in such rows, ...
-ROUGH = 1e-6  # ... and in equalities, no violation up to this counts as large, which the interior point may leave
+SHARE = 0.05  # of a row's values: a larger violation leaves little of the row
+MET = 1e-15  # values up to rounding say nothing of a row's size: where it has no others, ...
+ROUGH = 1e-6  # ... no violation up to this counts as large, which the interior point may leave
 
 
-def dwarfed(problem: Problem, guess: tuple[Tensor, Tensor], found: tuple[Tensor, Tensor]) -> Tensor:
-    """The place (B,) of a constraint whose violation is large beside all its values, `NONE` where there is none.
+def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The place (B,) of a constraint with a violation that is large beside a row's values; `NONE` where there is none.
 
-    A constraint's size is the largest value of its rows along the guess. Rows that have the value of the guess still,
-    such as those of a given start, say nothing; obstacles have sizes of their own.
+    The size of a row is its largest value at rest, and of inequalities along the trajectory, too, where equalities are
+    met; the two sides of a bound have one size. Rows that have the value at rest still, such as those of a given start,
+    say nothing; obstacles have sizes of their own.
 
     Args:
-        guess, found: states (B, N+1, n) and controls (B, N, m).
+        X, U: trajectories, (B, N+1, n) and (B, N, m).
     """
     place = torch.full((problem.B,), NONE, device=problem.x0.device)
-    for number, constraint in enumerate(within_horizons(problem).constraints):
+    problem = within_horizons(problem.held_at(X[:, 0]))
+    for number, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             continue
-        before, now = constraint.value(*guess), constraint.value(*found)
+        before, now = constraint.value(*problem.at_rest), constraint.value(X, U)
         if before.numel() == 0:
             continue
-        size = before.abs().flatten(1).amax(-1).view(-1, 1, 1)
-        rough = (size <= MET) | (constraint.sense == "equality")
-        admitted = torch.where(rough, (SHARE * size).clamp(min=ROUGH), SHARE * size)
-        large = (constraint.violation(*found) > admitted) & (now != before)
+        sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
+        rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
+        size = torch.where(rows > MET, rows, rows.amax(-1, keepdim=True))
+        admitted = torch.where(size > MET, SHARE * size, ROUGH)
+        large = (constraint.violation(X, U) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place
+
+
+def _of_both_sides(constraint: Constraint, sizes: Tensor) -> Tensor:
+    """Sizes (B, 1, p) of rows, of bounds the larger one of those above and below a component."""
+    if not isinstance(constraint, (ControlBounds, StateBounds, RateBounds)):
+        return sizes
+    every = torch.arange(constraint.upper.shape[-1], device=sizes.device)
+    place = torch.cat((every[constraint.above], every[constraint.below])).expand_as(sizes)
+    either = sizes.new_zeros(*sizes.shape[:2], len(every)).scatter_reduce(2, place, sizes, "amax")
+    return either.gather(2, place)

@@ -16,9 +16,11 @@ from torch import Tensor
 from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import lead
-from torchgco.constraints.base import Constraint, WrappedConstraint
+from torchgco.base.values import asks_for_knot
+from torchgco.constraints.base import Constraint, FunctionConstraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
+from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.maps.field import BoundField
@@ -121,7 +123,11 @@ def _of_stages(values: Tensor, k: int | Tensor, like: Tensor) -> Tensor:
 def _cost(problem: Problem, running: Tensor) -> Cost:
     cost, resting = problem.cost, _resting(problem)
     if type(cost) is BoundQuadratic:
-        return _quadratic(cost, running, resting)
+        return _quadratic(_with_last_reference(cost, problem.stages), running, resting)
+    if isinstance(cost, FunctionCost):
+        if cost.terminal_function is not None and asks_for_knot(cost.terminal_function):
+            raise InputError("horizon", "a terminal function without an argument k: `knot_values` serve", "one with it")
+        cost = replace(cost, values=cost.values.ending_at(problem.stages))
     if type(cost).total is not Cost.total:
         raise InputError("horizon", "a cost that is a sum over stages", f"{type(cost).__name__} with its own `total`")
     X, U = problem.at_rest
@@ -132,6 +138,14 @@ def _cost(problem: Problem, running: Tensor) -> Cost:
     weight = torch.where(torch.isfinite(weight) & (weight > 0), weight, 1.0)
     kind = _Stages if type(cost).expand is Cost.expand else _OwnExpansion
     return kind(cost, running.to(X.dtype), resting, weight)
+
+
+def _with_last_reference(cost: BoundQuadratic, last: Tensor) -> BoundQuadratic:
+    """The same cost, whose terminal references are those of the knots `last` (B,), each problem's own."""
+    if cost.x_ref.shape[1] == 1:
+        return cost
+    every = torch.cat((cost.x_ref.expand(len(last), -1, -1), cost.xf_ref.expand(len(last), -1).unsqueeze(1)), dim=1)
+    return replace(cost, xf_ref=every[torch.arange(len(last), device=last.device), last])
 
 
 def _quadratic(cost: BoundQuadratic, running: Tensor, resting: Tensor) -> BoundQuadratic:
@@ -216,6 +230,13 @@ def _constraint(problem: Problem, i: int) -> Constraint:
         return replace(
             constraint, lower=torch.where(each, lower, -torch.inf), upper=torch.where(each, upper, torch.inf)
         )
+    knots = torch.arange(problem.N + 1, device=horizon.device)[constraint.knots]
+    stands = counts & (knots == problem.N) & (horizon < problem.N).unsqueeze(-1)
+    if isinstance(constraint, FunctionConstraint) and bool(stands.any()):
+        if asks_for_knot(constraint.function):
+            expected = "a function without an argument k at the last knots: `knot_values` serve"
+            raise InputError("horizon", expected, f"one with it in constraints[{i}]")
+        constraint = replace(constraint, values=constraint.values.ending_at(horizon))
     return _Rows(constraint, counts.to(problem.x0.dtype))
 
 

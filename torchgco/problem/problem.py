@@ -45,8 +45,8 @@ class Problem:
             terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
             the cost names none.
         horizon: int64 (B,), from 1 to N: the number of stages of each problem, after which time stops for it; its
-            terminal cost and rows are those of its own last knot, and no obstacle counts later. None: all have N.
-            CasADi and missions take none, nor do costs with their own `total`.
+            terminal cost and rows are those of its own last knot, with references and `knot_values` of that knot, and
+            no obstacle counts later. None: all have N. CasADi and missions take none, nor do costs with a `total`.
         free_start: which components of the start the solver chooses, bool, (n,) or (B, n). There x0 is a guess, which
             is moved inside `StateBounds` that hold at knot 0. Other constraints hold at that knot where their `knots`
             say so, obstacles wherever a position is free. The interior point, and so `gco`, finds the start, which

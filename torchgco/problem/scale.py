@@ -11,7 +11,7 @@ from torchgco.constraints.bounds import ControlBounds
 from torchgco.costs.base import Cost
 
 LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
-LEAST_COST = 1e-6  # share of the cost of staying at the start, as which a cost counts at least
+LEAST_COST = 1e-9  # share of the cost of staying at the start, as which a cost counts at least
 BOUNDED, UNBOUNDED = 3e-5, 1e-10  # controls that cost nothing: as shares of their bounds, of 1 at most; without bounds
 DWARFS = 100.0  # times the rest of the cost: a smaller constant leaves tests relative to the cost meaningful
 

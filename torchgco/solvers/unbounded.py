@@ -12,7 +12,8 @@ from torchgco.solvers.ending import STATIONARY, constant_cost
 
 # Falls of the cost from that of the guess, as multiples of the size of that cost plus the cost unit of all stages.
 DEEP = 1e6  # a fall that asks for a closer look
-BOTTOMLESS = 1e20  # one that needs none, or a way of controls that asks for one: IPOPT's diverging_iterates_tol
+BOTTOMLESS = 1e20  # one that needs none: IPOPT's diverging_iterates_tol
+FAR = 1e6  # times 1 + the guess's own controls: a way of controls that asks for a look
 FARTHER = 10.0, 1e3, 1e6  # times the way from the guess, for that look
 GROWING = 1e-3  # controls that moved by less than this share of the largest move stay where they are
 
@@ -26,7 +27,8 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     bounds; where a Newton step would still save a share `left` (B,) of the cost; and where controls have gone very far.
     """
     unit = problem.N * cost_unit(problem)
-    open_ended = (left > STATIONARY) | ((found.U - U0).abs().flatten(1).amax(-1) >= BOTTOMLESS)
+    way = (found.U - U0).abs().flatten(1).amax(-1) / (1.0 + U0.abs().flatten(1).amax(-1))
+    open_ended = (left > STATIONARY) | (way >= FAR)
     falls = ((found.cost < -DEEP * unit) | open_ended) & (found.violation <= tolerance)
     rows = falls.nonzero().flatten()
     if rows.numel() == 0:
