@@ -31,7 +31,7 @@ from benchmarks.speed import __main__ as speed
 from torchgco import Problem
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
-from torchgco.experiments.reports import report, view
+from torchgco.experiments.reports import export, report, view
 from torchgco.judging.certificate import CHORDS
 from torchgco.judging.judge import CLEARANCES
 from torchgco.kernels import EagerWarning
@@ -100,6 +100,8 @@ def accept(command: str) -> None:
         assert options.folders
     elif program == "torchgco-view":
         view._parser().parse_args(words)
+    elif program == "torchgco-export":
+        export._parser().parse_args(words)
     elif program == "make":
         accept_make(words)
     elif program == "python":

@@ -34,12 +34,17 @@ from torchgco.base.status import Status as Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
+from torchgco.compiled import MPC as MPC
 from torchgco.compiled import Answer as Answer
 from torchgco.compiled import Compiled as Compiled
+from torchgco.compiled import MPPIController as MPPIController
 from torchgco.compiled import compile as compile
+from torchgco.constraints import Cone as Cone
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FunctionConstraint as FunctionConstraint
+from torchgco.constraints import Gates as Gates
+from torchgco.constraints import NormBounds as NormBounds
 from torchgco.constraints import RateBounds as RateBounds
 from torchgco.constraints import Separation as Separation
 from torchgco.constraints import StateBounds as StateBounds
@@ -93,14 +98,14 @@ __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules",
-    "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "Separation", "FirstStepRates",
-    "FunctionConstraint", "FunctionCost",
+    "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates", "Separation",
+    "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets", "plan_batch",
-    "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap",
-    "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
+    "solve", "MPC", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets",
+    "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish",
+    "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors

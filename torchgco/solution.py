@@ -17,7 +17,7 @@ from torchgco.base.differentiability import Differentiability
 from torchgco.base.errors import InputError, shown
 from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.gradients import without_gradients
-from torchgco.base.options import Count, check_value
+from torchgco.base.options import Count, Positive, check_value
 from torchgco.base.shapes import MISTAKES, check_device, check_shape
 from torchgco.base.status import Status
 from torchgco.base.tree import take
@@ -30,6 +30,8 @@ from torchgco.explaining.record import Standing as Standing
 from torchgco.judging.judge import columns as judged
 from torchgco.judging.worst import worst_rows
 from torchgco.lagrangian.lagrangian import Multipliers, shifted
+from torchgco.problem.sampled import sampled
+from torchgco.problem.times import times
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -233,6 +235,45 @@ class Solution:
         if problem is not None:
             columns |= judged(problem, self.U.detach(), None if problem.free_start is None else self.X[:, 0].detach())
         return pd.DataFrame(columns).rename_axis("element")
+
+    def trajectories(self, rate: float | None = None, problem: Problem | None = None) -> pd.DataFrame:
+        """A row per problem and time: `problem`, times, states and controls under their names with units.
+
+        Beside them are velocity and acceleration of the position, where the model integrates a derivative, and what
+        the model derives itself, such as a quadrotor's thrust. Controls hold until the next knot. Names are those of
+        `Dynamics.state_names` and `control_names`.
+
+        Args:
+            rate: samples per second, from the first to the last knot, by the model's own integrator; None: the knots.
+            problem: that was solved, for a solution that no longer knows it: else its states have no names, and
+                straight lines between the knots.
+
+        Raises:
+            InputError: a rate that isn't above 0, a problem of another form, or dynamics without a time step.
+        """
+        import pandas as pd
+
+        check_value(rate, Positive | None, "rate")
+        own = problem if problem is not None else None if self.account is None else self.account.problem
+        if own is not None:
+            check_shape(self.X, (own.B, own.N + 1, own.n), "problem: solution.X")
+        t, frames = self.t if problem is None else times(problem), []
+        for b in range(len(self)):
+            last = self.U.shape[1] if self.horizon is None else int(self.horizon[b])
+            X, U = self.X[b, : last + 1].detach(), self.U[b, :last].detach()
+            dynamics = None if own is None else own.take(slice(b, b + 1)).dynamics
+            columns = sampled(dynamics, X, U, (t if t.dim() == 1 else t[b])[: last + 1], rate)
+            frames.append(pd.DataFrame({"problem": b} | columns))
+        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame({"problem": []})
+
+    def to_csv(self, path: str | Path, rate: float | None = None, problem: Problem | None = None) -> None:
+        """Write `trajectories` as CSV: all of it or, if interrupted, nothing.
+
+        Raises:
+            InputError: as `trajectories`, or a place where no file can be written.
+        """
+        text = self.trajectories(rate, problem).to_csv(index=False)
+        write_whole(path, lambda file: file.write(text.encode()))
 
     def worst_rows(self, problem: Problem) -> pd.DataFrame:
         """One row per problem: which constraint is violated most, and where states were lost.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.speed.bench import SEED, Bench
-from benchmarks.speed.loop_peers import Peer
+from benchmarks.speed.loop_peers import ByHand, Peer
 from torchgco import ControlBounds, FunctionDynamics, Problem, QuadraticCost, Spheres, Status
 
 SECTION = "loop"
@@ -113,6 +113,25 @@ def plain(solver: str) -> Controller:
     return control
 
 
+def stepped() -> Controller:
+    """By `torchgco.MPC`."""
+    mpc = torchgco.MPC(problem(START[None], reference(0.0)[None], CENTERS))
+
+    def control(x: np.ndarray, x_ref: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, Report]:
+        u = mpc.step(x, x_ref=x_ref, centers=centers)
+        return u.numpy(), lambda: (int(mpc.answer.iterations), mpc.statuses[0] == Status.CONVERGED)
+
+    return control
+
+
+def by_hand() -> ByHand:
+    """The same as CasADi's users write it."""
+    import casadi as ca
+
+    rates = lambda x, u: ca.vertcat(x[3] * ca.cos(x[2]), x[3] * ca.sin(x[2]), x[3] * ca.tan(u[1]) / 2.5, u[0])
+    return ByHand(rates, N, DT, Q, R, QF, LOWER, UPPER, [np.inf] * 4, reach=[RADIUS + VEHICLE] * 2)
+
+
 def fleet(count: int, periods: int) -> Drive:
     """As many cars in one call."""
     found, random = Drive(), np.random.default_rng(SEED)
@@ -133,9 +152,10 @@ def run(bench: Bench) -> None:
     periods, long = bench.sizes.loop_periods, bench.sizes.loop_disturbed
     case = f"one car, {periods} periods"
     drive(compiled("gco"), periods).say(bench, case, "compile, gco")
-    for peer in Peer.ready(bench.sizes.loop_compiled):
+    for peer in Peer.ready(by_hand(), bench.sizes.loop_compiled):
         drive(peer, periods).say(bench, case, peer.name)
     drive(compiled("interior_point"), periods).say(bench, case, "compile, interior_point")
+    drive(stepped(), periods).say(bench, case, "MPC")
     for solver in ("interior_point", "gco"):
         drive(plain(solver), periods // 8).say(bench, case, f"solve, {solver}")
     for noise in (0.02, 0.2):

@@ -39,6 +39,15 @@ def states_of(model, lead=(3, 5), seed=0):
     return x, u
 
 
+@pytest.mark.parametrize("kind", [QuadrotorPlanning, QuadrotorPlant])
+def test_drag_slows_the_velocity_alone(kind):
+    own, free = (kind(airframe=Airframe(mass=1.2, drag=drag)) for drag in (0.3, 0.0))
+    x, u = states_of(own)
+    slope = torch.zeros(own.n, dtype=torch.float64)
+    slope[3:6] = -0.3 / 1.2
+    torch.testing.assert_close(own.field(x, u) - free.field(x, u), slope * x, rtol=0, atol=1e-12)
+
+
 def differences(step, x, u, h=1e-6):
     """[fx, fu] (..., n, n+m) by central differences of `step`."""
     z = torch.cat((x, u), dim=-1)

@@ -3,6 +3,7 @@ choose."""
 
 from __future__ import annotations
 
+import re
 from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
@@ -12,11 +13,12 @@ import pytest
 from tests.experiments.commands import HOLD, ROOT, problem_line
 from tests.slow import mostly
 from torchgco import Airframe, InputError, compose, presets
-from torchgco.experiments.config.build import Setup, config_dir
+from torchgco.experiments.config.build import Setup, build, compose_config, config_dir
 from torchgco.experiments.config.groups import FAMILIES, options_of
 from torchgco.experiments.flying.flight import plan_of
 from torchgco.experiments.flying.study import check_mission
 from torchgco.missions import Mission, Planner, RotorPlant
+from torchgco.scenarios import Vehicle
 
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
@@ -109,10 +111,9 @@ def test_a_registered_scenario_is_its_class(family: type) -> None:
     assert compose([f"scenario={family().name}", "solver=hold"]).scenario == family()
 
 
-def test_one_key_says_the_gravity_of_models_plants_and_states_at_rest() -> None:
-    key = "model.vehicle.dynamics.airframe"
+def test_one_key_says_what_models_plants_and_states_at_rest_weigh() -> None:
     for plant in ("rotors", *(["drone_models"] if find_spec("drone_models") else [])):
-        setup = checked("experiment=mission", f"{key}.gravity=1.62", f"+{key}.mass=1.2", f"plant={plant}")
+        setup = checked("experiment=mission", "vehicle.gravity=1.62", "vehicle.mass=1.2", f"plant={plant}")
         task = setup.task(setup.layouts(1))
         assert setup.mission is not None and isinstance(setup.mission.plant, RotorPlant)
         assert setup.mission.plant.airframe == setup.vehicle.dynamics.airframe == Airframe(mass=1.2, gravity=1.62)
@@ -120,8 +121,40 @@ def test_one_key_says_the_gravity_of_models_plants_and_states_at_rest() -> None:
         assert task.problem.cost.u_ref[..., 3].unique().item() == task.problem.cost.xf_ref[..., 13].unique().item()
 
 
+def test_a_vehicle_is_chosen_by_its_name_and_gives_all_parts_its_size(tmp_path: Path) -> None:
+    """Also one of a folder of one's own, which says what differs."""
+    mine = tmp_path / "vehicle"
+    mine.mkdir()
+    (mine / "racer.yaml").write_text("defaults: [paper, _self_]\nmass: 0.8\nthrust_max: 9.0\nradius: 0.2\n")
+    racer = build(compose_config(["vehicle=racer", "scenario=walls"], [f"file://{tmp_path}"]))
+    small = compose(["vehicle=crazyflie", "experiment=mission_unknown"])
+    for setup, mass, radius in ((racer, 0.8, 0.2), (small, 0.0319, 0.07)):
+        frame = setup.vehicle.dynamics.airframe  # type: ignore[attr-defined]
+        assert (frame.mass, frame.radius, setup.vehicle.radius) == (mass, radius, radius)
+        assert setup.layouts(1).vehicle_radius == radius  # which obstacles are grown by, unless a command says another
+    assert compose(["vehicle=crazyflie", "scenario.vehicle_radius=0.3"]).layouts(1).vehicle_radius == 0.3
+    assert compose(["vehicle=paper"]).vehicle == Vehicle.quadrotor(Airframe())
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["vehicle=nano"], "vehicle: expected one of crazyflie, paper, got nano"),
+        (["vehicle.masse=1"], "vehicle.masse: expected a key that the configuration has, such as mass, got masse"),
+        (["vehicle.mass=-1"], "vehicle.mass: expected a number above 0 kg, got -1"),
+        (["vehicle.thrust_min=7"], "vehicle.thrust_min: expected less than thrust_max 6.0, got 7"),
+        (["scenario=planar_trap", "vehicle.mass=1"], "vehicle: expected model=quadrotor, whose airframe this is"),
+        (["model.vehicle.dynamics.airframe.mass=1"], "expected vehicle.mass, as airframes have a group of their own"),
+        (["+plant.airframe={_target_: torchgco.Airframe, mass: 1}", "experiment=mission"], "plant.airframe: expected"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_a_vehicle_gets_one_line(words: list[str], line: str) -> None:
+    with pytest.raises(InputError, match=re.escape(line)):
+        compose(words)
+
+
 def test_a_registered_mission_is_its_class() -> None:
-    assert compose(["experiment=mission"]).mission == Mission(Planner(presets.gco(3)))
+    assert compose(["experiment=mission"]).mission == Mission(Planner(presets.gco(3)), plant=RotorPlant(Airframe()))
 
 
 def test_a_preset_flies_all_layouts_of_a_file() -> None:
@@ -157,7 +190,12 @@ def test_files_of_a_user_extend_what_is_registered(run, own: list[str]) -> None:
     _, out, _ = run(*own, "--help")
     assert "sparse" in out and "patient" in out and "mine" in out
     code, out, err = run(*own, "--cfg", "job", "experiment=mine")
-    assert code == 0 and "num_obstacles: 3" in out and "attempts: 9" in out and "vehicle_radius: 0.36" in out, err
+    assert (
+        code == 0
+        and "num_obstacles: 3" in out
+        and "attempts: 9" in out
+        and "vehicle_radius: ${torchgco.radius:0.36}" in out
+    ), err
     code, _, err = run(*own, "scenario=sparse", *HOLD, "hydra.run.dir=out")
     assert code == 0, err
 

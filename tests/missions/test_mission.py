@@ -285,7 +285,7 @@ def test_a_mission_flies_where_it_is_planned() -> None:
     """On the moon plans, tracker and plant weigh a sixth: the plant goes where the first plan leads."""
     moon = Airframe(gravity=1.62)
     plan = Planner(SOLVER, margin=0.0, estimation=0.0)
-    log = Mission(plan, plant=RotorPlant(moon), duration=0.5).fly(on_the_moon(moon))
+    log = Mission(plan, duration=0.5).fly(on_the_moon(moon))
     assert bool((log.x[0, :, 0, 2].abs() < 0.02).all())  # it doesn't fall, nor rise: 8.19 / 2 m in a second
     torch.testing.assert_close(log.x[0, -1, -1, :3], log.plan[0, 0, 10], rtol=0, atol=0.02)
     assert float(log.x[0, 0, 0, 13:].sum()) == pytest.approx(moon.mass * 1.62)
@@ -295,7 +295,7 @@ def test_a_plant_of_another_airframe_than_the_planned_one_is_refused() -> None:
     moon = Airframe(gravity=1.62)
     line = r"plant.airframe: expected that of the planning model, gravity 1.62, got gravity 9.81"
     with pytest.raises(InputError, match=line):
-        mission().fly(on_the_moon(moon))
+        mission(plant=RotorPlant(Airframe())).fly(on_the_moon(moon))
     with pytest.raises(InputError, match=r"mass 1.608, arm 0.216, got mass 1.2, arm 0.2"):
         mission(plant=RotorPlant(Airframe(mass=1.2, arm=0.2))).fly(far())
     errors = RotorPlant(mass_error=0.1, thrust_error=-0.1, drag=0.1)  # deviations, not another vehicle

@@ -12,11 +12,13 @@ from torch import Tensor
 from tests.native.test_engine import normal, user_problem
 from tests.problems import quadrotor_batch
 from torchgco import (
+    Cone,
     ControlBounds,
     Cost,
     FirstStepRates,
     FunctionConstraint,
     FunctionDynamics,
+    NormBounds,
     Problem,
     QuadraticCost,
     StateBounds,
@@ -296,6 +298,18 @@ def with_bounds_by_knot() -> Problem:
     return Problem(base.dynamics, each(), rows, base.x0, N)
 
 
+def with_norms() -> Problem:
+    base = user_problem(B, N)
+    low = 0.1 * normal(B, 3, seed=36).abs()
+    rows = [
+        NormBounds("u", upper=0.5 + normal(B, seed=37).abs()),
+        NormBounds(("x", slice(0, 2)), low, low + 0.5, knots=[2, 7, N], center=0.2 * normal(1, 3, 2, seed=38)),
+        Cone([1.0, 0.3], torch.linspace(0.4, 2.0, N).double().view(1, N), ("x", [3, 1])),
+        Cone(normal(B, 3, seed=39), 0.7, ("quaternion", [3, 0, 1, 2])),
+    ]
+    return Problem(base.dynamics, each(), rows, base.x0, N)
+
+
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "smooth": lambda: with_cost(Smooth()),
     "per problem": lambda: with_cost(each()),
@@ -311,6 +325,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "first step": first_step,
     "dynamics by stage": with_stages,
     "bounds by knot": with_bounds_by_knot,
+    "norms and cones": with_norms,
 }
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from array import array
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from torch import Tensor
@@ -97,3 +100,28 @@ def test_a_problem_started_elsewhere_follows_too(name: str) -> None:
     due = torchgco.solve(problem(given | {"x0": x0}), solver="interior_point")
     for each in (early, late):
         assert torch.equal(torchgco.solve(each, solver="interior_point").U, due.U)
+
+
+@pytest.mark.parametrize("make", [deque, lambda w: array("d", w), pd.Series, lambda w: list(np.float32(w)), tuple])
+def test_other_sequences_of_numbers_are_followed_too(make: Callable[[list[float]], Any]) -> None:
+    given: dict[str, Any] = {key: make_one() for key, make_one in NUMBERS.items()}
+    weights = make([1.0] * 6)
+    kept = problem(given | {"Q": weights})
+    torchgco.solve(kept, solver="interior_point")
+    if isinstance(weights, tuple):
+        return  # nothing can change
+    weights[0] = type(weights[0])(3.0)
+    due = torchgco.solve(problem(given | {"Q": [3.0] + [1.0] * 5}), solver="interior_point")
+    assert torch.equal(torchgco.solve(kept, solver="interior_point").U, due.U)
+
+
+def test_a_list_of_constraints_is_followed() -> None:
+    given = {key: make() for key, make in NUMBERS.items()}
+    base = problem(given)
+    speed = lambda most: FunctionConstraint(lambda x: x[..., 2:4].abs() - most)
+    rows: list[Any] = [speed(0.6)]
+    kept = Problem(base.dynamics, base.cost, rows, base.x0, base.N)
+    torchgco.solve(kept, solver="interior_point")
+    rows[0] = speed(0.4)
+    found = torchgco.solve(kept, solver="interior_point")
+    assert float(found.X[..., 2:4].abs().max()) < 0.4 + 1e-6

@@ -142,3 +142,20 @@ def test_small_units_change_no_answer(kind: str, native: bool) -> None:
 def test_tolerances_that_are_large_beside_the_rows_are_named(kind: str) -> None:
     with pytest.warns(ScaleWarning, match="over 5% of the constraint's own values"):
         torchgco.solve(in_units(1e-6, kind), solver="al_ilqr")
+
+
+@pytest.mark.parametrize(("s", "constant"), [(1e-3, 1.0), (1e-3, 1e3), (1e-4, 1.0), (1e-4, 10.0)])
+def test_constants_hide_nothing_in_small_units_either(s: float, constant: float) -> None:
+    base = in_units(s, "controls")
+    away = torch.tensor([s, 0.0, 0.0, 0.0], dtype=D)
+    weights = torch.tensor([1.0, 1.0, 0.1, 0.1], dtype=D)
+
+    def made(more: float) -> Problem:
+        stage = lambda x, u: 0.5 * (weights * (x - away).square()).sum(-1) + 0.05 * u.square().sum(-1) + more
+        cost = FunctionCost(stage, lambda x: 10.0 * (weights * (x - away).square()).sum(-1))
+        return Problem(base.dynamics, cost, base.constraints, base.x0, base.N)
+
+    due, found = (torchgco.solve(made(more), solver="interior_point") for more in (0.0, constant))
+    assert found.statuses == [Status.CONVERGED] * 16
+    own = made(0.0).cost.total(found.X, found.U)
+    torch.testing.assert_close(own, due.cost, rtol=5e-3, atol=0)

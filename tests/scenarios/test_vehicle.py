@@ -128,7 +128,7 @@ def test_states_of_another_length_are_named() -> None:
 
 def test_a_bound_that_is_left_out_is_the_dynamics_own() -> None:
     """A heavier quadrotor is planned with the accelerations that its rotors give, not with those of the lighter one."""
-    heavy = ["model=quadrotor", "scenario=forest", "+model.vehicle.dynamics.airframe.mass=2.4"]
+    heavy = ["model=quadrotor", "scenario=forest", "vehicle.mass=2.4"]
     task = compose(heavy).vehicle.task(Layouts(centers=[[[9.0, 9.0, 9.0]]], radii=[[0.1]]))
     bounds = task.problem.constraints[1]
     assert bounds.upper[0].tolist() == [5, 5, 5, 10.0] and bounds.lower[0, 3] == pytest.approx(4 * 0.1046 / 2.4)

@@ -18,6 +18,7 @@ from torchgco import (
     AugmentedLagrangian,
     ControlBounds,
     FunctionDynamics,
+    Goal,
     PathProposals,
     Problem,
     QuadraticCost,
@@ -55,6 +56,7 @@ def gates(weight: float = 6.0) -> tuple[Problem, Tensor]:
         [Spheres(centers, radii, 0.1), ControlBounds([-5.0] * 2, [5.0] * 2)],
         torch.zeros(4, 4, dtype=torch.float64),
         40,
+        Goal([10.0, 0.0], 0.9),
     )
     return problem, controls(problem)
 

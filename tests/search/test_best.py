@@ -10,7 +10,7 @@ import torch
 from tests.problems import planar_batch
 from tests.search.gates import LOCAL, Solve
 from tests.search.rows import restarts
-from torchgco import GCO, ILQR, AugmentedLagrangian, LineSearch, Problem, QuadraticCost, Solution
+from torchgco import GCO, ILQR, AugmentedLagrangian, Goal, LineSearch, Problem, QuadraticCost, Solution
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.search.attempts import Best
@@ -39,7 +39,7 @@ def given(monkeypatch) -> tuple[Problem, torch.Tensor, AugmentedLagrangian]:
     cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
     inner = ILQR(tolerance=1e-9, max_iterations=1)
     local = AugmentedLagrangian(inner, max_outer_iterations=3, violation_tolerance=10.0, penalty_growth=1.0)
-    return replace(problem, cost=cost), U0, local
+    return replace(problem, cost=cost, goal=Goal([1.0, 0.4], 1e3)), U0, local
 
 
 def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> Solution:
@@ -84,6 +84,7 @@ def test_an_arrived_iterate_is_kept_within_an_attempt_too(by_arrival: bool, monk
 def test_arrived_comes_before_feasible_and_feasible_before_cheap() -> None:
     """Of any two ends (arrived, violation, cost), the better one is kept, in either order."""
     problem, U0 = planar_batch(B=1, N=5, obstacles=1)
+    problem = replace(problem, goal=Goal([1.0, 0.4], 1.0))
     call = Call.checked(problem, U0)
 
     def end(arrived: bool, violation: float, cost: float) -> SolveEnd:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.problems import planar_batch
-from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian, InputError, LineSearch, MultiStart, QuadraticCost
+from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian, Goal, InputError, LineSearch, MultiStart, QuadraticCost
 from torchgco.lagrangian.quality import has_arrived, is_better
 
 LOCAL = AugmentedLagrangian(ILQR(max_iterations=4), max_outer_iterations=3)
@@ -99,7 +99,7 @@ def test_an_arrived_trajectory_is_preferred_to_a_cheaper_one(monkeypatch) -> Non
     """No step is accepted, so that every guess stays as it is; that of the vehicle at rest is the cheapest."""
     problem, U0 = planar_batch(B=4, N=25, obstacles=3, seed=7)
     cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
-    problem = replace(problem, cost=cost)
+    problem = replace(problem, cost=cost, goal=Goal([1.0, 0.4], 1e3))
     monkeypatch.setattr(LineSearch, "ratio_min", 1e9)
     stays = replace(LOCAL, inner=ILQR(max_iterations=1))
     many = replace(MANY, local=replace(stays, violation_tolerance=10.0), starts=20)

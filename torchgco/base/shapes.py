@@ -131,6 +131,8 @@ class Dimensions:
     position: slice | None
     like: Tensor  # x0: dtype and device of everything
     obstacles_from: int = 1  # the first knot at which obstacles hold: 0 where the position may be chosen there
+    goal: Tensor | None = None  # (B, d), m: the goal's position, where one is known
+    horizon: Tensor | None = None  # (B,) int64: stages of each problem, where they differ
 
 
 def space_of(dims: Dimensions, field: str) -> int:

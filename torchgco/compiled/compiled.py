@@ -20,7 +20,7 @@ from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
-from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_own_numbers
+from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.explaining.account import Account
 from torchgco.kernels import cost_unit, current, interior_of
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -28,9 +28,7 @@ from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.presets import named
-from torchgco.problem.goal import Goal
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
@@ -174,7 +172,7 @@ class Compiled:
         self,
         *,
         warm: bool = True,
-        shift: int | None = None,
+        shift: float | None = None,
         max_seconds: float | None = None,
         numbers: Mapping[str, Any] | None = None,
         **named: Any,
@@ -183,7 +181,8 @@ class Compiled:
 
         Args:
             warm: begin with the last answer, where that was a solution.
-            shift: by how many stages the horizon has moved since the last call; None: 1 if receding, else 0.
+            shift: by how many stages, also parts of one, the horizon has moved since the last call; None: 1 if
+                receding, else 0.
             max_seconds: after which the iterate so far is returned; looked at in every iteration.
             numbers: new numbers by name, for names that are no words, such as "constraints[1].centers".
             named: the same.
@@ -198,7 +197,7 @@ class Compiled:
         try:
             if shift is None:
                 shift = int(self.receding)
-            elif type(shift) is not int or shift < 0:
+            elif isinstance(shift, bool) or not isinstance(shift, int | float) or not 0 <= shift < math.inf:
                 raise InputError("shift", "a number of stages, at least 0", shown(shift))
             until = math.inf
             if max_seconds is not None:
@@ -209,6 +208,11 @@ class Compiled:
             return self._solved(able, shift, began, until)
         finally:
             self._lock.release()
+
+    @property
+    def problem(self) -> Problem:
+        """The problem, whose parts hold the numbers as they are."""
+        return self._problem
 
     @_plainly()
     def solution(self) -> Solution:
@@ -264,7 +268,7 @@ class Compiled:
         if number.derived:
             self._changed.add(number.part)
 
-    def _refresh(self, shift: int = 0) -> None:
+    def _refresh(self, shift: float = 0) -> None:
         """Have C begin `shift` stages later, and read what it doesn't share with the problem's tensors."""
         kept = self._kept
         assert kept is not None
@@ -290,16 +294,9 @@ class Compiled:
 
     def _now(self) -> Problem:
         """The problem with its numbers as they are, and nothing that was computed from others."""
-        problem = self._problem
-        constraints = tuple(_renewed(part) for part in problem.constraints)
-        known = replace(problem.known, row_shapes=None, interior=None, packed=(None, None))
-        now = problem._with({"constraints": constraints}, known)
-        if now.goal is None or now.goal.assumed:
-            dims = now._dimensions(now.x0)
-            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, known)
-        return now
+        return with_numbers_as_they_are(self._problem)
 
-    def _solved(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
+    def _solved(self, able: np.ndarray, shift: float, began: float, until: float) -> Answer:
         if self._kept is not None:
             self._refresh(shift)
         kept = self._kept
@@ -329,7 +326,7 @@ class Compiled:
         return found
 
     @_plainly()
-    def _by_solver_alone(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
+    def _by_solver_alone(self, able: np.ndarray, shift: float, began: float, until: float) -> Answer:
         """Where nothing is packed for C."""
         self._found = self._by_solver(shift if able.all() else None, until)
         return self._answer(able & able.all(), began)
@@ -368,12 +365,12 @@ class Compiled:
         for lam, own in zip(kept.lam, solution.multipliers.lam, strict=True):
             lam[rows] = own
 
-    def _by_solver(self, shift: int | None, until: float, problem: Problem | None = None) -> Solution:
+    def _by_solver(self, shift: float | None, until: float, problem: Problem | None = None) -> Solution:
         """A solve by the solver that `compile` was given, from the last answer where a shift is given."""
         now = self._now() if problem is None else problem
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
         seconds = None if until == math.inf else max(1e-3, until - time.perf_counter())
-        warm = None if shift is None or self._last is None else self._last.shifted(shift) if shift else self._last
+        warm = None if shift is None or self._last is None else _later(self._last, shift)
         return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:
@@ -392,12 +389,13 @@ class Compiled:
         return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began)
 
 
-def _renewed(part: Any) -> Any:
-    """A part of a problem with what was derived from its numbers made again."""
-    if not isinstance(part, BoundSpheres):
-        return part
-    made = BoundSpheres.prepare(
-        part.centers, part.inflated_radii, part.velocities, part.absent, part.vehicle_radius, part.knots,
-        part.position, part.dt,
-    )  # fmt: skip
-    return replace(made, stops=part.stops)
+def _later(last: Solution, shift: float) -> Solution:
+    """A guess for a horizon that begins so many stages later; parts of one as `Kept.shift` takes them."""
+    whole = int(shift)
+    guess, part = last.shifted(whole) if whole else last, shift - whole
+    if part == 0:
+        return guess
+    one = guess.shifted()
+    X, U, K, d = (torch.lerp(getattr(guess, name), getattr(one, name), part) for name in ("X", "U", "K", "d"))
+    lam = tuple(torch.lerp(*pair, part) for pair in zip(guess.multipliers.lam, one.multipliers.lam, strict=True))
+    return replace(one, X=X, U=U, K=K, d=d, multipliers=Multipliers(lam, guess.multipliers.mu))

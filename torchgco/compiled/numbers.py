@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -20,11 +20,15 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.base.values import Values
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.goal import Goal, GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
@@ -173,13 +177,21 @@ def with_own_numbers(problem: Problem) -> Problem:
         for name, length in (("x_ref", problem.N), ("u_ref", problem.N)):
             part = getattr(cost, name)
             object.__setattr__(cost, name, part.expand(B, length, part.shape[-1]).clone())
-    parts = {
-        "x0": problem.x0.clone(),
-        "dynamics": _own(problem.dynamics, B),
-        "cost": cost,
-        "constraints": tuple(_own(part, B) for part in problem.constraints),
-    }
+    rows = tuple(_own(part, B) for part in problem.constraints)
+    parts = {"x0": problem.x0.clone(), "dynamics": _own(problem.dynamics, B), "cost": cost, "constraints": rows}
+    if problem.goal is not None and problem.goal.required:
+        parts["goal"] = _goal_of(rows[-1], problem)
     return problem._with(parts)
+
+
+def _goal_of(row: Constraint, problem: Problem) -> Goal:
+    """The goal whose numbers lie in the memory of its row's."""
+    goal = problem.goal
+    assert goal is not None
+    if isinstance(row, GoalState):
+        return Goal(row.state[:, problem.position], goal.radius.clone(), True, row.state)
+    assert isinstance(row, GoalBall)
+    return Goal(row.center[:, 0], row.upper[:, 0], True)
 
 
 def numbers_of(problem: Problem) -> list[Number]:
@@ -191,6 +203,15 @@ def numbers_of(problem: Problem) -> list[Number]:
         name = f"constraints[{i}]"
         if isinstance(part, ControlBounds | StateBounds):
             found += _of_bounds(part, name, i)
+        elif isinstance(part, GoalBall):
+            found.append(Number("goal.position", (_view(part.center[:, 0]),), i, True, _finite))
+            found.append(Number("goal.radius", (_view(part.upper[:, 0]),), i, True, _radii))
+        elif isinstance(part, GoalState):
+            found.append(Number("goal.state", (_view(part.state),), i, True, partial(_fixed, part)))
+        elif isinstance(part, GateBalls | GateSquares):
+            continue  # at other knots they would be other gates
+        elif isinstance(part, NormBounds | Cone):
+            found += _of_vectors(part, name, i)
         elif isinstance(part, BoundSpheres):
             found += _of_spheres(part, name, i)
         elif isinstance(part, BoundBoxes) and not bool(part.absent.any()):
@@ -198,6 +219,28 @@ def numbers_of(problem: Problem) -> list[Number]:
         elif not isinstance(part, Obstacles):
             found += _of_part(part, name, i)
     return found
+
+
+def with_numbers_as_they_are(problem: Problem) -> Problem:
+    """The same problems after numbers were written, with nothing that was computed from the former ones."""
+    constraints = tuple(_renewed(part) for part in problem.constraints)
+    known = replace(problem.known, row_shapes=None, interior=None, packed=(None, None))
+    now = problem._with({"constraints": constraints}, known)
+    if now.goal is None or now.goal.assumed:
+        dims = now._dimensions(now.x0)
+        now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, known)
+    return now
+
+
+def _renewed(part: Any) -> Any:
+    """A part of a problem with what was derived from its numbers made again."""
+    if not isinstance(part, BoundSpheres):
+        return part
+    made = BoundSpheres.prepare(
+        part.centers, part.inflated_radii, part.velocities, part.absent, part.vehicle_radius, part.knots,
+        part.position, part.dt,
+    )  # fmt: skip
+    return replace(made, stops=part.stops)
 
 
 def _own(part: Any, B: int) -> Any:
@@ -265,6 +308,27 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
     ]
 
 
+def _of_vectors(part: NormBounds | Cone, name: str, i: int) -> list[Number]:
+    """Of bounds on norms and of cones; an axis may have any length above 0."""
+
+    def joint(new: Mapping[str, Floats]) -> tuple[str, Any] | None:
+        lower, upper = (new.get(f"{name}.{side}", _view(getattr(part, side))) for side in ("lower", "upper"))
+        over = np.nonzero(~(lower < upper))
+        if not len(over[0]):
+            return None
+        return "lower bounds below the upper ones", f"{(lower + 0 * upper)[over][0]:g}"
+
+    checks: dict[str, Callable[[Floats], tuple[str, Any] | None]] = {
+        "lower": _lengths, "upper": _above_zero, "center": _finite, "apex": _finite, "angle": _angles, "axis": _axes,
+    }  # fmt: skip
+    both = all(getattr(part, side, None) is not None for side in ("lower", "upper"))
+    return [
+        Number(f"{name}.{field}", (_view(getattr(part, field)),), i, True, checks[field], joint=joint if both else None)
+        for field in part.per_element
+        if field in checks and getattr(part, field) is not None
+    ]
+
+
 def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
     if bool(part.absent.any()):  # padding: which of them are there isn't a number
         return []
@@ -316,6 +380,28 @@ def _present(new: Floats) -> tuple[str, Any] | None:
 
 def _lengths(new: Floats) -> tuple[str, Any] | None:
     return _finite(new) or (None if (new >= 0).all() else ("lengths of at least 0", float(new.min())))
+
+
+def _radii(new: Floats) -> tuple[str, Any] | None:
+    return _finite(new) or _above_zero(new)
+
+
+def _fixed(part: GoalState, new: Floats) -> tuple[str, Any] | None:
+    free = np.isnan(_view(part.state)[0])
+    fits = (np.isnan(new) == free).all() and np.isfinite(new[..., ~free]).all()
+    return None if fits else ("finite numbers, and NaN in the components that are free at the end", new.tolist())
+
+
+def _above_zero(new: Floats) -> tuple[str, Any] | None:
+    return None if (new > 0).all() else ("numbers above 0, or infinity", float(new.min()))
+
+
+def _angles(new: Floats) -> tuple[str, Any] | None:
+    return None if ((new > 0) & (new < np.pi)).all() else ("angles in rad, above 0 and below pi", new.tolist())
+
+
+def _axes(new: Floats) -> tuple[str, Any] | None:
+    return _finite(new) or (None if (np.abs(new).max(-1) > 0).all() else ("vectors other than 0", new.tolist()))
 
 
 def _weights(new: Floats) -> tuple[str, Any] | None:

@@ -42,6 +42,14 @@ class Constraint(PerElement):
         """The constraint that a solver's form of it stands for; itself where it is none."""
         return self
 
+    @property
+    def row_radii(self) -> Tensor | None:
+        """Of rows s (|v|^2 - r^2) / (2 r) with `violation` s (|v| - r), s = 1 or -1: s r (B|1, K|1, p); else None.
+
+        Kernels in C turn such rows into violations themselves.
+        """
+        return None
+
     def bind(self, dims: Dimensions) -> Self:
         """The constraint checked and shaped for one problem; called once, by Problem."""
         raise undefined(self, "bind")
@@ -97,6 +105,7 @@ class WrappedConstraint(Constraint):
     geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
     knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
     bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
+    row_radii = property(lambda self: self.constraint.row_radii)  # type: ignore[assignment]
     calls_function = property(lambda self: is_users(self.constraint))
 
     def grown(self, by: Tensor) -> Self:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions
-from torchgco.base.values import bound_values
+from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.costs.base import Cost
 
 
@@ -56,6 +56,11 @@ class FunctionCost(Cost):
             raise InputError("cost.terminal_function", "a function of x, or None", shown(self.terminal_function))
         functions = self.stage_function, self.terminal_function
         return replace(self, values=bound_values(self.values, self.knot_values, functions, dims, "cost"))
+
+    @property
+    def reads_knots(self) -> bool:
+        """Whether the cost of a stage takes its number, or values of it."""
+        return bool(self.values.knot_names) or asks_for_knot(self.stage_function)
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         return self.values.call(self.stage_function, x, u, k=k)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as hidden
 from typing import Any, ClassVar, Literal, Self
@@ -33,7 +33,9 @@ class Dynamics(PerElement):
 
     Derivatives and native kernels are made from this method. `position` says which states are the position in metres
     that obstacles are compared with, or is None. A parameter that may be a tensor (B,), one value per problem, is named
-    in `per_element` and shaped by `shapes.lead`. Dynamics that depend on the knot override `at`.
+    in `per_element` and shaped by `shapes.lead`. Dynamics that depend on the knot override `at`. `state_names`,
+    `state_units`, `control_names` and `control_units`, a text for each state or control, are what figures, tables of
+    trajectories and `explain` call them.
     """
 
     n: int
@@ -41,6 +43,10 @@ class Dynamics(PerElement):
     dt: float
     integrator: str = "euler"
     position: slice | None = None
+    state_names: Sequence[str] = ()
+    state_units: Sequence[str] = ()
+    control_names: Sequence[str] = ()
+    control_units: Sequence[str] = ()
 
     @property
     def is_integrated(self) -> bool:
@@ -65,6 +71,10 @@ class Dynamics(PerElement):
     def bind(self, dims: Dimensions) -> Self:
         """The model checked and shaped for one problem; called once, by Problem."""
         return self
+
+    def derived(self, x: Tensor, u: Tensor) -> dict[str, Tensor]:
+        """Further quantities (...) that exported trajectories have beside states and controls, by label with unit."""
+        return {}
 
     def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of `step` by `torch.func`: fx (..., n, n) and fu (..., n, m)."""
@@ -104,6 +114,7 @@ class FunctionDynamics(Dynamics):
             solve belong here, or in captured tensors: with another captured Python number the code is compiled again.
         knot_values: the same per stage, (B|1, N, ...); the function sees the rows of its stages, (B, ...), (B, K, ...)
             or (B, 1, ...).
+        state_names, state_units, control_names, control_units: see `Dynamics`.
 
     Raises:
         InputError: a field out of its range or of another kind; on `Problem(...)`: values of another shape or that the
@@ -119,6 +130,10 @@ class FunctionDynamics(Dynamics):
     values: Any = None
     knot_values: Any = None
     k: Any = hidden(default=None, repr=False)  # the stage or the stages (K,), set by `at`
+    state_names: Sequence[str] = hidden(default=(), kw_only=True)
+    state_units: Sequence[str] = hidden(default=(), kw_only=True)
+    control_names: Sequence[str] = hidden(default=(), kw_only=True)
+    control_units: Sequence[str] = hidden(default=(), kw_only=True)
 
     batched: ClassVar[tuple[str, ...]] = ("values",)
     calls_function: ClassVar[bool] = True

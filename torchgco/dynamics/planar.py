@@ -37,6 +37,10 @@ class Planar(Dynamics):
     n: ClassVar[int] = 6
     m: ClassVar[int] = 2
     position: ClassVar[slice] = slice(0, 2)
+    state_names: ClassVar[tuple[str, ...]] = ("x", "y", "heading", "vx", "vy", "turn rate")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    control_names: ClassVar[tuple[str, ...]] = ("left", "right")
+    control_units: ClassVar[tuple[str, ...]] = ("m/s^2", "m/s^2")
     per_element: ClassVar[tuple[str, ...]] = ("drag", "thrust_gain", "turn_drag", "turn_gain")
 
     def __post_init__(self) -> None:

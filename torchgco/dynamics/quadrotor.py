@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,11 +21,18 @@ from torchgco.dynamics.integrators import Integrator
 Components = tuple[Tensor, ...]
 Row = tuple[float, float, float]
 Limits = tuple[float | None, ...]
+Texts = tuple[str, ...]
+POSE: Texts = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
+POSE_UNITS: Texts = (*["m"] * 3, *["m/s"] * 3, *[""] * 4, *["rad/s"] * 3)
+THRUSTS: Texts = ("thrust 1", "thrust 2", "thrust 3", "thrust 4")
+ROTORS: Texts = ("rotor 1", "rotor 2", "rotor 3", "rotor 4")
 
 
 @dataclass(frozen=True)
 class Airframe:
-    """The quadrotor's parameters and its weight (Table 2), shared by the three models and all parts of a mission.
+    """A quadrotor: Table 2 of the paper, or an own one. It is shared by the three models and all parts of a mission.
+
+    Command lines and configurations call it `vehicle`: `vehicle.mass=1.2`, `vehicle=crazyflie`.
 
     Raises:
         InputError: a field out of its range or of another kind, thrust limits crossed, an inertia that can't be.
@@ -45,13 +52,23 @@ class Airframe:
     thrust_max: Positive = 6.0  # N per rotor
     hover_speed: Positive = 5000.0  # rpm at which the rotors carry the weight
     gravity: Annotated[float, Above(0, "m/s^2")] = 9.81  # g
+    drag: NonNegative = 0.0  # force against the velocity, N s/m
+    radius: NonNegative = 0.36  # of the ball around it that obstacles are kept out of, m
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "inertia", _as_rows(self.inertia))
         check_options(self, "airframe")
         if not _is_inertia(*self.inertia):
             raise InputError("airframe.inertia", "a symmetric, positive definite matrix in kg m^2", self.inertia)
         if not self.thrust_min < self.thrust_max:
             raise InputError("airframe.thrust_min", f"less than thrust_max {self.thrust_max}", self.thrust_min)
+
+    def slowed(self, pose: Components, v: Components) -> Components:
+        """The rates of `pose_rates` with the drag on the velocity v."""
+        if self.drag == 0:
+            return pose
+        loss = self.drag / self.mass
+        return (*pose[:3], *(a - loss * v_i for a, v_i in zip(pose[3:6], v, strict=True)), *pose[6:])
 
     @property
     def hover_thrust(self) -> float:
@@ -100,6 +117,13 @@ class Airframe:
         return 2.0 / self.rotor_time_constant * root * (math.sqrt(self.thrust_coefficient) * speed - root)
 
 
+def _as_rows(inertia: Any) -> Any:
+    """Lists, as files have them, in place of tuples; anything else as it is, for the check."""
+    return (
+        tuple(tuple(row) if isinstance(row, list) else row for row in inertia) if isinstance(inertia, list) else inertia
+    )
+
+
 def _is_inertia(a: Row, b: Row, c: Row) -> bool:
     """Whether the matrix with these rows is symmetric and positive definite: its leading minors are above 0."""
     minor = a[0] * b[1] - a[1] * b[0]
@@ -136,8 +160,8 @@ class QuadrotorPlanning(Dynamics):
         p' = v,  v' = a R(q) e3 - g e3,  q' = 1/2 Qx(w) q,  w' = (w_c - w)/T_w,  a' = (a_c - a)/T_a
 
     q isn't renormalised, as in the paper's planner. The time constants may be tensors (B,). Of the airframe the model
-    takes g alone, and its mass and limits of thrust for `control_limits`; a mission takes all of it, for the vehicle
-    that follows the plans.
+    takes g and its drag, - drag v / m in v', and its mass and limits of thrust for `control_limits`; a mission takes
+    all of it, for the vehicle that follows the plans.
 
     Raises:
         InputError: a field out of its range or of another kind.
@@ -152,6 +176,10 @@ class QuadrotorPlanning(Dynamics):
     n: ClassVar[int] = 14
     m: ClassVar[int] = 4
     position: ClassVar[slice] = slice(0, 3)
+    state_names: ClassVar[Texts] = (*POSE, "a")
+    state_units: ClassVar[Texts] = (*POSE_UNITS, "m/s^2")
+    control_names: ClassVar[Texts] = ("wx command", "wy command", "wz command", "a command")
+    control_units: ClassVar[Texts] = ("rad/s", "rad/s", "rad/s", "m/s^2")
     per_element: ClassVar[tuple[str, ...]] = ("rate_time_constant", "thrust_time_constant")
 
     def __post_init__(self) -> None:
@@ -163,12 +191,17 @@ class QuadrotorPlanning(Dynamics):
         low, high = self.airframe.accelerations
         return (None, None, None, low), (None, None, None, high)
 
+    def derived(self, x: Tensor, u: Tensor) -> dict[str, Tensor]:
+        """The joint thrust of the rotors, m a."""
+        return {"thrust [N]": self.airframe.mass * x[..., 13]}
+
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         states, controls = components(x), components(u)
         v, q, w, a = states[3:6], states[6:10], states[10:13], states[13]
         T_w, T_a = (lead(T, a) for T in (self.rate_time_constant, self.thrust_time_constant))
         turning = ((w_c - w_i) / T_w for w_c, w_i in zip(controls[:3], w, strict=True))
-        return vectors(*pose_rates(v, q, w, a, self.airframe.gravity), *turning, (controls[3] - a) / T_a)
+        pose = self.airframe.slowed(pose_rates(v, q, w, a, self.airframe.gravity), v)
+        return vectors(*pose, *turning, (controls[3] - a) / T_a)
 
 
 @dataclass(frozen=True)
@@ -189,6 +222,10 @@ class QuadrotorPlant(Dynamics):
     n: ClassVar[int] = 17
     m: ClassVar[int] = 4
     position: ClassVar[slice] = slice(0, 3)
+    state_names: ClassVar[Texts] = (*POSE, *THRUSTS)
+    state_units: ClassVar[Texts] = (*POSE_UNITS, *["N"] * 4)
+    control_names: ClassVar[Texts] = ROTORS
+    control_units: ClassVar[Texts] = ("rpm",) * 4
 
     def __post_init__(self) -> None:
         check_options(self, "plant")
@@ -197,6 +234,7 @@ class QuadrotorPlant(Dynamics):
         _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
         lift = F.sum(-1) / self.airframe.mass
         pose = pose_rates(components(v), components(q), components(w), lift, self.airframe.gravity)
+        pose = self.airframe.slowed(pose, components(v))
         rates = self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)
         return torch.cat((vectors(*pose), *rates), dim=-1)
 
@@ -226,6 +264,10 @@ class RotorTracking(Dynamics):
 
     n: ClassVar[int] = 7
     m: ClassVar[int] = 4
+    state_names: ClassVar[Texts] = ("wx", "wy", "wz", *THRUSTS)
+    state_units: ClassVar[Texts] = (*["rad/s"] * 3, *["N"] * 4)
+    control_names: ClassVar[Texts] = ROTORS
+    control_units: ClassVar[Texts] = ("rpm",) * 4
 
     def __post_init__(self) -> None:
         check_options(self, "rotors")

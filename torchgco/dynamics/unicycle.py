@@ -34,6 +34,10 @@ class Unicycle(Dynamics):
     n: ClassVar[int] = 4
     m: ClassVar[int] = 2
     position: ClassVar[slice] = slice(0, 2)
+    state_names: ClassVar[tuple[str, ...]] = ("x", "y", "heading", "speed")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "m/s")
+    control_names: ClassVar[tuple[str, ...]] = ("acceleration", "turn rate")
+    control_units: ClassVar[tuple[str, ...]] = ("m/s^2", "rad/s")
 
     def __post_init__(self) -> None:
         check_options(self, "unicycle")

@@ -32,6 +32,13 @@ UNMOVED = (
     "rows."
 )
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
+MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
+COVERED = "The goal is required, and an obstacle, grown by the vehicle's radius, covers all of it."
+NEARER = (
+    "A longer horizon N, weaker limits, or a larger radius of the goal; without required=True the solve tells how near "
+    "it gets."
+)
+ELSEWHERE = "A goal that no obstacle covers, or a larger radius of it."
 UNKNOWN = (
     "A start where the map knows that it is free; or let unknown cells, which count as occupied, count as free: "
     'DistanceField.of(grid, unknown="free"), on the command line scenario.unknown=free.'
@@ -55,6 +62,8 @@ class Facts:
         in_unknown: whether the start is invalid for unknown cells of a map alone.
         unmoved: whether all violated rows have the same values for all controls.
         named: whether the row that is violated most is named to the reader before.
+        missed: by how much a required goal is missed, with its unit; None: it isn't, or isn't required.
+        covered: whether one obstacle covers all of a required goal.
     """
 
     status: Status
@@ -71,12 +80,16 @@ class Facts:
     in_unknown: bool = False
     unmoved: bool = False
     named: bool = False
+    missed: str | None = None
+    covered: bool = False
 
     @property
     def told(self) -> list[str]:
         """Why the solve ended so, in sentences."""
         if self.unmoved:
             return [UNMOVED]
+        if self.radius is None and self.missed is not None:
+            return [self.status.sentence, COVERED if self.covered else MISSED.format(missed=self.missed)]
         if self.radius is None:
             return [self.status.sentence]
         room = "none of any radius" if self.passage == 0.0 else f"the widest has room for {self.passage:.3g} m"
@@ -102,6 +115,8 @@ def advice(facts: Facts) -> list[str]:
         found.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
     if facts.status in FITS and facts.reached is False:
         found.append("A longer horizon N, or a larger terminal weight: the trajectory stops short of the goal.")
+    elif facts.missed is not None and facts.status is Status.INFEASIBLE:
+        found.append(ELSEWHERE if facts.covered else NEARER)
     elif facts.status in BY_STATUS:
         limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
         row = "the row named above" if facts.named else "one constraint after the other"

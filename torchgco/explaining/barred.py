@@ -4,13 +4,31 @@ from __future__ import annotations
 
 from typing import Any
 
+from torch import Tensor
+
 from torchgco.base.status import Status
 from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.maps.exact import distance_within
 from torchgco.maps.field import BoundField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.passage import widest_passage
+from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.covered import covered_goals
+from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
+
+
+def goal_facts(problem: Problem, X: Tensor, U: Tensor) -> dict[str, Any]:
+    """Those of `Facts` on a required goal that X (1, N+1, n), U (1, N, m) misses; none where it doesn't."""
+    row = next((part for part in problem.constraints if isinstance(part, GoalBall | GoalState)), None)
+    if row is None:
+        return {}
+    last = int(problem.stages[0])  # of a problem with its own horizon, whose rows stand at knot N
+    missed = float(row.worst(X[:, [last] * X.shape[1]], U))
+    if not missed > ADMITTED:
+        return {}
+    unit = " m" if isinstance(row, GoalBall) else ""
+    return {"missed": f"{missed:.4g}{unit}", "covered": bool(covered_goals(problem))}
 
 
 def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]:

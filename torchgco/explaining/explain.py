@@ -13,7 +13,7 @@ from torchgco.base.shapes import check_shape, computing_on
 from torchgco.base.status import Status
 from torchgco.explaining.account import Account
 from torchgco.explaining.advice import Facts, advice, tells_to_record
-from torchgco.explaining.barred import map_facts
+from torchgco.explaining.barred import goal_facts, map_facts
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, number, place_told
 from torchgco.explaining.record import SearchRecord
@@ -144,6 +144,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         could_record=could,
         unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.X, one.U, ADMITTED)),
         named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,
+        **goal_facts(one.problem, one.X, one.U),
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
     )
 

@@ -10,8 +10,13 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.constraints.norms import Cone, NormBounds
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
+from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 SHOWN = 4  # runs of knots, or obstacles, that are named
@@ -78,9 +83,9 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     if worst["constraint"] == NONE:
         return None
     constraint = problem.constraints[worst["constraint"]]
-    length = " m" if constraint.geometric else ""
+    length = " m" if constraint.geometric or isinstance(constraint, GoalBall | GateBalls | GateSquares) else ""
     where = knots_told([worst["knot"]], t)
-    row = row_told(constraint, worst["row"])
+    row = row_told(constraint, worst["row"], problem.dynamics)
     return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
 
 
@@ -89,14 +94,24 @@ def constraint_told(constraint: Constraint, i: int) -> str:
     return f"constraints[{i}] ({kind_of(constraint)})"
 
 
-def row_told(constraint: Constraint, row: int) -> str:
-    """A row of a constraint: which obstacle, or which bound of which component."""
+def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
+    """A row of a constraint: which obstacle, or which bound of which component, by its name where it has one."""
     if isinstance(constraint, Obstacles):
         return f"obstacle {row}, "
     if isinstance(constraint, ControlBounds | StateBounds):
         above, below = (_places(constraint, part) for part in (constraint.above, constraint.below))
         side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
-        return f"{side} bound of {'control' if constraint.of == 'u' else 'state'} {component}, "
+        kind, of = ("control", controls_of) if constraint.of == "u" else ("state", states_of)
+        named = getattr(dynamics, f"{kind}_names")
+        return f"{side} bound of {kind} {component}{f' ({of(dynamics)[component].label})' if len(named) else ''}, "
+    if isinstance(constraint, GoalBall | GateBalls):
+        return "its radius, "
+    if isinstance(constraint, GoalState):
+        return f"state {constraint.components.tolist()[row]}, "  # type: ignore[union-attr]
+    if isinstance(constraint, NormBounds | Cone):
+        what = "cone of" if isinstance(constraint, Cone) else f"{constraint.sides[row]} bound of the norm of"
+        places = listed(constraint.components.tolist())  # type: ignore[union-attr]
+        return f"{what} {'controls' if constraint.of == 'u' else 'states'} {places}, "
     return f"row {row}, "
 
 

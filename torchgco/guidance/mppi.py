@@ -75,8 +75,12 @@ class MPPI:
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
         """The weighted mean of the last round's samples, X (B, N+1, n) and U (B, N, m); round 1 draws around U."""
-        plan = kernels_of(problem).sample(problem, U, self.sampling(problem, key))
+        plan = self.improved(problem, U, key)
         return open_loop(problem, plan), plan
+
+    def improved(self, problem: Problem, U: Tensor, key: DrawKey) -> Tensor:
+        """The same controls alone, (B, N, m)."""
+        return kernels_of(problem).sample(problem, U, self.sampling(problem, key))
 
     def first_samples(self, problem: Problem, U: Tensor, key: DrawKey, count: int) -> Tensor:
         """Controls (count, B, N, m) of the first samples of round 1, as `improve` draws them in PyTorch."""

@@ -15,9 +15,11 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape, check_tensor, computing_on, tensor
-from torchgco.constraints.base import CONTACT_FACTOR, Constraint
+from torchgco.constraints.base import CONTACT_FACTOR, Constraint, innermost
+from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
+from torchgco.judging.gates import passes
 from torchgco.judging.maps import segment_distances
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import ADMITTED, Obstacles
@@ -49,6 +51,7 @@ class Verdict:
     feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
     reached: Tensor  # bool: feasible, and closer to the goal than the goal radius; False without a goal
     sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
+    gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, between the knots too
 
     def success(self, best_cost: Tensor) -> Tensor:
         """Whether sound, and within 5 % of the best known cost (B,), (B,) bool.
@@ -198,11 +201,15 @@ def _verdict(
     goal_distance, reached = torch.full_like(cost, torch.nan), torch.zeros_like(feasible)
     if goal is not None:
         goal_distance = (X[:, -1, problem.position] - goal[0]).square().sum(-1).sqrt()
-        reached = feasible & (goal_distance < goal[1])
+        required = problem.goal is not None and problem.goal.required  # rows among the others are kept as far as these
+        reached = feasible & (goal_distance < goal[1] + (OTHERS_WITHIN if required else 0.0))
     sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
     if problem.dynamics.position is None and not any(isinstance(part, Separation) for part in problem.constraints):
         clearance_knots = clearance = torch.full_like(cost, torch.nan)
-    return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound)
+    passed = torch.zeros_like(problem.stages)
+    for way in (passes(part, X) for part in problem.constraints):
+        passed = passed if way is None else passed + way.passed.sum(-1)
+    return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound, passed)
 
 
 def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
@@ -357,8 +364,8 @@ def frame_columns(verdict: Verdict) -> dict[str, Any]:
 def columns(problem: Problem, U: Tensor, start: Tensor | None = None) -> dict[str, Any]:
     """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
 
-    `clearance` (m) where the problem has obstacles, `reached` where it has a goal; a problem of another precision is
-    judged in float64; `start` as in `judge`.
+    `clearance` (m) where the problem has obstacles, `reached` where it has a goal, `gates_passed` where it has gates; a
+    problem of another precision is judged in float64; `start` as in `judge`.
 
     Raises:
         InputError: as `judge`.
@@ -368,7 +375,9 @@ def columns(problem: Problem, U: Tensor, start: Tensor | None = None) -> dict[st
         return {}
     names = ["clearance"] if any(isinstance(c, tuple(CLEARANCES)) for c in problem.constraints) else []
     names += ["reached"] if problem.goal is not None else []
-    if not names:
+    gated = [part for part in problem.constraints if isinstance(innermost(part), GateBalls | GateSquares)]
+    if not names and not gated:
         return {}
     verdict = judge(problem, U, start=start)
-    return {name: getattr(verdict, name).cpu().numpy() for name in names}
+    found = {name: getattr(verdict, name).cpu().numpy() for name in names}
+    return found | ({"gates_passed": verdict.gates_passed.cpu().numpy()} if gated else {})

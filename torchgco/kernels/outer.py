@@ -8,7 +8,7 @@ from torch import Tensor
 from torchgco.base.status import Status
 from torchgco.ilqr import lifted
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.lagrangian.quality import goal_tolerance
+from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
 from torchgco.lagrangian.state import PassEnd, State
 from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import Engine
@@ -26,7 +26,7 @@ class NativeOuter:
         problem: the b running problems, `s` their state.
         phr: the form of inequalities' terms, as of a `Lagrangian`.
         base: (b,) outer iterations before this solve.
-        by_arrival: an iterate that has arrived at the goal is preferred to any that hasn't.
+        by_arrival: an iterate that has arrived at a stated goal is preferred to any that hasn't.
         limits: options and constants of the outer loop by name; see `structures.Outer`.
     """
 
@@ -53,7 +53,7 @@ class NativeOuter:
             regularisation=s.regularisation, inner=s.inner, iterations=s.iterations, rung=s.rung, **self.out,
             options=options, limit=options.max_iterations, replicas=1,
         )  # fmt: skip
-        near = goal_tolerance(problem) if by_arrival else None
+        near = goal_tolerance(problem) if by_arrival and ranks_arrival(problem) else None
         goal = {} if near is None or problem.goal is None else {"goal": problem.goal.position, "near": near}
         self.packed = packed
         self.outer = Outer(

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.goal import RADIUS_SHARE
 from torchgco.problem.problem import Problem
 
@@ -50,11 +51,14 @@ def goal_tolerance(problem: Problem) -> Tensor | None:
     """The distance from the goal within which a solver counts a trajectory as arrived, (B,), m; None without a goal.
 
     The smaller of the goal's radius and `GOAL_TOLERANCE` times the distance from the start: a solver that stopped at
-    the edge of a large goal would return trajectories that a few more iterations make cheaper.
+    the edge of a large goal would return trajectories that a few more iterations make cheaper. A required goal's rows
+    say what arrives: all that keeps them, as far as trajectories that count as feasible do.
     """
     goal = problem.goal
     if goal is None:
         return None
+    if goal.required:
+        return goal.radius + ADMITTED
     near = GOAL_TOLERANCE * goal.distance(problem.x0[:, problem.position])
     return near if goal.assumed else torch.minimum(goal.radius, near)
 
@@ -67,10 +71,26 @@ def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
     return problem.goal.distance(X[:, -1, problem.position]) <= tolerances * near
 
 
+def ranks_arrival(problem: Problem) -> bool:
+    """Whether arriving counts before the cost: at a goal that was stated.
+
+    One derived from the cost says no more of what is wanted than the cost itself.
+    """
+    return problem.goal is not None and not problem.goal.assumed
+
+
+def leaves_goal(problem: Problem, new: Tensor, old: Tensor) -> Tensor:
+    """Whether states (B, N+1, n) end away from a stated goal at which old ones have arrived, (B,) bool."""
+    if not ranks_arrival(problem):
+        return torch.zeros_like(new[:, 0, 0], dtype=torch.bool)
+    return has_arrived(problem, old) & ~has_arrived(problem, new)
+
+
 def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float | Tensor, by_arrival: bool = True) -> Tensor:
-    """Whether a trajectory should replace an old one, (B,) bool: feasible arrival counts first, then `is_better`."""
+    """Whether a trajectory should replace an old one, (B,) bool: feasible arrival at a stated goal counts first, then
+    `is_better`."""
     better = is_better(new.cost, new.violation, old.cost, old.violation, limit)
-    if not by_arrival:
+    if not by_arrival or not ranks_arrival(problem):
         return better
     arrived, before = ((path.violation <= limit) & has_arrived(problem, path.X) for path in (new, old))
     return torch.where(arrived == before, better, arrived)

@@ -2,8 +2,14 @@
 
 from torchgco.missions.disturbance import Disturbance as Disturbance
 from torchgco.missions.log import MissionLog as MissionLog
+from torchgco.missions.mission import Flight as Flight
+from torchgco.missions.mission import Frame as Frame
 from torchgco.missions.mission import Mission as Mission
+from torchgco.missions.outcome import Ending as Ending
+from torchgco.missions.outcome import Outcome as Outcome
+from torchgco.missions.pilot import Pilot as Pilot
 from torchgco.missions.planner import Planner as Planner
 from torchgco.missions.plant import Plant as Plant
 from torchgco.missions.plant import RotorPlant as RotorPlant
+from torchgco.missions.tables import endings as endings
 from torchgco.missions.tracker import Tracker as Tracker

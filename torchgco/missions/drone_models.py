@@ -46,8 +46,8 @@ class DroneModelsPlant(RotorPlant):
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
-        states, command, push = (part.detach().cpu().double() for part in (x, self.airframe.reachable(u), force))
-        b = self.airframe.thrust_coefficient * (1.0 + column(self.thrust_error, states))
+        states, command, push = (part.detach().cpu().double() for part in (x, self.frame.reachable(u), force))
+        b = self.frame.thrust_coefficient * (1.0 + column(self.thrust_error, states))
         parameters = self._parameters(b.numpy(), states)
 
         def rates(z: Tensor) -> Tensor:
@@ -58,13 +58,13 @@ class DroneModelsPlant(RotorPlant):
             speed = (F.clamp(min=0.0) / b).sqrt()
             z = rk4(rates, torch.cat((pose, q[:, XYZW], w, speed), dim=-1), self.dt)
         pose, q, w, speed = z.split((6, 4, 3, 4), dim=-1)
-        return within_limits(torch.cat((pose, q[:, WXYZ], w, b * speed * speed.abs()), dim=-1), self.airframe).to(x)
+        return within_limits(torch.cat((pose, q[:, WXYZ], w, b * speed * speed.abs()), dim=-1), self.frame).to(x)
 
     def _rates(self, z: np.ndarray, command: np.ndarray, push: np.ndarray, parameters: dict[str, Any]) -> np.ndarray:
         """z' of z = [p, v, q (xyzw), w, rotor speeds (rpm)] (B, 17)."""
         _, v, q, w, speed = np.split(z, (3, 6, 10, 13), axis=-1)
         yaw_drag = np.zeros_like(w)
-        yaw_drag[:, 2] = -self.airframe.rotational_drag * w[:, 2]
+        yaw_drag[:, 2] = -self.frame.rotational_drag * w[:, 2]
         unit = _unit(q)
         unit = np.where(np.isnan(unit), UPRIGHT, unit)  # SciPy refuses a batch with a NaN; q is NaN after the step
         in_world = Rotation.from_quat(unit).apply(yaw_drag)
@@ -77,7 +77,7 @@ class DroneModelsPlant(RotorPlant):
 
     def _parameters(self, b: np.ndarray, like: Tensor) -> dict[str, Any]:
         """The package's parameters for thrust coefficients b (B or 1, 1), N/rpm^2."""
-        frame = self.airframe
+        frame = self.frame
         mass_error, drag = (column(part, like).numpy() for part in (self.mass_error, self.drag))
         J, none = np.array(frame.inertia), np.zeros_like(b)
         return {
@@ -90,7 +90,7 @@ class DroneModelsPlant(RotorPlant):
             "rpm2thrust": np.stack((none, none, b)),
             "rpm2torque": np.stack((none, none, frame.rotor_torque * b)),
             "mixing_matrix": MIXING,
-            "drag_matrix": -drag[..., None] * np.eye(3),
+            "drag_matrix": -(drag + frame.drag)[..., None] * np.eye(3),
             "rotor_dyn_coef": np.array([1.0, 0.0, 1.0, 0.0]) / frame.rotor_time_constant,
         }
 

@@ -10,14 +10,14 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
-from torchgco.base.shapes import computing_on
+from torchgco.base.shapes import check_tensor, computing_on
 from torchgco.base.tree import take
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
@@ -25,9 +25,10 @@ from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance, measured
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import FARTHEST
+from torchgco.missions.pilot import KnownMap, Pilot
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.plant import Plant, RotorPlant, hovering
+from torchgco.missions.plant import Plant, RotorPlant, flown, hovering
 from torchgco.missions.sensing.sensors import Depth, Lidar
 from torchgco.missions.tracker import Reference, Tracker, Tracking
 from torchgco.missions.unknown.exploration import Exploration
@@ -38,7 +39,8 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
-SEED_STEP = 7_919  # between the seeds of two control steps
+CPU = torch.device("cpu")
+Begin = Callable[[Problem, Tensor, int, Tensor], Pilot]
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
 
 
@@ -49,8 +51,8 @@ class Mission:
     Args:
         planner: makes a plan in every control period, which is a time step of the planning problems.
         tracker: its time step divides the control period, and is the plant's.
-        plant: the vehicle; parameters that differ between missions are (B,). Its airframe is the one of the planning
-            model, which planner and tracker use; its errors are deviations from that.
+        plant: what is flown; parameters that differ between missions are (B,). Its airframe is that of the planning
+            model, as those of planner, tracker and explorer are; its errors are deviations from that.
         disturbance: wind and noise.
         duration: s, after which a mission ends with TIMEOUT.
         goal_radius: m, within which the goal counts as reached; None: the problems' own.
@@ -88,10 +90,10 @@ class Mission:
 
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
-        frame, flown = airframe_of(dynamics), getattr(self.plant, "airframe", None)
-        if isinstance(flown, Airframe) and flown != frame:
-            named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(flown, f.name)]
-            planned, given = (", ".join(f"{name} {getattr(one, name)}" for name in named) for one in (frame, flown))
+        frame, other = airframe_of(dynamics), getattr(self.plant, "airframe", None)
+        if isinstance(other, Airframe) and other != frame:
+            named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(other, f.name)]
+            planned, given = (", ".join(f"{name} {getattr(one, name)}" for name in named) for one in (frame, other))
             raise InputError("plant.airframe", f"that of the planning model, {planned}", given)
         if self.substeps(float(dynamics.dt)) is None:
             raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
@@ -103,6 +105,10 @@ class Mission:
         """Time steps of the plant in a control period, s; None where they don't fit."""
         count = round(period / self.plant.dt)
         return count if count >= 1 and math.isclose(count * self.plant.dt, period, rel_tol=1e-9) else None
+
+    def periods(self, period: float) -> int:
+        """Control periods, s, of the mission."""
+        return math.ceil(self.duration / period - 1e-9)
 
     def exploration(self, problem: Problem, seed: int, ids: Tensor) -> Exploration | None:
         """The planner of missions with a sensor; None where all obstacles are known."""
@@ -125,8 +131,7 @@ class Mission:
                 period that isn't a multiple of the plant's time step, or an argument of another kind.
         """
         check_value(report, Callable | None, "report")
-        with computing_on(torch.device("cpu")):
-            return self._flight(problem, seed, ids).run(report or (lambda step, flying: None))
+        return Flight(self, problem, seed, ids).run(report or (lambda step, flying: None))
 
     def first_plans(self, problem: Problem, seed: int = 0, ids: Tensor | None = None) -> tuple[Problem, Solution]:
         """The planning problems of the first control period, and the solutions that `fly` makes its first plans of.
@@ -136,89 +141,181 @@ class Mission:
         """
         if self.sensor != "full":
             raise InputError("mission.sensor", "full for first plans", self.sensor)
-        with computing_on(torch.device("cpu")):
-            flight = self._flight(problem, seed, ids)
-            return flight.planner.first(problem, measured(flight.x, flight.noise[:, 0]), flight.seed, flight.ids)
+        problem, seed, ids = check_flown(self, problem, seed, ids)
+        with computing_on(CPU):
+            x = hovering(airframe_of(problem.dynamics), problem.x0[:, :3])
+            period = float(problem.dynamics.dt)
+            _, noise = self.disturbance.draw(seed, ids.tolist(), self.periods(period), period)
+            return self._planner.first(problem, measured(x, noise[:, 0]), seed, ids)
 
-    def _flight(self, problem: Problem, seed: int, ids: Tensor | None) -> _Flight:
-        problem = current_problem(problem)
-        seed = check_value(seed, Seed, "seed")
-        if ids is not None:
-            check_ids(ids, problem)
-        return _Flight(self, problem, seed, torch.arange(problem.B) if ids is None else ids)
+    def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
+        """Who plans for vehicles at plants x (B, 17): the planner, or with a sensor the explorer."""
+        return self.exploration(problem, seed, ids) or KnownMap(self._planner, problem, x, seed, ids)
+
+    @property
+    def _planner(self) -> Planner:
+        """The planner: with a latency it doesn't know the thrusts at a plan's start, one period ahead."""
+        return self.planner if self.latency == 0 else replace(self.planner, first_step=False)
 
 
-class _Flight:
-    """One call of `Mission.fly`: the state of all vehicles that still fly."""
+def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | None) -> tuple[Problem, int, Tensor]:
+    """The problems, the seed and the ids (B,) of a flight, where they can be flown; see `Mission.fly`."""
+    problem = current_problem(problem)
+    seed = check_value(seed, Seed, "seed")
+    if ids is not None:
+        check_ids(ids, problem)
+    if problem.goal is None:
+        raise InputError("goal", "a Goal in the problem", None)
+    if problem.horizon is not None:
+        raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
+    mission.check(problem.dynamics)
+    if problem.x0.dtype != torch.float64:
+        raise InputError("x0", "torch.float64 for a mission", problem.x0.dtype)
+    return problem, seed, torch.arange(problem.B, device="cpu") if ids is None else ids
 
-    def __init__(self, mission: Mission, problem: Problem, seed: int, ids: Tensor) -> None:
-        self.mission, self.seed = mission, seed
-        # The thrusts at a plan's start are not known one period ahead.
-        self.planner = mission.planner if mission.latency == 0 else replace(mission.planner, first_step=False)
-        if problem.goal is None:
-            raise InputError("goal", "a Goal in the problem", None)
-        if problem.horizon is not None:
-            raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
-        mission.check(problem.dynamics)
+
+@dataclass(frozen=True)
+class Frame:
+    """A control period of a flight; b vehicles flew in it.
+
+    Args:
+        step: its number; t: its end, s.
+        rows: the vehicles' places among all, (b,) int64.
+        measured: their states at its start, (b, 17).
+        plan: that they flew along.
+        x: their states at its end, (b, 17).
+        ended: which of them are at their goal, in contact or lost by then, (b,) bool.
+        seconds: that the plans took.
+    """
+
+    step: int
+    t: float
+    rows: Tensor
+    measured: Tensor
+    plan: Plan
+    x: Tensor
+    ended: Tensor
+    seconds: float
+
+
+class Flight:
+    """Missions that are flown period by period: `Mission.fly` calls `step` until they are `done`.
+
+        flight = Flight(mission, problem)
+        while not flight.done:
+            frame = flight.step()
+
+    Args:
+        mission, problem, seed, ids: as `Mission.fly` takes them.
+        begin: makes the pilot; None: `mission.begin`.
+
+    Attributes:
+        x: states (b, 17) of the plants that still fly; rows: their places among all, (b,) int64.
+        log: what has happened.
+
+    Raises:
+        InputError: as `Mission.fly`.
+    """
+
+    def __init__(
+        self, mission: Mission, problem: Problem, seed: int = 0, ids: Tensor | None = None, begin: Begin | None = None
+    ) -> None:
+        self.mission = mission
+        problem, self.seed, ids = check_flown(mission, problem, seed, ids)
         self.airframe = airframe_of(problem.dynamics)
-        if problem.x0.dtype != torch.float64:
-            raise InputError("x0", "torch.float64 for a mission", problem.x0.dtype)
         self.period = float(problem.dynamics.dt)
         self.substeps = mission.substeps(self.period) or 1
-        self.steps = math.ceil(mission.duration / self.period - 1e-9)
-        self.contact = Contact.among(problem)
-        self.measured_at, self.clearance = problem.x0[:, :3], torch.full_like(problem.x0[:, 0], -torch.inf)
-        self.goal = problem.goal.position
-        radius = mission.goal_radius
-        self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
-        x = hovering(self.airframe, problem.x0[:, :3])
-        self.start = x[:, :3]
-        self.problem, self.planned = problem, self.planner.problem(problem, x)
-        self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
-        self.plant, self.x, self.rows, self.ids = mission.plant, x, torch.arange(problem.B), ids
-        self.exploration = mission.exploration(problem, seed, ids)
-        knots = (problem.N if self.exploration is None else mission.explorer.stages) + 1
-        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, knots)
-        if self.exploration is not None:
-            self.log.seen.extend(scout.log for scout in self.exploration.scouts)
+        self.steps, self._step = mission.periods(self.period), 0
+        with computing_on(CPU):
+            self._begin(problem, ids, begin or mission.begin)
 
-    def run(self, report: Report) -> MissionLog:
-        """Fly until all missions have ended."""
-        plan: Plan | None = None
-        tracking: Tracking | None = None
-        self._leave(~self.problem.start_is_clear)
-        for step in range(self.steps):
-            if self.rows.numel() == 0:
-                break
-            seen, seconds = measured(self.x, self.noise[self.rows, step]), 0.0
-            if self.exploration is not None:
-                self.exploration.sense(step, self.x, seen)
-            if plan is None or self.mission.latency == 0:
-                plan, seconds = self._planned(step, seen, seen, plan)
-            flown = plan
-            if self.mission.latency == 1:
-                plan, more = self._planned(step + 1, self.planner.predicted(seen, flown), seen, flown)
-                seconds += more
-            self.log.add_plan(self.rows, step, self.x, flown, seconds / self.rows.numel())
-            if self.exploration is not None:
-                self.log.add_parts(self.rows, step, self.exploration.parts())
-            tracking, left = self._fly_period(step, flown, tracking)
-            if bool(left.any()):
-                stay = (~left).nonzero().flatten()
-                plan, tracking = plan.take(stay), tracking.take(stay)
-                self._leave(left)
-            report(step, self.rows.numel())
+    def _begin(self, problem: Problem, ids: Tensor, begin: Begin) -> None:
+        mission, goal = self.mission, problem.goal
+        assert goal is not None
+        self.contact, self.model = Contact.among(problem), problem.dynamics
+        self.measured_at, self.clearance = problem.x0[:, :3], torch.full_like(problem.x0[:, 0], -torch.inf)
+        radius = mission.goal_radius
+        self.goal = goal.position
+        self.radius = goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
+        x = hovering(self.airframe, problem.x0[:, :3])
+        self.start, self.ids = x[:, :3], ids
+        self.force, self.noise = mission.disturbance.draw(self.seed, ids.tolist(), self.steps, self.period)
+        self.plant, self.x, self.rows = flown(mission.plant, self.airframe), x, torch.arange(problem.B)
+        self.pilot = begin(problem, x, self.seed, ids)
+        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, self.pilot.knots)
+        self.log.seen.extend(self.pilot.seen)
+        self._plan: Plan | None = None  # to continue, or with a latency to fly
+        self._tracking: Tracking | None = None
+        self._leave(~problem.start_is_clear)
+
+    @property
+    def done(self) -> bool:
+        """Whether all vehicles have ended, or the time is over."""
+        return self.rows.numel() == 0 or self._step == self.steps
+
+    def run(self, report: Report = lambda step, flying: None) -> MissionLog:
+        """Fly until it is done."""
+        while not self.done:
+            frame = self.step()
+            report(frame.step, self.rows.numel())
         return self.log
 
-    def _planned(self, step: int, x: Tensor, seen: Tensor, before: Plan | None) -> tuple[Plan, float]:
-        """Plans from states x (B, 17) at a control step, when `seen` is measured; and the seconds they took."""
-        if self.exploration is not None:
-            return self.exploration.plan(step, x, before)
-        seed = self.seed + SEED_STEP * step
-        plan, self.planned, seconds = self.planner.plan(
-            self.problem, self.planned, x, step, before, seed, self.ids, seen
-        )
+    def step(self, plan: Plan | Tensor | None = None) -> Frame:
+        """Fly one control period.
+
+        Args:
+            plan: to fly along, of the vehicles in `rows`: states (b, K, 14) of the planning model at knots a control
+                period apart, K at least 2, of which the tracker follows body rates and acceleration. None: the
+                pilot's. The pilot doesn't continue a plan that isn't its own.
+
+        Raises:
+            InputError: a flight that is done, a plan of another shape, or one that isn't finite.
+        """
+        if self.done:
+            raise InputError("flight", "one that isn't done", "one that is")
+        with computing_on(CPU):
+            step, rows = self._step, self.rows
+            seen = measured(self.x, self.noise[rows, step])
+            flown, seconds = self._chosen(step, seen, plan)
+            self.log.add_plan(rows, step, self.x, flown, seconds / rows.numel())
+            self.log.add_parts(rows, step, self.pilot.parts())
+            self._tracking, ended = self._fly_period(step, flown, self._tracking)
+            frame = Frame(step, (step + 1) * self.period, rows, seen, flown, self.x, ended, seconds)
+            if bool(ended.any()):
+                stay = (~ended).nonzero().flatten()
+                self._plan = None if self._plan is None else self._plan.take(stay)
+                self._tracking = self._tracking.take(stay)
+                self._leave(ended)
+            self._step += 1
+            return frame
+
+    def _chosen(self, step: int, seen: Tensor, given: Plan | Tensor | None) -> tuple[Plan, float]:
+        """The plan of a control step, from measured states `seen` (b, 17), and the seconds that it took."""
+        if given is not None and not isinstance(given, Plan):
+            given = self._of_states(given, seen, step)
+        self.pilot.sense(step, self.x, seen)
+        if given is not None:
+            self._plan = None
+            return given, 0.0
+        plan, seconds, late = self._plan, 0.0, self.mission.latency == 1
+        if plan is None or not late:
+            plan, seconds = self.pilot.plan(step, seen, plan, seen)
+        self._plan = plan
+        if late:
+            ahead = self.mission.planner.predicted(seen, plan)
+            self._plan, more = self.pilot.plan(step + 1, ahead, plan, seen)
+            seconds += more
         return plan, seconds
+
+    def _of_states(self, X: Any, seen: Tensor, step: int) -> Plan:
+        b = len(seen)
+        wanted = f"states ({b}, K, 14) of the vehicles that fly, K at least 2, or a Plan"
+        if not isinstance(X, Tensor) or X.dim() != 3 or (X.shape[0], X.shape[2]) != (b, 14) or X.shape[1] < 2:
+            raise InputError("plan", wanted, tuple(X.shape) if isinstance(X, Tensor) else type(X).__name__)
+        check_tensor(X, "plan", seen)
+        if not bool(torch.isfinite(X).all()):
+            raise InputError("plan", "finite states", "NaN or infinity")
+        return Plan.of_states(X, seen, self.model, step)
 
     def _fly_period(self, step: int, plan: Plan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
         """One control period along a plan; and which vehicles have ended in it, (B,) bool."""
@@ -255,9 +352,7 @@ class _Flight:
         stay = (~left).nonzero().flatten()
         if stay.numel() == left.numel():
             return
-        self.problem, self.planned = self.problem.take(stay), self.planned.take(stay)
         self.plant, self.contact = self.plant.take(stay), self.contact.take(stay)
         self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
         self.measured_at, self.clearance = self.measured_at[stay], self.clearance[stay]
-        if self.exploration is not None:
-            self.exploration.take(stay)
+        self.pilot.take(stay)

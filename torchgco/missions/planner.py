@@ -69,6 +69,17 @@ class Plan:
         parts = {name: take(getattr(self, name), index) for name in (*TRAJECTORY, *OTHERS)}
         return replace(self, **parts, model=self.model.take(index))
 
+    @classmethod
+    def of_states(cls, X: Tensor, measured: Tensor, model: Dynamics, step: int) -> Plan:
+        """A plan that somebody else has made: states X (B, N+1, 14) alone, from plants measured at (B, 17)."""
+        B, n, like = len(X), X.shape[-1], X[:, 0, 0]
+        none, U = torch.zeros_like(like, dtype=torch.int64), X.new_zeros(B, X.shape[1] - 1, 4)
+        unknown = torch.full_like(like, torch.nan)
+        return cls(
+            X, U, X.new_zeros(*U.shape, n), Multipliers((), unknown), unknown, unknown, unknown, none.bool(), none,
+            none, measured, X.new_zeros(B, 3), model, step, none.bool(),
+        )  # fmt: skip
+
 
 TRAJECTORY = ("X", "U", "K", "multipliers", "penalty", "cost", "violation", "shifted")
 OTHERS = ("guided", "iterations", "measured", "bias", "arrived")

@@ -64,7 +64,8 @@ def acceleration(x: Tensor, airframe: Airframe) -> Tensor:
     """v' (B, 3) of the planning model for plants x (B, 17), m/s^2."""
     _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
     lift = F.sum(-1) / airframe.mass
-    return torch.stack(pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), lift, airframe.gravity)[3:6], dim=-1)
+    pose = pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), lift, airframe.gravity)
+    return torch.stack(airframe.slowed(pose, v.unbind(-1))[3:6], dim=-1)
 
 
 @dataclass(frozen=True)

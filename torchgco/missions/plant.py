@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import torch
@@ -40,16 +40,16 @@ class RotorPlant(PerElement):
     Rotors turn no slower and no faster than the airframe's limits of thrust ask for: commands beyond are cut off.
 
     Args:
-        airframe: that of the planning model, which has no such errors.
+        airframe: None, as a mission takes it from its planning model, which has no such errors; alone the paper's.
         mass_error, thrust_error: share by which mass and thrust coefficient differ from the airframe's, number or (B,).
-        drag: force against the velocity, N s/m, a number or (B,).
+        drag: force against the velocity beyond the airframe's own, N s/m, a number or (B,).
 
     Raises:
         InputError: non-positive dt, a mass or thrust coefficient that isn't above 0, a negative drag, a parameter that
             is neither a finite number nor (B,).
     """
 
-    airframe: Airframe = Airframe()
+    airframe: Airframe | None = None
     dt: Seconds = 0.01
     mass_error: float | Tensor = 0.0
     thrust_error: float | Tensor = 0.0
@@ -61,20 +61,31 @@ class RotorPlant(PerElement):
         check_options(self, "plant")
         check_vehicle(self.mass_error, self.thrust_error, self.drag)
 
+    @property
+    def frame(self) -> Airframe:
+        """The airframe that flies."""
+        return Airframe() if self.airframe is None else self.airframe
+
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
-        model = QuadrotorPlant(self.dt, airframe=self.airframe)
+        frame = self.frame
+        model = QuadrotorPlant(self.dt, airframe=frame)
         mass_error, thrust_error, drag = (column(part, x) for part in (self.mass_error, self.thrust_error, self.drag))
-        speed = (1.0 + thrust_error).sqrt() * self.airframe.reachable(u)
+        speed = (1.0 + thrust_error).sqrt() * frame.reachable(u)
 
         def rates(x: Tensor) -> Tensor:
-            planned = model.field(x, speed)
-            lift = planned[:, 3:6] + planned.new_tensor([0.0, 0.0, self.airframe.gravity])
-            push = (force - drag * x[:, 3:6]) / self.airframe.mass
+            planned = model.field(x, speed)  # the drag of the airframe in it, too
+            lift = planned[:, 3:6] + planned.new_tensor([0.0, 0.0, frame.gravity])
+            push = (force - drag * x[:, 3:6]) / frame.mass
             error = (push - mass_error * lift) / (1.0 + mass_error)
             return torch.cat((planned[:, :3], planned[:, 3:6] + error, planned[:, 6:]), dim=-1)
 
-        return within_limits(rk4(rates, x, self.dt), self.airframe)
+        return within_limits(rk4(rates, x, self.dt), frame)
+
+
+def flown(plant: Plant, airframe: Airframe) -> Plant:
+    """The plant of a mission with this airframe, where it hasn't been given one."""
+    return replace(plant, airframe=airframe) if isinstance(plant, RotorPlant) and plant.airframe is None else plant
 
 
 def check_vehicle(mass_error: float | Tensor, thrust_error: float | Tensor, drag: float | Tensor) -> None:

@@ -6,7 +6,6 @@ measured states: a log need not hold what it can be found again from. Plans are 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -57,7 +56,7 @@ def replayed(
     if exploration is None:
         raise InputError("mission.sensor", "lidar or depth: only then is there something to see", mission.sensor)
     period = float(problem.dynamics.dt)
-    _, noise = mission.disturbance.draw(seed, [number], math.ceil(mission.duration / period - 1e-9), period)
+    _, noise = mission.disturbance.draw(seed, [number], mission.periods(period), period)
     (scout,), sought = exploration.scouts, []
     for step, state in enumerate(x):
         true = state.unsqueeze(0)

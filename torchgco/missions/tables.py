@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 import torch
 
+from torchgco.base.errors import InputError
+from torchgco.base.options import Meters, check_value
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
-from torchgco.missions.log import PARTS
+from torchgco.missions.log import PARTS, MissionLog
 from torchgco.missions.outcome import Ending, judge_flight
+from torchgco.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Arrays = Mapping[str, np.ndarray]
 SCALARS = (
@@ -58,6 +64,8 @@ def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances:
 
     Commands `u1` to `u4` are the first of a control step; `u1_low` and `u1_high` the least and the largest of it.
     """
+    import pandas as pd
+
     frames = []
     for b, number in enumerate(ids):
         K = _steps(arrays, b)
@@ -88,6 +96,8 @@ def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float, airframe:
     A command holds from its row to the next one; the last row is the mission's end and repeats the last command.
     Arguments as `mission_frame`.
     """
+    import pandas as pd
+
     low, high = airframe.rotor_speeds
     frames = []
     for b, number in enumerate(ids):
@@ -163,6 +173,24 @@ def ending(arrays: Arrays, b: int, period: float, contact: Contact, goal: np.nda
     _, x = samples(arrays, b, period)
     dt, finite = period / arrays["commands"].shape[2], np.isfinite(x).all(axis=-1, keepdims=True)
     return judge_flight(np.where(finite, x[:, :3], np.nan), dt, contact.take(slice(b, b + 1)), goal, goal_radius)
+
+
+def endings(log: MissionLog, problem: Problem, goal_radius: float | None = None) -> list[Ending]:
+    """How each mission of a log ended: outcome, flight time, clearance and distance from the goal.
+
+    Args:
+        problem: the problems that were flown.
+        goal_radius: m, as the mission had it; None: the problems' own.
+
+    Raises:
+        InputError: other problems than the log's, problems without a goal, or a radius that isn't above 0.
+    """
+    check_value(goal_radius, Meters | None, "goal_radius")
+    if len(log.x) != problem.B or problem.goal is None:
+        raise InputError("problem", f"the {len(log.x)} problems with goals that were flown", f"{problem.B} problems")
+    contact, goal, arrays = Contact.among(problem), problem.goal.position.numpy(), log.arrays()
+    radii = problem.goal.radius.tolist() if goal_radius is None else [goal_radius] * problem.B
+    return [ending(arrays, b, log.period, contact, goal[b], radii[b]) for b in range(problem.B)]
 
 
 def _steps(arrays: Arrays, b: int) -> int:

@@ -287,7 +287,8 @@ class Engine:
         if source is None:
             return numbers_of(constraint, None, problem)
         shared = self.shared.rows[i]
-        return {**numbers_of(constraint, rows_numbers(problem, i, source, shared), problem), "shared": shared}
+        own = numbers_of(constraint, rows_numbers(problem, i, source, shared), problem)
+        return {**own, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:
@@ -331,8 +332,11 @@ os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child has none of 
 
 
 def _measured(part: Constraint) -> bool:
-    """Whether violations are what the base class says of rows."""
-    return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
+    """Whether violations are what the base class says of rows, or C finds them from these."""
+    return part.row_radii is not None or (type(part).violation, type(part).worst) == (
+        Constraint.violation,
+        Constraint.worst,
+    )
 
 
 def _is_blank(lam: Tensor) -> bool:

@@ -115,8 +115,22 @@ class Kept:
         """Let all trajectories begin at the problem's starts."""
         self._moving[0][:, 0] = self._x0
 
-    def shift(self, by: int) -> None:
-        """Let all trajectories and multipliers begin `by` stages later, as `Solution.shifted` does."""
+    def shift(self, by: float) -> None:
+        """Let all trajectories and multipliers begin `by` stages later, as `Solution.shifted` does.
+
+        Part of a stage takes the straight line between what whole stages give: a guess, for the solve that follows.
+        """
+        whole = int(by)
+        if whole:
+            self._shift(whole)
+        if (part := by - whole) > 0:
+            now = [numbers.copy() for numbers in self._moving]
+            self._shift(1)
+            for numbers, before in zip(self._moving, now, strict=True):
+                numbers *= part
+                numbers += (1 - part) * before
+
+    def _shift(self, by: int) -> None:
         if by not in self._later:
             self._later[by] = [_moved(knots, by) for knots in self._knots]
         for part, at in zip(self._moving, self._later[by], strict=True):

@@ -60,6 +60,7 @@ class Constraint(Structure):
         (Array, "bound"),
         (Array, "squares"),  # SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none
         (Array, "velocities"),  # SPHERES: as centres, or NULL
+        (Array, "radii"),  # FUNCTION: see Constraint.row_radii (E, knots, rows), or NULL
         (Array, "stops"),  # SPHERES, BOXES, FIELD: the last knot at which they count (E, 1, 1), or NULL
         ("double", "dt"),
         ("const double *", "shared"),  # FUNCTION: numbers w that all problems share

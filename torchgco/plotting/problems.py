@@ -18,9 +18,11 @@ from matplotlib.patches import Patch
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape
 from torchgco.constraints import ControlBounds, Separation, StateBounds
+from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.bodies import ABOVE, Plane
+from torchgco.plotting.gates import Outline, draw_gates, outlines
 from torchgco.plotting.layouts import EDGE, MARKED, SIDE, STONE, draw_obstacles, draw_targets, marker, moving_handles
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import flown, leaving, passes, view
@@ -141,13 +143,18 @@ class _Map:
     courses: list[Course]
     planes: tuple[Plane, ...]
     box: np.ndarray  # (2, d): lower and upper corner, m
+    gates: list[Outline]
 
     @classmethod
     def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> _Map:
         world = world_of(problem, courses[0].b)
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
         boxes = [view(scene, [0], kept, others) for scene in world.scenes]
-        return cls(world, courses, planes, np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]))
+        box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+        gates = outlines(problem, courses[0].b)
+        for corners, radius in gates:
+            box = np.stack([np.minimum(box[0], corners.min(0) - radius), np.maximum(box[1], corners.max(0) + radius)])
+        return cls(world, courses, planes, box, gates)
 
     @property
     def shares(self) -> list[float]:
@@ -172,6 +179,7 @@ class _Map:
         for course in self.courses:
             drawn |= self._course(ax, plane, course)
         draw_targets(ax, self.world.first, 0, plane)
+        draw_gates(ax, self.gates, plane)
         for course in self.courses[1:]:
             start: dict[str, Any] = {"marker": "s", "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5}
             ax.plot(*course.paths[0][:1, plane].T, color=INK, zorder=2.5, linestyle="none", **start)
@@ -239,7 +247,7 @@ def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Cours
     count = problem.n + problem.m
     rows = ceil(count / COLUMNS)
     axes = list(figure.subplots(rows, min(COLUMNS, count), squeeze=False, sharex=True).flat)
-    names = _names(problem)
+    names = [one.label for one in (*states_of(problem.dynamics), *controls_of(problem.dynamics))]
     for i, ax in enumerate(axes[:count]):
         state, j = i < problem.n, i if i < problem.n else i - problem.n
         values = []
@@ -258,16 +266,6 @@ def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Cours
             ax.tick_params(labelbottom=True)
     for ax in axes[count:]:
         ax.remove()
-
-
-def _names(problem: Problem) -> list[str]:
-    """Titles of the histories: coordinates of the position by letter, other states and controls by number."""
-    at = problem.dynamics.position
-    place = range(0) if at is None else range(at.start, at.stop)
-    states = [
-        f"{'xyz'[j - place.start]} [m]" if j in place and len(place) <= 3 else f"x[{j}]" for j in range(problem.n)
-    ]
-    return [*states, *(f"u[{j}]" for j in range(problem.m))]
 
 
 def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.ndarray], state: bool, j: int) -> None:

@@ -22,7 +22,9 @@ from torchgco.base.shapes import MISTAKES, Dimensions, describe
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint, innermost
 from torchgco.costs.base import Cost
+from torchgco.costs.function import FunctionCost
 from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.names import check_names
 from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
@@ -30,7 +32,10 @@ LOST = 1e-2  # share of a derivative by which differences may disagree
 NOISE = 8.0  # times the rounding error of a difference, or its change with the step
 APART = "values of a problem that depend on its own row alone; numbers per problem belong in `values` or `batched`"
 
-ANY_AXES = "the same numbers of a state and control whatever axes lie before the last, (B, n), (B, K, n) or (B, S, n)"
+ANY_AXES = (
+    "the same numbers of a state and control whatever axes lie before the last, (B, n), (B, K, n) or (B, S, n), and "
+    "whether k is a number or a tensor (K,)"
+)
 ONE_KNOT = (
     "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; numbers per knot: "
     "`knot_values`, or an argument k)"
@@ -90,6 +95,7 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     """
     if not is_users(dynamics):
         return
+    check_names(dynamics)
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
     k = torch.arange(3, device=x0.device).clamp(max=N - 1)
@@ -152,8 +158,9 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
-    _check_axes("cost.stage", lambda i, k, x, u: stage(i, x, u, k), rows, k, X[:, :-1], U)
-    _check_axes("cost.terminal", lambda i, _, x: cost.take(i).terminal(x), rows, k[:1], X[:, -1:])
+    reads = not isinstance(cost, FunctionCost) or cost.reads_knots
+    _check_axes("cost.stage", lambda i, k, x, u: stage(i, x, u, k), reads, rows, k, X[:, :-1], U)
+    _check_axes("cost.terminal", lambda i, _, x: cost.take(i).terminal(x), False, rows, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
     _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
     _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
@@ -225,7 +232,7 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
     if place is not None:
         got = f"rows of knot {int(knots[place])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
-    _check_axes(field, together, rows, knots, *arguments)
+    _check_axes(field, together, constraint.reads_knots, rows, knots, *arguments)
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
@@ -301,10 +308,12 @@ def _check_apart(field: str, function: Callable[..., Tensor], rows: Tensor, *arg
         raise InputError(field, APART, "values that change with those of another problem")
 
 
-def _check_axes(field: str, function: Callable[..., Tensor], rows: Tensor, k: Tensor, *arguments: Tensor) -> None:
-    """Check that function(rows, k, *arguments) doesn't look at how many axes its arguments have."""
-    if _called(field, ANY_AXES, depends_on_axes, function, rows, k, arguments):
-        raise InputError(field, ANY_AXES, "others for a state by itself than among those of all knots")
+def _check_axes(
+    field: str, function: Callable[..., Tensor], reads_k: bool, rows: Tensor, k: Tensor, *arguments: Tensor
+) -> None:
+    """Check that function(rows, k, *arguments) doesn't look at how many axes its arguments have, nor at what k is."""
+    if _called(field, ANY_AXES, depends_on_axes, function, rows, k, arguments, reads_k):
+        raise InputError(field, ANY_AXES, "others for a state by itself, and its k, than among those of all knots")
 
 
 def _check_tensor(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:

@@ -7,8 +7,10 @@ for gradients, its parts are bound once more, with gradients recorded, when a so
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Number
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from torch import Tensor
 from torchgco.base.gradients import leaves, recording, without_gradients
 from torchgco.base.shapes import as_states, check_untransformed
 from torchgco.problem.free_start import moved_inside
+from torchgco.problem.goal import with_goal, without_goal
 
 PARTS = "dynamics", "cost", "constraints", "x0"  # a goal judges trajectories and changes none: it takes no gradients
 
@@ -81,7 +84,9 @@ class Given:
             x0 = as_states(self.fields["x0"])
             dims = whole._dimensions(x0)
             parts = {name: self.fields[name].bind(dims) for name in ("dynamics", "cost")}
-            parts["constraints"] = tuple(part.bind(dims) for part in self.fields["constraints"])
+            goal = self.fields["goal"]
+            rows = [part.bind(dims) for part in without_goal(goal, dims, self.fields["constraints"])]
+            parts["constraints"] = with_goal(goal, rows, dims)
             parts["x0"] = moved_inside(x0, whole.free_start, parts["constraints"])
             return self._applied(whole._with(parts))
 
@@ -103,22 +108,45 @@ def replaced(parts: Sequence[Any], old: Sequence[Any], new: Sequence[Any]) -> li
     return [part if at is None else new[at] for part, at in zip(parts, places, strict=True)]
 
 
+@dataclass(frozen=True, eq=False)
+class _Itself:
+    """An object that is equal to itself alone; what it holds is looked at elsewhere, or read anew."""
+
+    held: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Itself) and other.held is self.held
+
+    def __hash__(self) -> int:
+        return id(self.held)
+
+
 def _facts(fields: Mapping[str, Any]) -> Iterator[Hashable]:
-    """Numbers, how often tensors were written into, and sums over the bytes: `.data` and NumPy write unseen."""
+    """Parts and functions; numbers, how often tensors were written into, and sums over the bytes of tensors and arrays:
+    `.data` and NumPy write unseen."""
+    parts = fields["constraints"]
+    yield from map(_Itself, parts if isinstance(parts, (list, tuple)) else (parts,))
+    yield from (_Itself(fields[name]) for name in ("dynamics", "cost"))
     for leaf in leaves(fields):
         if isinstance(leaf, Tensor):
             yield 0 if leaf.is_inference() else leaf._version
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
-                yield _sum(leaf.detach().resolve_conj().resolve_neg().numpy())
-        elif isinstance(leaf, np.ndarray):
-            yield _sum(leaf)
-        elif isinstance(leaf, (int, float)):
+                yield _sum(leaf.detach())
+        elif isinstance(leaf, (Number, str, bytes)):
             yield leaf
+        elif callable(leaf) or leaf is None or isinstance(leaf, slice):
+            yield _Itself(leaf)
+        elif isinstance(leaf, np.ndarray) or hasattr(leaf, "__array__") or isinstance(leaf, (Collection, memoryview)):
+            yield _sum(leaf)
 
 
-def _sum(array: np.ndarray) -> int | None:
+def _sum(numbers: Any) -> int | None:
     """A sum over the bytes of numbers; None of other things."""
+    try:
+        array = np.asarray(list(numbers) if isinstance(numbers, deque) else numbers)
+    except (TypeError, ValueError, RuntimeError):
+        return None
     return (
         zlib.crc32(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data) if array.dtype.kind in "biuf" else None
     )

@@ -1,53 +1,116 @@
-"""The goal of a problem, its position and radius, for solver, search and judge alike."""
+"""The goal of a problem, for solver, search and judge alike; and the rows of one that binds."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.norms import NormBounds
+from torchgco.costs.base import Cost
+from torchgco.obstacles.base import ADMITTED
 
 RADIUS_SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
 
 
 @dataclass(frozen=True)
 class Goal(PerElement):
-    """A ball in which the last knot should lie.
+    """A ball in which the last knot should lie; or, required, a ball in which or a state at which it must.
+
+        Goal([4.0, 0.0], 0.3)                     # where the trajectory should end: judged, and sought by the search
+        Goal([4.0, 0.0], 0.3, required=True)      # |p_N - position| <= radius is a constraint
+        Goal(state=[4.0, 0, 0, 0], required=True)  # x_N = state is one: a boundary constraint
+
+    A required goal adds its rows to the problem's constraints, as the last of them; where horizons differ they hold at
+    each problem's own last knot. Feasible is then what arrives.
 
     Args:
         position: its centre (d,), or (B, d) one per problem, m.
-        radius: number or (B,), m, above 0.
+        radius: number or (B,), m, above 0. With a state, by how much its position may be missed to count as reached;
+            None: 1e-3, as constraints are admitted to be violated.
+        required: whether arriving is a constraint.
+        state: (n,), or (B, n) one per problem, in the place of a position; NaN in components that are free at the end,
+            the same ones in all problems. Models without a position take one, too: the problem has no `goal` then.
 
     Raises:
         InputError: on `Problem(...)`: wrong shapes, values that aren't finite, a radius that isn't above 0, dynamics
-            without a position.
+            without a position; a position and a state, or neither; a state that isn't required, or free as a whole.
     """
 
-    position: Any
-    radius: Any
+    position: Any = None
+    radius: Any = None
+    required: bool = False
+    state: Any = None
     assumed: bool = False  # derived from the cost: the radius is a rule of thumb
 
-    batched: ClassVar[tuple[str, ...]] = ("position", "radius")
+    batched: ClassVar[tuple[str, ...]] = ("position", "radius", "state")
 
-    def bind(self, dims: Dimensions) -> Goal:
-        """The goal with one row per problem; called once, by Problem."""
+    def bind(self, dims: Dimensions) -> Goal | None:
+        """The goal with one row per problem; None where the model has no position; called once, by Problem."""
+        if not isinstance(self.required, bool):
+            raise InputError("goal.required", "True or False", shown(self.required))
+        if self.state is not None:
+            return self._bound_state(dims)
         d = space_of(dims, "goal")
         position = tensor(self.position, "goal.position", dims.like)
         position = position.expand(dims.B, -1) if position.dim() == 1 else position
         check_shape(position, (dims.B, d), "goal.position")
+        if not bool(torch.isfinite(position).all()):
+            raise InputError("goal.position", "finite numbers", "NaN or infinity")
+        return Goal(position.contiguous(), self._bound_radius(dims), self.required)
+
+    def _bound_radius(self, dims: Dimensions) -> Tensor:
         radius = tensor(self.radius, "goal.radius", dims.like)
         radius = radius.expand(dims.B) if radius.dim() == 0 else radius
         check_shape(radius, (dims.B,), "goal.radius")
-        if not bool(torch.isfinite(position).all()):
-            raise InputError("goal.position", "finite numbers", "NaN or infinity")
         if not bool((radius > 0).all() & torch.isfinite(radius).all()):
             raise InputError("goal.radius", "finite numbers above 0 m", float(radius.min()))
-        return Goal(position.contiguous(), radius.contiguous())
+        return radius.contiguous()
+
+    def _bound_state(self, dims: Dimensions) -> Goal | None:
+        if not self.required:
+            raise InputError("goal.state", "a state with required=True; or a position and a radius", "required=False")
+        if self.position is not None and not self._is_bound:
+            raise InputError("goal.position", "none beside a state", shown(self.position))
+        state = tensor(self.state, "goal.state", dims.like)
+        state = state.expand(dims.B, -1) if state.dim() == 1 else state
+        check_shape(state, (dims.B, dims.n), "goal.state")
+        free = torch.isnan(state)
+        if bool(torch.isinf(state).any() | (free != free[:1]).any() | free.all()):
+            raise InputError("goal.state", "finite numbers, NaN in the same components of all problems", state.tolist())
+        if dims.position is None:
+            return None
+        if bool(free[:, dims.position].any()):
+            raise InputError("goal.state", "a position that isn't free", "NaN in it")
+        radius = dims.like.new_full((dims.B,), ADMITTED) if self.radius is None else self._bound_radius(dims)
+        return Goal(state[:, dims.position].contiguous(), radius, True, state.contiguous())
+
+    @property
+    def _is_bound(self) -> bool:
+        """Whether a position stands beside the state because this goal is bound already."""
+        return isinstance(self.position, Tensor) and isinstance(self.state, Tensor) and self.state.dim() == 2
+
+    @property
+    def place(self) -> Tensor | None:
+        """The position (B, d) of a goal that is bound; None before that."""
+        return self.position if isinstance(self.position, Tensor) and self.position.dim() == 2 else None
+
+    def rows(self, dims: Dimensions) -> Constraint:
+        """The constraint of a required goal that `bind` accepts."""
+        if self.state is None:
+            bound = self.bind(dims)
+            assert bound is not None and dims.position is not None
+            at = list(range(dims.n))[dims.position]
+            return GoalBall(("x", at), upper=bound.radius, knots=[dims.N], center=bound.position).bind(dims)
+        state = tensor(self.state, "goal.state", dims.like)
+        return GoalState(state.expand(dims.B, -1) if state.dim() == 1 else state).bind(dims)
 
     @classmethod
     def derived(cls, state: Tensor | None, dims: Dimensions) -> Goal | None:
@@ -62,3 +125,72 @@ class Goal(PerElement):
         """Distances (B, ...) of points p (B, ..., d) from the centre, m."""
         center = self.position.view(-1, *([1] * (p.dim() - 2)), p.shape[-1])
         return (p - center).square().sum(-1).sqrt()
+
+
+@dataclass(frozen=True)
+class GoalBall(NormBounds):
+    """The row of a required goal: the last knot lies in its ball; `violation` in metres."""
+
+    name: ClassVar[str] = "goal"
+    label: ClassVar[str] = "goal"
+
+
+@dataclass(frozen=True)
+class GoalState(Constraint):
+    """The rows x_N - state = 0 of a required goal, of the components that aren't NaN."""
+
+    state: Tensor  # (B, n)
+    components: Tensor | None = None  # (c,) int64, once bound
+    knots: Any = None
+
+    batched: ClassVar[tuple[str, ...]] = ("state",)
+    of: ClassVar[str] = "x"
+    sense: ClassVar[Any] = "equality"
+    name: ClassVar[str] = "goal"
+
+    def bind(self, dims: Dimensions) -> Self:
+        components = (~torch.isnan(self.state[0])).nonzero().flatten()
+        return replace(self, components=components, knots=slice(dims.N, dims.N + 1))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return X[:, self.knots][..., self.components] - self.state[:, self.components].unsqueeze(1)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        at, n = self.components, X.shape[-1]
+        assert at is not None
+        H[:, -1, at, n] += g[:, 0]
+        H[:, -1, n, at] += g[:, 0]
+        H[:, -1, at, at] += h[:, 0]
+
+
+def bound_goal(goal: Goal | None, cost: Cost, dims: Dimensions) -> tuple[Goal | None, Dimensions]:
+    """The goal that was stated, else the one that the cost names, bound; and the dimensions with its position.
+
+    Raises:
+        InputError: see `Goal`.
+    """
+    stated = goal is not None and not goal.assumed
+    bound = goal.bind(dims) if stated else Goal.derived(cost.goal(dims.like), dims)  # type: ignore[union-attr]
+    return bound, dims if bound is None else replace(dims, goal=bound.position)
+
+
+def without_goal(goal: Goal | None, dims: Dimensions, constraints: Sequence[Constraint]) -> Sequence[Constraint]:
+    """Constraints without the rows of a required goal, as they may be those of a problem that is bound.
+
+    A model without a position keeps them where no goal takes their place: its problems have no other memory of it.
+    """
+    if dims.position is None and goal is None:
+        return constraints
+    return [part for part in constraints if not isinstance(part, GoalBall | GoalState)]
+
+
+def with_goal(goal: Goal | None, rows: Sequence[Constraint], dims: Dimensions) -> tuple[Constraint, ...]:
+    """Bound constraints followed by those of a required goal.
+
+    Raises:
+        InputError: see `Goal`.
+    """
+    if goal is None or not goal.required:
+        return tuple(rows)
+    goal.bind(dims)  # which says what is wrong with it
+    return (*rows, goal.rows(dims))

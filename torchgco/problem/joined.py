@@ -51,7 +51,7 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
     return _place(alone(rows, k, *arguments), together(rows, k, *arguments))
 
 
-def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> bool:
+def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor], reads_k: bool) -> bool:
     """Whether rows of one knot (b, ...), or of its samples (b, S, ...), differ from those of all knots (b, K, ...).
 
     Code that takes some of these forms alone is left to those who call it so.
@@ -61,18 +61,20 @@ def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence
         rows: two problems.
         k: the numbers of the knots (K,).
         arguments: (2, K, ...).
+        reads_k: every knot is tried, as a number finds places that a tensor doesn't: those of a dict, for instance.
     """
     several = _tried(function, rows, k, *arguments)
     if several is None or several.shape[:2] != (len(rows), len(k)):
         return False
-    for at in {0, len(k) // 2, len(k) - 1}:
-        one = [z[:, at] for z in arguments]
-        alone = _tried(function, rows, int(k[at]), *one)
-        samples = _tried(function, rows, int(k[at]), *(torch.stack((z, z, z), dim=1) for z in one))
-        for found in (alone, None if samples is None else samples[:, 0]):
-            due = several[:, at]
-            if found is not None and found.shape == due.shape and bool(unlike(found, due).any()):
-                return True
+    some = {0, len(k) // 2, len(k) - 1}
+    for at in range(len(k)) if reads_k else some:
+        one, due = [z[:, at] for z in arguments], several[:, at]
+        forms = [_tried(function, rows, int(k[at]), *one)]
+        if at in some:
+            samples = _tried(function, rows, int(k[at]), *(torch.stack((z, z, z), dim=1) for z in one))
+            forms.append(None if samples is None else samples[:, 0])
+        if any(form is not None and form.shape == due.shape and bool(unlike(form, due).any()) for form in forms):
+            return True
     return False
 
 

@@ -26,9 +26,9 @@ from torchgco.problem.binding import bound
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
 from torchgco.problem.given import Given, place, replaced
-from torchgco.problem.goal import Goal
+from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
 from torchgco.problem.known import Known
-from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
+from torchgco.problem.scale import CostScale, changes_of, cost_scale, reach, savings
 from torchgco.problem.summary import summary
 
 
@@ -41,9 +41,8 @@ class Problem:
         x0: (B, n), fixes batch, device and dtype: float64 or float32. Lists and arrays become a tensor, a single state
             (n,) is a batch of one.
         N: number of stages.
-        goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
-            terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
-            the cost names none.
+        goal: where the last knot should lie, or must: see `Goal`. None: what `Cost.goal` names, if anything, to seek
+            paths to, with 0.09 of the distance from the start as radius, while the cost alone decides.
         horizon: int64 (B,), from 1 to N: the number of stages of each problem, after which time stops for it; its
             terminal cost and rows are those of its own last knot, with references and `knot_values` of that knot, and
             no obstacle counts later. None: all have N. CasADi and missions take none, nor do costs with a `total`.
@@ -84,22 +83,22 @@ class Problem:
         object.__setattr__(self, "dynamics", bound(self.dynamics, dims, "dynamics", Dynamics))
         self._check_dynamics()
         object.__setattr__(self, "cost", bound(self.cost, dims, "cost", Cost))
-        object.__setattr__(self, "constraints", _all_bound(self.constraints, dims))
+        goal, dims = bound_goal(self.goal, self.cost, dims)
+        object.__setattr__(self, "constraints", _all_bound(self.constraints, dims, self.goal))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
-        rows = zip(constraints, self.constraints, strict=True)
+        rows = zip(without_goal(self.goal, dims, constraints), self.constraints, strict=False)  # the goal's row is last
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
         for i, part in enumerate(self.constraints):
             if isinstance(part, Obstacles):
                 warn_of_small(part, f"constraints[{i}]")
-        given = self.goal if self.goal is not None and not self.goal.assumed else None
-        goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "known", Known())
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
         first = 0 if chooses_position(self.free_start, model.position) else 1
-        return Dimensions(x0.shape[0], self.N, self.n, self.m, getattr(model, "dt", None), model.position, x0, first)
+        goal, dt = self.goal and self.goal.place, getattr(model, "dt", None)
+        return Dimensions(len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon)
 
     def __repr__(self) -> str:
         return summary(self)
@@ -188,10 +187,10 @@ class Problem:
         """
         X, U = self.at_rest
         total, goal = self.cost.total(X, U), None if self.goal is None else self.goal.position
-        changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
+        steps = reach(self.dynamics, X, self.control_bounds)
+        changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position, steps)
         changes = torch.maximum(changes, savings(slopes, curvatures))
-        stages = None if self.horizon is None else self.stages
-        return cost_scale(total, curvatures[:, :-1, self.n :], changes, stages, self.control_bounds)
+        return cost_scale(total, curvatures[:, :-1, self.n :], changes, self.horizon, self.control_bounds)
 
     @property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
@@ -315,7 +314,8 @@ class Problem:
             if dynamics is not None:
                 model = bound(dynamics, self._dimensions(x0, dynamics), "dynamics", Dynamics)
             dims = self._dimensions(x0, model)
-            rows = _all_bound(constraints, dims)
+            constraints = without_goal(self.goal, dims, constraints)
+            rows = _all_bound(constraints, dims, self.goal)
             for i, part in enumerate(rows):
                 other = (part.position, part.dt if part.moving else dims.dt) if isinstance(part, Obstacles) else None
                 if other is not None and other != (dims.position, dims.dt):
@@ -325,8 +325,7 @@ class Problem:
                 kinds = ", ".join(type(part).__name__ for part in self.constraints)
                 raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in rows))
             parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, rows), "constraints": rows}
-            if dynamics is not None:
-                parts["dynamics"] = model
+            parts["dynamics"] = model
             if cost is not None:
                 parts["cost"] = bound(cost, dims, "cost", Cost)
                 if self.goal is None or self.goal.assumed:
@@ -334,7 +333,7 @@ class Problem:
             started = self._with(parts)
             given = self.given and self.given.started(self, x0, constraints, cost, dynamics)
             object.__setattr__(started, "given", given)
-            new = [pair for pair in zip(constraints, rows, strict=True) if place(pair[0], self.constraints) is None]
+            new = [pair for pair in zip(constraints, rows, strict=False) if place(pair[0], self.constraints) is None]
             pair = lambda part, name: None if part is None else (part, parts[name])
             check_code(dims, started.x0, pair(dynamics, "dynamics"), pair(cost, "cost"), new)
         return started
@@ -442,8 +441,9 @@ def _check_constraints(constraints: Any) -> None:
         raise InputError("constraints", "one RateBounds at most", rates)
 
 
-def _all_bound(constraints: Sequence[Constraint], dims: Dimensions) -> tuple[Constraint, ...]:
-    return tuple(bound(part, dims, f"constraints[{i}]", Constraint) for i, part in enumerate(constraints))
+def _all_bound(constraints: Sequence[Constraint], dims: Dimensions, goal: Goal | None) -> tuple[Constraint, ...]:
+    stated = enumerate(without_goal(goal, dims, constraints))
+    return with_goal(goal, [bound(part, dims, f"constraints[{i}]", Constraint) for i, part in stated], dims)
 
 
 def _named(part: object) -> str:

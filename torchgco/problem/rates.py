@@ -14,15 +14,17 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.constraints.separation import Separation
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.obstacles.base import Obstacles
+from torchgco.problem.goal import GoalBall
 from torchgco.problem.problem import Problem
 
 # Besides obstacles, which read the position alone: kinds that find their states and controls among others, too.
-IN_PLACE = (ControlBounds, StateBounds, Separation)
+IN_PLACE = (ControlBounds, StateBounds, NormBounds, Cone, Separation, GoalBall)
 FORM = "with controls before"  # what is kept with the form of the problem for this one
 
 

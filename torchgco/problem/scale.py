@@ -9,10 +9,12 @@ from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.costs.base import Cost
+from torchgco.dynamics.base import Dynamics
 
 LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
 LEAST_COST = 1e-9  # share of the cost of staying at the start, as which a cost counts at least
 BOUNDED, UNBOUNDED = 3e-5, 1e-10  # controls that cost nothing: as shares of their bounds, of 1 at most; without bounds
+NARROW = 0.1  # half the range of controls in units that may be too large for a cost to be tried by one of them
 DWARFS = 100.0  # times the rest of the cost: a smaller constant leaves tests relative to the cost meaningful
 
 
@@ -66,15 +68,50 @@ def cost_scale(
     return CostScale(torch.where(usable, unit, 1.0), constant, size)
 
 
-def changes_of(cost: Cost, X: Tensor, U: Tensor, total: Tensor, goal: Tensor | None, position: slice | None) -> Tensor:
+def reach(dynamics: Dynamics, X: Tensor, bounds: ControlBounds | None) -> tuple[Tensor, Tensor]:
+    """How far states and controls go from the start, (B, 1, n) and (B|1, 1, m), at least where a cost is tried.
+
+    By one and by as much as they are; of controls with narrow bounds half their range, and of states then what a
+    rollout at either bound reaches: in small units a cost of one unit's change would hide every other.
+
+    Args:
+        X: states that stay at the start, (B, N+1, n).
+    """
+    far, controls = 1.0 + X[:, :1].abs(), X.new_ones(1, 1, dynamics.m)
+    half = None if bounds is None else 0.5 * bounds.range
+    if half is None or bounds is None or not bool((half < NARROW).any()):
+        return far, controls
+    narrow = (half < NARROW).all(-1).view(-1, 1, 1)
+    places = []
+    for bound in (bounds.lower, bounds.upper):
+        x, u = X[:, 0], bound.flatten(1, -2).amax(1) if bound.dim() == 3 else bound
+        u = torch.where(torch.isfinite(u), u, 0.0).expand(len(x), -1)
+        for k in range(X.shape[1] - 1):
+            x = dynamics.at(k).step(x, u)
+            places.append((x - X[:, 0]).abs())
+    reached = torch.stack(places).nan_to_num(0.0, 0.0, 0.0).amax(0).unsqueeze(1)
+    return torch.where(narrow & (reached > 0), reached, far), torch.where(narrow, half.unsqueeze(1), controls)
+
+
+def changes_of(
+    cost: Cost,
+    X: Tensor,
+    U: Tensor,
+    total: Tensor,
+    goal: Tensor | None,
+    position: slice | None,
+    steps: tuple[Tensor, Tensor],
+) -> Tensor:
     """The largest change (B,) of a cost between X (B, N+1, n), U (B, N, m) and a few other places.
 
-    These are the origin, states and controls larger and smaller by one and by as much as they are, and the goal (B, d).
+    These are the origin, states and controls larger and smaller by `steps`, controls by as much as they are, too, and
+    the goal (B, d).
     """
-    step = 1.0 + X.abs()
+    step, by = steps
     # No two components change alike, so that differences of states change too.
     uneven = 1.0 + 0.3 * torch.arange(X.shape[-1], dtype=X.dtype, device=X.device).cos()
-    places = [(torch.zeros_like(X), U), (X + uneven * step, U + 1.0 + U.abs()), (X - uneven * step, U - 1.0 - U.abs())]
+    move, turn = (uneven * step).expand_as(X), by + U.abs()
+    places = [(torch.zeros_like(X), U), (X + move, U + turn), (X - move, U - turn)]
     if goal is not None and position is not None:
         there = X.clone()
         there[..., position] = goal.unsqueeze(1)

@@ -15,5 +15,6 @@ def summary(problem: Any) -> str:
         places = goal.position.unique(dim=0)
         where = [round(x, 4) for x in places[0].tolist()] if len(places) == 1 else f"{len(places)} places"
         radii = sorted({f"{float(radius):.4g}" for radius in (goal.radius.min(), goal.radius.max())})
-        lines.append(f"  goal={where}, radius {' to '.join(radii)} m")
+        kind = "" if not goal.required else ", a state required" if goal.state is not None else ", required"
+        lines.append(f"  goal={where}, radius {' to '.join(radii)} m{kind}")
     return "\n".join(lines) + ")"

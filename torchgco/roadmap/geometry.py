@@ -90,12 +90,14 @@ class Scene:
     goal: Tensor  # (B, d)
     obstacles: Inflated
     traversal_cost: Callable[[Tensor, Tensor], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
+    gates: Tensor | None = None  # (B, G, d): which paths pass, in this order
 
     def take(self, rows: Tensor) -> Scene:
         """The same of some problems."""
         cost = self.traversal_cost
         obstacles = take(self.obstacles, rows)
-        return Scene(self.start[rows], self.goal[rows], obstacles, lambda points, some: cost(points, rows[some]))
+        gates = None if self.gates is None else self.gates[rows]
+        return Scene(self.start[rows], self.goal[rows], obstacles, lambda points, some: cost(points, rows[some]), gates)
 
 
 def length(path: Tensor) -> Tensor:

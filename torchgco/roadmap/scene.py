@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import LastTaken
+from torchgco.constraints.base import innermost
+from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.costs.base import Cost
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles, Solids
@@ -44,7 +46,15 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
         cost, x0, u, unit = some.take(rows)
         return _resting_cost(cost, x0, u, at, points).clamp(min=0.0) / unit + 0.1
 
-    return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost)
+    gates = gates_of(problem)
+    centers = None if gates is None else gates.centers
+    return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost, centers)
+
+
+def gates_of(problem: Problem) -> GateBalls | GateSquares | None:
+    """The first gates that a trajectory has to pass; None where there are none."""
+    bare = (innermost(part) for part in problem.constraints)
+    return next((part for part in bare if isinstance(part, GateBalls | GateSquares)), None)
 
 
 def has_paths(problem: Problem) -> bool:

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import AtLeast, Count, Extended, Meters, check_options
+from torchgco.base.options import AtLeast, Count, Extended, Meters, check_options, check_value
 from torchgco.base.shapes import check_device
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.maps.field import Field
 from torchgco.obstacles.boxes import Boxes
 from torchgco.obstacles.oscillating import OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
+from torchgco.scenarios.base import Family, Scenario
 from torchgco.scenarios.layouts import SINES, Layouts
 
 STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
@@ -87,6 +89,40 @@ class Vehicle:
                     raise InputError(f"vehicle.{name}", f"{length} numbers", repr(getattr(self, name)))
         for name in LIMITS:
             self.limits(name)
+
+    @classmethod
+    def quadrotor(cls, airframe: Airframe | None = None, **changes: Any) -> Self:
+        """A quadrotor with the paper's weights (Table 1); by default the paper's own.
+
+            vehicle = Vehicle.quadrotor(Airframe(mass=1.2, arm=0.15, thrust_max=4.5, radius=0.3))
+
+        Args:
+            changes: other values of fields, such as state_weight.
+
+        Raises:
+            InputError: as the class.
+        """
+        frame = check_value(Airframe() if airframe is None else airframe, Airframe, "airframe")
+        rest = [0.0] * 3 + [1.0] + [0.0] * 6 + [frame.gravity]  # after the position: v, q, w, a
+        given: dict[str, Any] = {
+            "name": "quadrotor", "dynamics": QuadrotorPlanning(airframe=frame),
+            "state_weight": [1.0, 1, 100, *[1.0] * 7, 10, 10, 10, 10], "control_weight": [10.0, 10, 10, 1],
+            "terminal_weight": [1.0, 1, 10, *[1.0] * 11], "control_reference": [0.0, 0, 0, frame.gravity],
+            "control_lower": [-5.0, -5, -5, None], "control_upper": [5.0, 5, 5, None],  # rad/s
+            "start": [-1.0, 1, 0, *rest], "goal": [20.0, 1, 0.2, *rest],
+            "radius": frame.radius, "goal_radius": 2.0, "stages": 100,
+        }  # fmt: skip
+        return cls(**(given | changes))
+
+    def among(self, scenario: Scenario, ids: Iterable[int], seed: int = 0, **where: Any) -> Task:
+        """The problems of this vehicle, with its own radius, on layouts of a scenario; `where` as of `task`.
+
+        Raises:
+            InputError: as `task`.
+        """
+        if isinstance(scenario, Family):
+            scenario = replace(scenario, vehicle_radius=self.radius)
+        return self.task(self.at_rest(scenario.draw(list(ids), seed)), **where)
 
     @property
     def dimension(self) -> int:

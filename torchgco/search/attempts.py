@@ -13,7 +13,7 @@ from torchgco.base.status import STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import chord_clearance
 from torchgco.lagrangian.penalties import Penalty
-from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.lagrangian.quality import has_arrived, is_preferred, leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
@@ -102,7 +102,7 @@ class Best:
         """Remember those of two trajectories that lose by their cost alone to one that touches between two knots."""
         limit = self.solver.violation_tolerance
         fits = (old.best.violation <= limit) & (new.best.violation <= limit)
-        fits &= has_arrived(problem, old.best.X) == has_arrived(problem, new.best.X)
+        fits &= ~leaves_goal(problem, new.best.X, old.best.X) & ~leaves_goal(problem, old.best.X, new.best.X)
         if not bool(fits.any()):
             return
         before, now = (chord_clearance(problem, end.best.X) >= 0 for end in (old, new))

@@ -17,7 +17,7 @@ from torchgco.base.options import Count, check_options
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.kernels import chord_clearance, measured
-from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.quality import leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
@@ -136,4 +136,4 @@ def serving(
     found = replace(new, violation=measured(problem, new.X, new.U))
     clearance = chord_clearance(problem, found.X)
     serves = (found.violation <= limit) & (clearance > least)
-    return serves & (has_arrived(problem, found.X) | ~has_arrived(problem, old.X)), found, clearance
+    return serves & ~leaves_goal(problem, found.X, old.X), found, clearance

@@ -12,7 +12,7 @@ from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.kernels import chord_clearance
-from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.lagrangian.quality import is_preferred, leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.maps.field import BoundField
 from torchgco.problem.problem import Problem
@@ -120,7 +120,7 @@ class Converge(Row):
         """
         problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
         old, new = take(search.best.end.best, rows), end.best
-        arrives = has_arrived(problem, new.X) | ~has_arrived(problem, old.X)
+        arrives = ~leaves_goal(problem, new.X, old.X)
         near = new.cost <= old.cost + WORTH * old.cost.abs()
         serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
         clear = ~(chord_clearance(problem, new.X) < chord_clearance(problem, old.X).clamp(max=0.0))

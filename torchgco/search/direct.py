@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchgco.base.options import Natural, NonNegative, check_options
 from torchgco.base.tree import take
-from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
@@ -99,8 +99,10 @@ class Direct(Row):
 
     def _compared(self, search: Search, rows: Tensor, call: Call, end: SolveEnd, bound: Tensor) -> Tensor:
         """Keep results of `rows` that are hardly dearer than a bound (b,); places (b',) of the others, which wait."""
-        arrives = (end.best.violation <= search.solver.violation_tolerance) & has_arrived(call.problem, end.best.X)
-        quick = arrives & (end.best.cost <= bound + self.gap * bound.abs())
+        serves = end.best.violation <= search.solver.violation_tolerance
+        if ranks_arrival(call.problem):
+            serves &= has_arrived(call.problem, end.best.X)
+        quick = serves & (end.best.cost <= bound + self.gap * bound.abs())
         enough, left = quick.nonzero().flatten(), (~quick).nonzero().flatten()
         search.best.keep(rows[enough], take(end, enough))
         search.best.end.iterations[rows[left]] += end.iterations[left]  # now, and not once more at the end

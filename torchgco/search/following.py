@@ -13,13 +13,17 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Below, Count, NonNegative, Positive, check_options
 from torchgco.base.shapes import check_shape, tensor
 from torchgco.base.tree import take
+from torchgco.constraints.base import innermost
 from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
 from torchgco.obstacles.base import Obstacles
+from torchgco.problem.goal import GoalBall
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Inflated, length, points_along
+from torchgco.roadmap.legs import timed
 from torchgco.search.candidates import Candidates, inner_solver
 from torchgco.search.nearby import without_obstacles
 from torchgco.solvers.ilqr import descend
@@ -31,6 +35,10 @@ SHORTEST = 0.05  # share of the horizon between departure and arrival
 LAST_PART = 0.1  # of the distance to the goal: the last part is approached slowly
 CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
 DEPTH_POINTS = 64  # points of a path at which its depth is measured, about
+
+
+# Constraints that say where to be, not how fast.
+AT_PLACES = (Obstacles, ControlBounds, GoalBall, GateBalls, GateSquares)
 
 
 class Free(NamedTuple):
@@ -188,6 +196,11 @@ class Follow:
     def _centers(self, path: Tensor, arrive: Tensor, problem: Problem, paths: Paths) -> Tensor:
         """Where the candidates are at every knot, (B K, N+1, d): along each path within the horizon of its problem."""
         N, each = problem.N, path.shape[0] // max(1, problem.B)
+        gates = seen.gates_of(problem)
+        if gates is not None:  # which say when
+            assert gates.places is not None
+            places, stages = (part.repeat_interleave(each, dim=0) for part in (gates.places, problem.stages))
+            return timed(path, places, stages, N)
         center = path[:, -1:].repeat(1, N + 1, 1)
         for horizon in problem.stages.unique().tolist():
             rows = (problem.stages == horizon).nonzero().flatten()
@@ -214,7 +227,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor)
 
 def limits_states(problem: Problem) -> bool:
     """Whether rows besides obstacles and control bounds may limit how fast a vehicle is."""
-    others = (part for part in problem.constraints if not isinstance(part, Obstacles | ControlBounds))
+    others = (part for part in problem.constraints if not isinstance(innermost(part), AT_PLACES))
     return any(part.sense == "inequality" for part in others)
 
 

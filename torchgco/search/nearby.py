@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.scene import gates_of
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
@@ -140,10 +142,14 @@ def _on_the_way(problem: Problem, solids: Solids) -> Tensor | None:
     if problem.goal is None:
         return None
     start, goal = problem.x0[:, problem.position], problem.goal.position
-    straight = (goal - start).square().sum(-1).sqrt().unsqueeze(-1)
-    reach = solids.extent.square().sum(-1).sqrt() + solids.radii
-    way = sum((solids.centers - end.unsqueeze(1)).square().sum(-1).sqrt() - reach for end in (start, goal))
-    return ~solids.absent & (way <= DETOUR * straight)
+    gates = gates_of(problem)
+    stops = [start, *([] if gates is None else gates.centers.unbind(1)), goal]
+    reach, near = solids.extent.square().sum(-1).sqrt() + solids.radii, torch.zeros_like(solids.absent)
+    for leg in pairwise(stops):
+        straight = (leg[1] - leg[0]).square().sum(-1).sqrt().unsqueeze(-1)
+        way = sum((solids.centers - end.unsqueeze(1)).square().sum(-1).sqrt() - reach for end in leg)
+        near |= way <= DETOUR * straight
+    return ~solids.absent & near
 
 
 def _beside(p: Tensor, solids: Solids) -> Tensor:

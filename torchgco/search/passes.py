@@ -141,7 +141,10 @@ class IntoGoal(Row):
         """Solve; see the class."""
         if self.among == "pathless" and search.has_paths:
             return
-        rows, best = search.rows("close"), search.best
+        goal, best = search.call.problem.goal, search.best
+        if goal is not None and goal.required:  # its rows attract all attempts
+            return
+        rows = search.rows("close")
         start = take(best.end.best, rows)
         if rows.numel() > 0:
             call = replace(search.call.take(rows), U0=start.U, warm=start.multipliers)

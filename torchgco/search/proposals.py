@@ -29,6 +29,7 @@ from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.homotopy import classes
 from torchgco.roadmap.known import Known
+from torchgco.roadmap.legs import paths_through
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
 from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
@@ -264,7 +265,7 @@ class Part:
         for number, roadmap in enumerate(roadmaps):
             if any(roadmap.repeats(other, self.scene) for other in roadmaps[:number]):
                 continue
-            corners, arrives = roadmap.paths(self.scene, count, rows, self.known)
+            corners, arrives = paths_through(roadmap, self.scene, count, rows, self.known)
             known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, count)))
             found = found | (arrives & usable)
         corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))

@@ -52,7 +52,7 @@ def pursue(search: Search, rows: Tensor) -> None:
     problem = search.call.problem.take(rows)
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
     part = Part(problem.in_cost_units(), rest, search.call.rows[rows], search.record)
-    if part.scene is None:
+    if part.scene is None or part.scene.gates is not None:  # to which these ways don't lead
         return
     found = [_driven(part, b) for b in range(problem.B)]
     if not any(ways for ways, _ in found):

@@ -111,7 +111,9 @@ class Tube(Row):
             return
         search.best.worked[rows] = True
         every = torch.arange(problem.B, device=rows.device)
-        paths = part.seek(every, (ROADMAP,), self.num_paths).joined(*ROADMAP.clear_path(part.scene))
+        paths = part.seek(every, (ROADMAP,), self.num_paths)
+        if part.scene.gates is None:
+            paths = paths.joined(*ROADMAP.clear_path(part.scene))
         starts, usable = _starts(problem, rest)
         live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(PACES, dim=1)
         starts = starts.repeat_interleave(PACES, dim=1).repeat(1, paths.corners.shape[1], 1, 1)

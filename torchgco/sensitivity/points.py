@@ -18,7 +18,7 @@ from torchgco.base.status import SOLVED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import chord_clearance, cost_unit, interior_of, measured
 from torchgco.lagrangian.kkt import KktSolve, RightSides
-from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.quality import leaves_goal
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
@@ -109,7 +109,7 @@ def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, re
     new = Session(call, RAW).trajectories(end)
     stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STAYS
     stays &= ~(chord_clearance(part, new.X) < chord_clearance(part, old.X).clamp(max=0.0))
-    leaves = (stays | (end.status == SOLVED)) & has_arrived(part, old.X) & ~has_arrived(part, new.X)
+    leaves = (stays | (end.status == SOLVED)) & leaves_goal(part, new.X, old.X)
     why = torch.where(stays, int(Why.DIFFERENTIABLE), int(Why.MOVED))
     reason[rows] = torch.where(leaves, int(Why.LEAVES_GOAL), why)
     kept = (reason[rows] == Why.DIFFERENTIABLE).nonzero().flatten()

@@ -111,7 +111,7 @@ class AugmentedLagrangian(Solver):
 
         Args:
             guide_first: also call guidance before the first inner solve.
-            by_arrival: an iterate that has arrived at the goal is preferred to any that hasn't.
+            by_arrival: an iterate that has arrived at a stated goal is preferred to any that hasn't.
         """
         loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
         B = call.problem.B

@@ -16,6 +16,7 @@ from torchgco.kernels import kernels_of, reproducible
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.problem.covered import covered_goals
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import Optimality, final_status, optimality
@@ -23,6 +24,8 @@ from torchgco.solvers.history import Recorder
 from torchgco.solvers.rules import Rules
 from torchgco.solvers.unbounded import falls_without_end
 
+# Where a required goal is covered by an obstacle, the reason is known; these say only how the solve came to its end.
+GAVE_UP = int(Status.MAX_ITERATIONS), int(Status.LINE_SEARCH_FAILED), int(Status.NOT_POSITIVE_DEFINITE)
 UNLIKE = 1e-6  # difference of two rollouts' steps, as a share of the largest state, that no rounding explains
 
 
@@ -73,6 +76,7 @@ class Session:
         ended = torch.where(finite | (ended == Status.INVALID_START), ended, int(Status.NON_FINITE))
         status = final_status(ended, left, found.violation, tolerance, constrained)
         user = self.given.problem
+        status[torch.isin(status, status.new_tensor(GAVE_UP)) & covered_goals(user)] = Status.INFEASIBLE
         falls = falls_without_end(user, self.given.U0, found, left, tolerance)
         status[falls] = Status.UNBOUNDED
         return Solution(

@@ -25,7 +25,8 @@ from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import plain
 from torchgco.kernels import use_native
-from torchgco.missions import Mission, RotorPlant
+from torchgco.missions import Mission
+from torchgco.missions.plant import Plant, flown
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.solvers.memory import least_bytes
@@ -159,7 +160,7 @@ def build(config: DictConfig) -> Setup:
     device, dtype = _device(config.device)
     setup = Setup(
         config=config,
-        vehicle=_instantiate(config.model.vehicle, "model.vehicle"),
+        vehicle=_vehicle(config),
         scenario=_instantiate(config.scenario, "scenario"),
         solver=solver_of(config),
         solver_name=config.solver.name,
@@ -179,6 +180,17 @@ def build(config: DictConfig) -> Setup:
             wanted += f", or scenario={' or '.join(others)}"
         raise InputError("model", wanted, f"model={setup.vehicle.name}")
     return setup
+
+
+def _vehicle(config: DictConfig) -> Vehicle:
+    """The model; mistakes in its airframe have the names that a command has for it."""
+    try:
+        return _instantiate(config.model.vehicle, "model.vehicle")
+    except InputError as error:
+        part, _, name = error.field.partition(".")
+        if part != "airframe" or config.get("vehicle") is None:
+            raise
+        raise InputError(f"vehicle.{name}", error.expected, error.got) from None
 
 
 def _gigabytes(count: float) -> str:
@@ -209,8 +221,8 @@ def _mission(setup: Setup) -> Mission | None:
 
 
 def _closed_loop(made: Any, plant: Any, solver: Any, vehicle: Vehicle) -> Mission:
-    if isinstance(plant, RotorPlant) and isinstance(vehicle.dynamics, QuadrotorPlanning):
-        plant = replace(plant, airframe=vehicle.dynamics.airframe)  # said once, in the model
+    if isinstance(plant, Plant) and isinstance(vehicle.dynamics, QuadrotorPlanning):
+        plant = flown(plant, vehicle.dynamics.airframe)  # said once, in the model
     if not isinstance(made, partial) or "planner" not in made.keywords:
         raise InputError(
             "mission", "keys that extend those of mission=default", "a node without its _target_ or planner"

@@ -19,6 +19,7 @@ from torchgco.experiments.results.identity import CLOSED_LOOP
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
 MODEL = ("dimension", "vehicle")
+VEHICLE = "vehicle"  # the group of airframes that the model of a quadrotor brings along
 NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
 PATHS = ("scenario.path", "hydra.run.dir", "hydra.sweep.dir")  # keys whose values are paths, of any letters
 
@@ -93,7 +94,7 @@ def check(config: Mapping[str, Any]) -> None:
     groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
     own = [key for key in base if key not in ("defaults", "hydra")]
     needed = [*own, *(key for key, option in groups.items() if option is not None)]
-    _keys(config, "", needed, [*own, *groups])
+    _keys(config, "", needed, [*own, *groups, VEHICLE])
     device: Any = OmegaConf.load(conf / "device" / f"{groups['device']}.yaml")
     for name, known in (("study", base["study"]), ("device", device), ("model", MODEL)):
         _keys(config[name], name, list(known), list(known))
@@ -188,6 +189,10 @@ def _unknown_key(error: BaseException, key: str) -> InputError:
     name, parent = key.rpartition(".")[2], found.parent_node if hasattr(found, "parent_node") else None
     if key in CLOSED_LOOP:
         return InputError(key, "experiment=mission, as its keys are given", "none")
+    if key.split(".")[0] == VEHICLE and not (isinstance(parent, DictConfig) and "mass" in parent):
+        return InputError(key, "model=quadrotor, whose airframe this is", "another model")
+    if key.startswith("model.vehicle.dynamics.airframe."):
+        return InputError(key, f"{VEHICLE}.{name}, as airframes have a group of their own", name)
     known = [str(other) for other in parent] if isinstance(parent, DictConfig) else []
     near = get_close_matches(name, known, n=1)
     return InputError(key, "a key that the configuration has" + "".join(f", such as {other}" for other in near), name)

@@ -22,6 +22,7 @@ from hydra.core.object_type import ObjectType
 from omegaconf import OmegaConf
 
 from torchgco.base.version import PACKAGE
+from torchgco.dynamics import Airframe
 from torchgco.missions import Disturbance, Mission, Planner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
 from torchgco.scenarios import (
@@ -41,6 +42,7 @@ from torchgco.scenarios import (
     Woods,
     Yard,
 )
+from torchgco.scenarios.quadrotor import STATES
 from torchgco.scenarios.vehicle import BUILT_IN
 from torchgco.search import Passes
 
@@ -109,6 +111,7 @@ def register() -> None:
     register_resolver(BY_DIMENSION, lambda dimension, plane, space: space if dimension == 3 else plane)
     register_resolver("torchgco.drawn", _drawn)
     register_resolver("torchgco.options", _help)
+    register_resolver("torchgco.radius", _radius)
     # Hydra copies the whole store for each composition, 40 % of its time, and copies again what it takes from it.
     setattr(ConfigStore, "__deepcopy__", lambda store, memo: store)  # noqa: B010
     _store("scenario", "layouts", _fields_of(LayoutFile))
@@ -116,10 +119,11 @@ def register() -> None:
     for family in FAMILIES:
         made = family()
         picked = {"defaults": [{"override /model@_global_.model": _model_of(made)}, "_self_"]}
-        _store("scenario", made.name, picked | _fields_of(family))
+        _store("scenario", made.name, picked | _fields_of(family) | _sizes(made))
     for name, make in PRESETS.items():
         trees = _tree(make(2)), _tree(make(3))
         _store("solver", name, {"name": name} | _joined(*trees), *trees)
+    _store("vehicle", "paper", _fields_of(Airframe))
     _store("plant", "rotors", _fields_of(RotorPlant, *ALIKE))
     planner = {"_partial_": True} | _fields_of(Planner, "solver", *ALIKE)  # its solver is the one under study
     parts = {"planner": planner, "tracker": _fields_of(Tracker, *ALIKE), "disturbance": _fields_of(Disturbance)}
@@ -130,7 +134,8 @@ def classes_of(group: str) -> frozenset[type]:
     """The classes that the options of a group make, parts included: registered options and files of conf/."""
     trees = [OmegaConf.to_container(OmegaConf.load(path)) for path in (config_dir() / group).glob("*.yaml")]
     named = {*_targets.get(group, ()), *(target for tree in trees for target in _named(tree))}
-    return frozenset(hydra.utils.get_class(target) for target in named)
+    parts = classes_of("vehicle") if group == "model" else ()  # a model holds the airframe that is chosen there
+    return frozenset(hydra.utils.get_class(target) for target in named) | frozenset(parts)
 
 
 def _named(tree: Any) -> Iterator[str]:
@@ -196,6 +201,18 @@ def _literal(value: Any) -> str:
     if isinstance(value, dict):
         return f"{{{','.join(f'{key}:{_literal(held)}' for key, held in value.items())}}}"
     return f"[{','.join(map(_literal, value))}]" if isinstance(value, list) else json.dumps(value)
+
+
+def _sizes(made: Any) -> dict[str, Any]:
+    """Lengths of a family that are the vehicle's, where a command has chosen one."""
+    return {"vehicle_radius": f"${{torchgco.radius:{made.vehicle_radius}}}"} if made.states == STATES else {}
+
+
+def _radius(usual: float, _root_: Any) -> float:
+    """The radius of the vehicle, m; a family's usual one for the paper's, and for models that have no such group."""
+    vehicle = _root_.get("vehicle")
+    own = vehicle.get("radius") if OmegaConf.is_dict(vehicle) else None
+    return usual if own is None or own == Airframe().radius else own
 
 
 def _help(_root_: Any) -> str:

@@ -105,11 +105,21 @@ class Exploration:
             return Known(world)
         return Unaware() if self.explorer.movers == "none" else Tracks(self.sensor.pitch)
 
-    def take(self, stay: Tensor) -> None:
-        """Keep the missions in `stay`."""
-        self.scouts = [self.scouts[b] for b in stay.tolist()]
-        self.ids = [self.ids[b] for b in stay.tolist()]
-        self.whole, self.radius = self.whole.take(stay), self.radius[stay]
+    @property
+    def knots(self) -> int:
+        """Of a plan, N+1."""
+        return self.explorer.stages + 1
+
+    @property
+    def seen(self) -> list[SeenLog]:
+        """What each vehicle sees."""
+        return [scout.log for scout in self.scouts]
+
+    def take(self, index: Tensor) -> None:
+        """Keep the missions in `index`."""
+        self.scouts = [self.scouts[b] for b in index.tolist()]
+        self.ids = [self.ids[b] for b in index.tolist()]
+        self.whole, self.radius = self.whole.take(index), self.radius[index]
 
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
         """Scan at a control step from plants x (B, 17), and put that into the maps where the vehicles believe to be."""
@@ -132,8 +142,8 @@ class Exploration:
             scout.changed = scout.changed[:0]
             scout.seconds = dict(zip(PARTS, (*took, 0.0), strict=True))
 
-    def plan(self, step: int, x: Tensor, before: Plan | None) -> tuple[Plan, float]:
-        """Plans from measured plants x (B, 17), and the seconds that they took, those of the maps among them."""
+    def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
+        """Plans from plants measured at x (B, 17), and the seconds that they took, those of the maps among them."""
         began = time.perf_counter()
         sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
         bias = self.planner.estimated(x, before, self.dt)

@@ -18,6 +18,12 @@ static inline void note(const Lanes *s, const Constraint *con, V c, V violated, 
     *pushed |= *lam != zero;
 }
 
+/* By how much |v| is beyond r, where c = s (|v|^2 - r^2) / (2 r) is at least 0; `radius` is s r. */
+static inline V past_radius(V c, V radius) {
+    V square = SET(1.0) + (c + c) / radius; /* (|v| / r)^2 */
+    return (c + c) / (SET(1.0) + tgco_sqrt(tgco_choose(square < SET(0.0), SET(0.0), square)));
+}
+
 /* Rows of one knot of a constraint. */
 static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sweep *sweep) {
     const Constraint *con = s->of->constraint + i;
@@ -65,6 +71,7 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
         model_rows((int)i, x, u, at(rows->bound, &con->bound, place), con->shared, c);
         for (int j = 0; j < con->rows; j++) {
             V violated = con->equality ? tgco_fabs(c[j]) : tgco_choose(c[j] < zero, zero, c[j]);
+            if (con->radii.data) violated = past_radius(violated, at(rows->radii, &con->radii, place)[j]);
             note(s, con, c[j], violated, lam + j, &pushed, sweep);
         }
     }

@@ -1,0 +1,108 @@
+"""What a loop flies: trajectories of several vehicles with feedback, sampled at any time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import computing_on
+from torchgco.compiled.numbers import as_floats
+from torchgco.constraints.bounds import ControlBounds
+from torchgco.dynamics.base import Dynamics
+from torchgco.problem.between import between
+
+CPU = torch.device("cpu")
+ROUNDING = 1e-9  # of a stage: a time this close before a knot is the knot's
+
+
+class Instant(NamedTuple):
+    """A plan at one time."""
+
+    x: Tensor  # (B, n)
+    u: Tensor  # (B, m)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Trajectories with feedback u = U + K (x - X), each from a time of its own on.
+
+    Args:
+        X, U, K: (B, N+1, n), (B, N, m), (B, N, m, n).
+        start: times of the first knots (B,), s.
+        dt: of a stage, s.
+        dynamics: lead from knot to knot.
+        bounds: that controls with feedback keep; None: none.
+    """
+
+    X: Tensor
+    U: Tensor
+    K: Tensor
+    start: np.ndarray
+    dt: float
+    dynamics: Dynamics
+    bounds: ControlBounds | None
+
+    @property
+    def t(self) -> Tensor:
+        """Times of the knots, (B, N+1), s."""
+        return torch.from_numpy(self.start[:, None] + self.dt * np.arange(self.X.shape[1]))
+
+    @property
+    def end(self) -> Tensor:
+        """Times of the last knots, (B,), s."""
+        return self.t[:, -1]
+
+    def at(self, t: float, x: Any = None) -> Instant:
+        """States (B, n) and controls (B, m) at a time, s.
+
+        Controls are those of their stage, states are integrated from the knot before (`problem.between`). Before its
+        start a plan is at its first knot; after its end at its last one, with its last control.
+
+        Args:
+            x: states (B, n), or (n,) of one vehicle, that are measured then: controls get the feedback on the
+                difference from the plan, within the bounds of controls.
+
+        Raises:
+            InputError: a time or states that are no finite numbers, or states of another shape.
+        """
+        if isinstance(t, bool) or not isinstance(t, int | float) or not np.isfinite(t):
+            raise InputError("t", "a time in seconds", shown(t))
+        with computing_on(CPU):
+            return self._at(t, None if x is None else self._states(x))
+
+    def _at(self, t: float, given: Tensor | None) -> Instant:
+        B, N, m = self.U.shape
+        stages = np.clip((t - self.start) / self.dt, 0.0, N)
+        k = np.minimum(np.floor(stages + ROUNDING), N - 1).astype(int)
+        share = np.clip(stages - k, 0.0, 1.0)
+        share[share < ROUNDING] = 0.0
+        states, rows = self._states_at(k, share), torch.arange(B)
+        u = self.U[rows, k].clone()
+        if given is not None:
+            u += (self.K[rows, k] @ (given - states).unsqueeze(-1)).squeeze(-1)
+            if self.bounds is not None:
+                lower, upper = (bound.expand(B, N, m)[rows, k] for bound in self.bounds.over(N))
+                u = torch.minimum(torch.maximum(u, lower), upper)
+        return Instant(states, u)
+
+    def _states(self, x: Any) -> Tensor:
+        B, _, n = self.X.shape
+        given = as_floats(x, "x")
+        if given.shape not in ((B, n), (n,)) or not np.isfinite(given).all():
+            raise InputError("x", f"finite states ({B}, {n})", shown(given.shape))
+        return torch.from_numpy(given).expand(B, n)
+
+    def _states_at(self, k: np.ndarray, share: np.ndarray) -> Tensor:
+        """The states (B, n) after shares (B,) of the stages k (B,)."""
+        states = self.X[torch.arange(len(k)), k].clone()
+        for stage, part in sorted(set(zip(k.tolist(), share.tolist(), strict=True))):
+            if part > 0:
+                at = torch.tensor([stage]), self.X.new_tensor([part * self.dt]), self.X.new_tensor([self.dt])
+                rows = torch.from_numpy((k == stage) & (share == part))
+                states[rows] = between(self.dynamics, self.X, self.U, *at)[rows, 0]
+        return states

@@ -1,0 +1,229 @@
+"""Gates that a trajectory passes in their order: balls, or squares that are crossed in one direction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.constraints.base import Constraint, whole
+from torchgco.constraints.norms import AWAY, NormBounds
+from torchgco.costs.base import add_blocks
+
+
+@dataclass(frozen=True)
+class Gates(Constraint):
+    """The position passes each gate, in their order, at a knot of its own.
+
+        rings = Gates([[2.0, 0, 1], [4, 1, 1]], radius=0.3)
+        frames = Gates([[2.0, 0, 1], [4, 1, 1]], normals=[[1.0, 0, 0], [0, 1, 0]], half_widths=0.2)
+
+    A ball is a row |p - center| <= radius at its knot. A square is crossed from behind to ahead of its normal between
+    its knot and the next: at both the position is inside the prism over the square, before the plane at the first and
+    beyond it at the second, so that the straight line between them crosses the square itself. The search for paths
+    leads through the gates leg by leg.
+
+    Args:
+        centers: (G, d), or (B, G, d) one row of gates per problem, m.
+        radius: of balls, m: a number, (G,) or (B, G). None where there are squares.
+        normals: of squares, (G, d) or (B, G, d), of any length above 0. In space two sides of a square are level, or
+            parallel to the y axis where it lies flat.
+        half_widths: of squares, m, as `radius`: half the length of a side.
+        knots: (G,) or (B, G) whole numbers that rise, within 1..N; of squares they rise by 2, to N - 1. None: by arc
+            length along the straight lines from the start through all gates to the goal, or to the last gate where none
+            is known, slowly at both ends.
+
+    Raises:
+        InputError: on `Problem(...)`: no position, shapes that don't fit, numbers that aren't finite, sizes of 0 or
+            less, neither balls nor squares or both, more gates than knots, two gates at one knot, knots in another
+            order or beyond a horizon.
+    """
+
+    centers: Any
+    radius: Any = None
+    normals: Any = None
+    half_widths: Any = None
+    knots: Any = None
+
+    def bind(self, dims: Dimensions) -> GateBalls | GateSquares:  # type: ignore[override]
+        d = space_of(dims, "gates")
+        centers = _each(self.centers, "gates.centers", dims, (d,))
+        G = centers.shape[1]
+        if (self.radius is None) == (self.normals is None):
+            raise InputError("gates.radius", "a radius, or normals and half_widths", "both" if self.normals else "none")
+        if (self.normals is None) != (self.half_widths is None):
+            raise InputError("gates.half_widths", "half widths where there are normals", shown(self.half_widths))
+        gap = 1 if self.normals is None else 2
+        last = dims.N + 1 - gap
+        ends = torch.full((dims.B,), last) if dims.horizon is None else dims.horizon.cpu() + 1 - gap
+        if bool((1 + gap * (G - 1) > ends).any()):
+            raise InputError("gates.centers", f"at most {(int(ends.min()) - 1) // gap + 1} gates in N = {dims.N}", G)
+        given = self.knots
+        places = _by_length(centers, dims, gap, ends) if given is None else _given(given, dims, G, gap, ends)
+        at = list(range(dims.n))[dims.position]  # type: ignore[index]
+        if self.normals is None:
+            radius = _sizes(self.radius, "gates.radius", dims, G)
+            return _balls(at, centers, radius, places, dims)
+        normals = _each(self.normals, "gates.normals", dims, (d,), G)
+        if not bool((normals.norm(dim=-1) > 0).all()):
+            raise InputError("gates.normals", "vectors other than 0", normals.tolist())
+        half = _sizes(self.half_widths, "gates.half_widths", dims, G)
+        squares = GateSquares(centers, _axes(normals), half, places, torch.tensor(at, device=centers.device))
+        return squares.bind(dims)
+
+
+@dataclass(frozen=True)
+class GateBalls(NormBounds):
+    """Gates that are balls, bound: at the other knots from 1 to N there is no bound."""
+
+    places: Tensor | None = field(default=None, kw_only=True)  # (B, G) int64: their knots
+
+    per_element: ClassVar[tuple[str, ...]] = ("lower", "upper", "center", "places")
+    name: ClassVar[str] = "gates"
+    label: ClassVar[str] = "gates"
+
+    @property
+    def centers(self) -> Tensor:
+        """(B, G, d), m."""
+        assert self.places is not None
+        return self.center.gather(1, (self.places - 1).unsqueeze(-1).expand(-1, -1, self.center.shape[-1]))
+
+    @property
+    def sizes(self) -> Tensor:
+        """Their radii (B, G), m."""
+        assert self.places is not None
+        return self.upper.gather(1, self.places - 1)
+
+
+@dataclass(frozen=True)
+class GateSquares(Constraint):
+    """Gates that are squares, bound: rows A p - b <= 0, per knot those before a plane, or beyond one."""
+
+    centers: Tensor  # (B, G, d), m
+    axes: Tensor  # (B, G, d, d): normal, then the directions of the sides, as rows
+    half_widths: Tensor  # (B, G), m
+    places: Tensor  # (B, G) int64: the knots before the planes
+    components: Tensor  # (d,) int64: the position's states
+    slopes: Tensor | None = field(default=None, repr=False)  # (B, N, p, d), once bound
+    limits: Tensor | None = field(default=None, repr=False)  # (B, N, p)
+    knots: Any = None
+
+    batched: ClassVar[tuple[str, ...]] = ("centers", "axes", "half_widths", "places", "slopes", "limits")
+    of: ClassVar[str] = "x"
+    name: ClassVar[str] = "gates"
+
+    @property
+    def sizes(self) -> Tensor:
+        return self.half_widths
+
+    def bind(self, dims: Dimensions) -> Self:
+        B, G, d = self.centers.shape
+        p, normal, sides = 2 * d - 1, self.axes[:, :, :1], self.axes[:, :, 1:]
+        slopes = self.centers.new_zeros(B, dims.N, p, d)
+        limits = torch.full_like(slopes[..., 0], -AWAY)  # 0 - 1: no row
+        each = torch.arange(B, device=self.centers.device).unsqueeze(-1)
+        for beyond, sign in ((0, 1.0), (1, -1.0)):
+            rows = torch.cat((sign * normal, sides, -sides), dim=2)  # (B, G, p, d)
+            room = torch.cat((torch.zeros_like(self.half_widths.unsqueeze(-1)),
+                self.half_widths.unsqueeze(-1).expand(B, G, p - 1)), dim=-1)  # fmt: skip
+            at = each, self.places - 1 + beyond
+            slopes[at], limits[at] = rows, room + (rows @ self.centers.unsqueeze(-1))[..., 0]
+        return replace(self, slopes=slopes, limits=limits, knots=slice(1, dims.N + 1))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        p = X[:, self.knots][..., self.components]
+        assert self.slopes is not None and self.limits is not None
+        return (self.slopes * p.unsqueeze(-2)).sum(-1) - self.limits
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        J = X.new_zeros(*g.shape, X.shape[-1])
+        assert self.slopes is not None
+        J[..., self.components] = self.slopes
+        add = H.new_zeros(*g.shape[:2], *H.shape[2:])
+        add_blocks(add, X.shape[-1], (g.unsqueeze(-2) @ J).squeeze(-2), None, J.mT @ (h.unsqueeze(-1) * J), None)
+        H[:, self.knots] += add
+
+
+def _balls(at: list[int], centers: Tensor, radius: Tensor, places: Tensor, dims: Dimensions) -> GateBalls:
+    """Balls as bounds on norms, with a centre and a radius at their own knots; an infinite one elsewhere."""
+    each = torch.arange(dims.B, device=centers.device).unsqueeze(-1)
+    middles = centers.new_zeros(dims.B, dims.N, centers.shape[-1])
+    upper = centers.new_full((dims.B, dims.N), torch.inf)
+    middles[each, places - 1], upper[each, places - 1] = centers, radius
+    return GateBalls(("x", at), None, upper, slice(1, dims.N + 1), middles, places=places).bind(dims)
+
+
+def _axes(normals: Tensor) -> Tensor:
+    """Unit normals, then the directions of the sides, as rows (B, G, d, d), for normals (B, G, d)."""
+    n = normals / normals.norm(dim=-1, keepdim=True)
+    if n.shape[-1] == 2:
+        return torch.stack((n, torch.stack((-n[..., 1], n[..., 0]), dim=-1)), dim=-2)
+    flat = n[..., :2].norm(dim=-1, keepdim=True) < 1e-6
+    z, y = torch.zeros_like(n), torch.zeros_like(n)
+    z[..., 2], y[..., 1] = 1.0, 1.0
+    level = torch.where(flat, y, torch.linalg.cross(z, n, dim=-1))
+    level = level / level.norm(dim=-1, keepdim=True)
+    return torch.stack((n, level, torch.linalg.cross(n, level, dim=-1)), dim=-2)
+
+
+def _each(value: Any, name: str, dims: Dimensions, size: tuple[int, ...], G: int | None = None) -> Tensor:
+    """Vectors (B, G, d): given so, or as (G, d) for all problems."""
+    found = tensor(value, name, dims.like)
+    found = found.expand(dims.B, *found.shape) if found.dim() == 2 else found
+    check_shape(found, (dims.B, "G" if G is None else G, *size), name)
+    if found.shape[1] == 0 or not bool(torch.isfinite(found).all()):
+        raise InputError(name, "one gate at least, of finite numbers", found.tolist())
+    return found.contiguous()
+
+
+def _sizes(value: Any, name: str, dims: Dimensions, G: int) -> Tensor:
+    """Lengths (B, G), m: given as one, (G,) or (B, G)."""
+    found = tensor(value, name, dims.like)
+    if found.dim() > 2 or (found.dim() > 0 and tuple(found.shape) not in ((G,), (dims.B, G))):
+        raise InputError(name, f"a number, shape ({G},) or ({dims.B}, {G})", tuple(found.shape))
+    if not bool((torch.isfinite(found) & (found > 0)).all()):
+        raise InputError(name, "finite numbers above 0 m", found.tolist())
+    return found.expand(dims.B, G).contiguous()
+
+
+def _given(knots: Any, dims: Dimensions, G: int, gap: int, ends: Tensor) -> Tensor:
+    """Knots (B, G), given so or as (G,)."""
+    name, expected = "gates.knots", f"{G} whole numbers, or {dims.B} rows of them"
+    try:
+        rows = [[whole(k) for k in row] for row in knots] if _nested(knots) else [[whole(k) for k in knots]] * dims.B
+        found = torch.tensor(rows, device="cpu")
+    except (TypeError, ValueError):
+        raise InputError(name, expected, shown(knots)) from None
+    if tuple(found.shape) != (dims.B, G):
+        raise InputError(name, expected, f"shape {tuple(found.shape)}")
+    if bool((found.diff(dim=1) < gap).any()):
+        rise = "knots that rise: no two gates at one" if gap == 1 else "knots that rise by 2 at least"
+        raise InputError(name, rise, found.tolist())
+    if bool((found < 1).any() | (found > ends.unsqueeze(-1)).any()):
+        raise InputError(name, f"knots within 1..{int(ends.min())}", found.tolist())
+    return found.to(dims.like.device)
+
+
+def _nested(knots: Any) -> bool:
+    return len(knots) > 0 and hasattr(knots[0], "__len__")
+
+
+def _by_length(centers: Tensor, dims: Dimensions, gap: int, ends: Tensor) -> Tensor:
+    """Knots (B, G) along the straight lines from the start through the gates to the goal, with a smooth start and stop.
+
+    At a constant speed a vehicle at rest would have to be at the first gate before it can be.
+    """
+    line = [dims.like[:, None, dims.position], centers] + ([] if dims.goal is None else [dims.goal.unsqueeze(1)])
+    reached = torch.cat(line, dim=1).diff(dim=1).norm(dim=-1).cumsum(-1)
+    G, last = centers.shape[1], ends.to(reached.device) + gap - 1
+    share = (reached[:, :G] / reached[:, -1:].clamp(min=1e-12)).clamp(0.0, 1.0)
+    when = 0.5 - ((1.0 - 2.0 * share).asin() / 3.0).sin()  # when^2 (3 - 2 when) = share
+    places = (when * last.unsqueeze(-1)).round().long()
+    for g in range(G):  # apart from each other, with room for those to come
+        least = places[:, g - 1] + gap if g > 0 else torch.ones_like(last)
+        places[:, g] = torch.minimum(torch.maximum(places[:, g], least), last + 1 - gap - gap * (G - 1 - g))
+    return places

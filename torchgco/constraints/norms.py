@@ -1,0 +1,313 @@
+"""Bounds on the norm of states or controls, and cones that vectors or attitudes stay within."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import Dimensions, tensor
+from torchgco.constraints.base import Constraint, resolve_knots, whole
+from torchgco.costs.base import add_blocks
+
+AWAY = -1.0  # the row of a bound that one problem of a batch doesn't have
+# Length of a vector, in its units, at which a cone's row is smooth, too: smaller ones cost the interior point hundreds
+# of iterations where a vector ends at the tip, as the way to a landing site does.
+TIP = 1e-4
+QUATERNION = "quaternion"
+
+
+@dataclass(frozen=True)
+class _Vectors(Constraint):
+    """A constraint on some components of the state, or of the control, at a knot."""
+
+    components: Tensor | None = field(default=None, repr=False, kw_only=True)  # (c,) int64, once bound
+
+    label: ClassVar[str]  # in errors
+
+    def _vectors(self, X: Tensor, U: Tensor) -> Tensor:
+        """The components (B, K, c)."""
+        return (X if self.of == "x" else U)[:, self.knots][..., self.components]  # type: ignore[attr-defined]
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        J = torch.zeros(*g.shape, (X if self.of == "x" else U).shape[-1], dtype=H.dtype, device=H.device)  # type: ignore[attr-defined]
+        J[..., self.components] = self._slopes(X, U)
+        gradient, curvature = (g.unsqueeze(-2) @ J).squeeze(-2), J.mT @ (h.unsqueeze(-1) * J)
+        add = H.new_zeros(*g.shape[:2], *H.shape[2:])
+        x, u = ((gradient, curvature), (None, None)) if self.of == "x" else ((None, None), (gradient, curvature))  # type: ignore[attr-defined]
+        add_blocks(add, X.shape[-1], x[0], u[0], x[1], u[1])
+        H[:, self.knots] += add
+
+    def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
+        """The derivatives (B, K, p, c) of the rows by the components."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class NormBounds(_Vectors):
+    """lower <= |z - center| <= upper, with z some states or some controls of a knot.
+
+        speed = NormBounds(("x", [3, 4, 5]), upper=5.0)  # m/s
+        thrust = NormBounds("u", lower=4.0, upper=12.0)  # N: a thrust annulus
+
+    Rows are (|z - center|^2 - upper^2) / (2 upper) and (lower^2 - |z - center|^2) / (2 lower): smooth everywhere, and
+    near the bound as large as the distance to it. The second has no slope at the centre: a guess should lie elsewhere.
+
+    Args:
+        of: "x" or "u", all components; or a pair of that and which: ("x", [3, 4, 5]), ("u", range(3)), a slice.
+        lower, upper: numbers in the units of z: one for all, (B,), or per knot (B|1, K) with a column for each of the K
+            `knots` in their order; None, a lower bound of 0 or an upper one of infinity: no bound.
+        knots: default 1..N for states (x_0 is given), 0..N-1 for controls.
+        center: (c,), (B, c) or per knot (B|1, K, c); None: 0.
+
+    Raises:
+        InputError: on `Problem(...)`: components that the model doesn't have or that are given twice; bounds of another
+            shape, NaN, negative, crossed, an upper bound of 0, or none; a centre that isn't finite.
+    """
+
+    of: Any
+    lower: Any = None
+    upper: Any = None
+    knots: Any = None
+    center: Any = None
+
+    per_element: ClassVar[tuple[str, ...]] = ("lower", "upper", "center")
+    label: ClassVar[str] = "norm_bounds"
+
+    def bind(self, dims: Dimensions) -> Self:
+        name = self.label
+        kind, components = _chosen(self.of, self.components, ("x", "u"), dims, f"{name}.of")
+        knots, K = _knots(self.knots, kind, dims, f"{name}.knots")
+        bounds = {}
+        for side in ("lower", "upper"):
+            given = getattr(self, side)
+            bounds[side] = None if given is None else _per_knot(given, f"{name}.{side}", dims, K)
+        lower, upper = bounds["lower"], bounds["upper"]
+        if lower is not None and not bool((torch.isfinite(lower) & (lower >= 0)).all()):
+            raise InputError(f"{name}.lower", "finite numbers of at least 0", lower.tolist())
+        if upper is not None and not bool((upper > 0).all()):
+            raise InputError(f"{name}.upper", "numbers above 0, or infinity", upper.tolist())
+        if lower is not None and upper is not None and not bool((lower < upper).all()):
+            raise InputError(f"{name}.lower", "less than the upper bound", f"{lower.tolist()} and {upper.tolist()}")
+        # A side that bounds no problem has no rows.
+        lower = None if lower is None or not bool((lower > 0).any()) else lower
+        upper = None if upper is None or not bool(torch.isfinite(upper).any()) else upper
+        if lower is None and upper is None:
+            raise InputError(name, "a lower bound above 0 or a finite upper bound", "neither")
+        center = self.center
+        if center is not None:
+            center = _points(center, f"{name}.center", dims, K, len(components))
+        return replace(self, of=kind, components=components, knots=knots, lower=lower, upper=upper, center=center)
+
+    def _away(self, X: Tensor, U: Tensor) -> Tensor:
+        z = self._vectors(X, U)
+        return z if self.center is None else z - self.center
+
+    def _sides(self) -> list[tuple[float, Tensor, Tensor]]:
+        """Of the upper and the lower bounds that there are: +-1, the bounds (B|1, K|1) or 1, where there are any."""
+        sides = []
+        if self.upper is not None:
+            there = torch.isfinite(self.upper)
+            sides.append((1.0, torch.where(there, self.upper, 1.0), there.to(self.upper)))
+        if self.lower is not None:
+            there = self.lower > 0
+            sides.append((-1.0, torch.where(there, self.lower, 1.0), there.to(self.lower)))
+        return sides
+
+    @property
+    def sides(self) -> list[str]:
+        """Of which bound each row is."""
+        return [side for side in ("upper", "lower") if getattr(self, side) is not None]
+
+    @property
+    def row_radii(self) -> Tensor:
+        rows = [sign * bound for sign, bound, _ in self._sides()]
+        return torch.stack(torch.broadcast_tensors(*rows), dim=-1)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        square, rows = self._away(X, U).square().sum(-1), []
+        for sign, bound, there in self._sides():
+            rows.append(sign * there / (2.0 * bound) * (square - bound.square()) + (1.0 - there) * AWAY)
+        return torch.stack(rows, dim=-1)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """By how much the norm is beyond each bound, in the units of z, (B, K, p)."""
+        size = self._away(X, U).norm(dim=-1)
+        rows = [there * (sign * (size - bound)).clamp(min=0.0) for sign, bound, there in self._sides()]
+        return torch.stack(rows, dim=-1)
+
+    def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
+        away = self._away(X, U)
+        return torch.stack([(sign * there / bound).unsqueeze(-1) * away for sign, bound, there in self._sides()], -2)
+
+
+@dataclass(frozen=True)
+class Cone(_Vectors):
+    """A vector stays within `angle` of an axis: |v| cos(angle) <= axis . v.
+
+        tilt = Cone([0, 0, 1], math.radians(30), ("quaternion", range(6, 10)))  # the body's z axis
+        pointing = Cone([0, 0, 1], math.radians(20), "u")  # of a thrust vector
+        glide_slope = Cone([0, 0, 1], math.radians(75), ("x", [0, 1, 2]), apex=pad)  # 15 degrees above ground, at least
+
+    The row is (|v| cos(angle) - axis . v) / sin(angle), near the surface as large as the distance to it; of an attitude
+    |q|^2 times that. At 0 it would have no slope: vectors of 1e-4 or less count as shorter than they are.
+
+    Args:
+        axis: (d,), (B, d) or per knot (B|1, K, d), of any length above 0.
+        angle: between axis and surface, rad, above 0 and below pi: a number, (B,), or per knot (B|1, K).
+        of: "x" or "u", or a pair of that and which components, as for `NormBounds`; or ("quaternion", four states), a
+            quaternion (w, x, y, z) whose body's z axis, in the world, is v.
+        knots: default 1..N for states, 0..N-1 for controls.
+        apex: where v = z - apex begins, (d,), (B, d) or per knot (B|1, K, d); None: 0. Not for attitudes.
+
+    Violations are distances from the cone in the units of v; of attitudes angles beyond `angle`, rad.
+
+    Raises:
+        InputError: on `Problem(...)`: components that the model doesn't have or that are given twice, other than four
+            of a quaternion; an axis of another length, 0 or not finite; an angle out of its range; a bad apex.
+    """
+
+    axis: Any
+    angle: Any
+    of: Any
+    knots: Any = None
+    apex: Any = None
+    attitude: bool = field(default=False, repr=False, kw_only=True)  # set once bound
+
+    per_element: ClassVar[tuple[str, ...]] = ("axis", "angle", "apex")
+    label: ClassVar[str] = "cone"
+
+    def bind(self, dims: Dimensions) -> Self:
+        known = QUATERNION if self.attitude else self.of
+        kind, components = _chosen(known, self.components, ("x", "u", QUATERNION), dims, "cone.of")
+        attitude = kind == QUATERNION
+        if attitude and len(components) != 4:
+            raise InputError("cone.of", "the four states (w, x, y, z) of a quaternion", components.tolist())
+        kind = "x" if attitude else kind
+        knots, K = _knots(self.knots, kind, dims, "cone.knots")
+        d = 3 if attitude else len(components)
+        axis = _points(self.axis, "cone.axis", dims, K, d)
+        if not bool((axis.norm(dim=-1) > 0).all()):
+            raise InputError("cone.axis", "vectors other than 0", axis.tolist())
+        angle = _per_knot(self.angle, "cone.angle", dims, K)
+        if not bool(((angle > 0) & (angle < math.pi)).all()):
+            raise InputError("cone.angle", "angles in rad, above 0 and below pi", angle.tolist())
+        apex = self.apex
+        if apex is not None and attitude:
+            raise InputError("cone.apex", "none for a quaternion", shown(apex))
+        if apex is not None:
+            apex = _points(apex, "cone.apex", dims, K, d)
+        return replace(
+            self, axis=axis, angle=angle, of=kind, components=components, knots=knots, apex=apex,
+            attitude=attitude,
+        )  # fmt: skip
+
+    @property
+    def _direction(self) -> Tensor:
+        """The axis as a unit vector, (B|1, K|1, d)."""
+        return self.axis / self.axis.norm(dim=-1, keepdim=True)
+
+    def _directed(self, X: Tensor, U: Tensor) -> Tensor:
+        """The vectors v (B, K, d)."""
+        z = self._vectors(X, U)
+        if not self.attitude:
+            return z if self.apex is None else z - self.apex
+        w, x, y, z = z.unbind(-1)
+        columns = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
+        return torch.stack(columns, dim=-1)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        v = self._directed(X, U)
+        if self.attitude:
+            size = self._vectors(X, U).square().sum(-1)
+        else:
+            square = v.square().sum(-1)
+            size = square / (square + TIP**2).sqrt()
+        row = (self.angle.cos() * size - (self._direction * v).sum(-1)) / self.angle.sin()
+        return row.unsqueeze(-1)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """How far the vectors are outside, in their units, or rad of attitudes, (B, K, 1)."""
+        v = self._directed(X, U)
+        along = (self._direction * v).sum(-1)
+        across = (v - along.unsqueeze(-1) * self._direction).norm(dim=-1)
+        if self.attitude:
+            return (torch.atan2(across, along) - self.angle).clamp(min=0.0).unsqueeze(-1)
+        cosine, sine = self.angle.cos(), self.angle.sin()
+        outside = across * cosine - along * sine
+        # Behind the tip the nearest point of the cone is the tip.
+        behind = (outside > 0) & (along * cosine + across * sine < 0)
+        outside = torch.where(behind, v.norm(dim=-1), outside)
+        return outside.clamp(min=0.0).unsqueeze(-1)
+
+    def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
+        z, v = self._vectors(X, U), self._directed(X, U)
+        cosine, sine = self.angle.cos().unsqueeze(-1), self.angle.sin().unsqueeze(-1)
+        if not self.attitude:
+            square = v.square().sum(-1, keepdim=True)
+            by_v = v * (square + 2.0 * TIP**2) / (square + TIP**2).pow(1.5)
+            return ((cosine * by_v - self._direction) / sine).unsqueeze(-2)
+        w, x, y, z_ = z.unbind(-1)
+        by_axis = (
+            torch.stack((y, z_, w, x), dim=-1),  # half the derivatives of v_x, v_y and v_z by (w, x, y, z)
+            torch.stack((-x, -w, z_, y), dim=-1),
+            torch.stack((w, -x, -y, z_), dim=-1),
+        )
+        along = sum(self._direction[..., i : i + 1] * part for i, part in enumerate(by_axis))
+        return (2.0 * (cosine * z - along) / sine).unsqueeze(-2)
+
+
+def _chosen(
+    of: Any, known: Tensor | None, kinds: tuple[str, ...], dims: Dimensions, field: str
+) -> tuple[Literal["x", "u", "quaternion"], Tensor]:
+    """Whose components, and which (c,) int64; `known` are those of a constraint that is bound already."""
+    pair = of if isinstance(of, tuple) and len(of) == 2 else (of, slice(None) if known is None else known)
+    kind, which = pair
+    if not isinstance(kind, str) or kind not in kinds:
+        words = ", ".join(f'"{word}"' for word in kinds)
+        raise InputError(field, f"one of {words}, or a pair of that and which components", shown(of))
+    size = dims.m if kind == "u" else dims.n
+    try:
+        places = list(range(size))[which] if isinstance(which, slice) else [whole(i) for i in which]
+    except (TypeError, ValueError):
+        raise InputError(field, "a slice, or a list of whole numbers", shown(which)) from None
+    of_what = "controls" if kind == "u" else "states"
+    if not places or len(set(places)) < len(places) or not all(0 <= i < size for i in places):
+        raise InputError(field, f"some of the {of_what} 0..{size - 1}, none twice", shown(which))
+    return kind, torch.tensor(places, device=dims.like.device)  # type: ignore[return-value]
+
+
+def _knots(knots: Any, kind: str, dims: Dimensions, field: str) -> tuple[slice | Tensor, int]:
+    """The knots at which a constraint holds, and how many."""
+    last = dims.N - 1 if kind == "u" else dims.N
+    default = slice(0 if kind == "u" else 1, last + 1)
+    found = resolve_knots(default if knots is None else knots, last, field, dims.like.device)
+    return found, len(range(last + 1)[found]) if isinstance(found, slice) else len(found)
+
+
+def _per_knot(value: Any, field: str, dims: Dimensions, K: int) -> Tensor:
+    """Numbers (B|1, K|1): given as one, (B,), or (B|1, K)."""
+    given = tensor(value, field, dims.like)
+    found = given.view(1, 1) if given.dim() == 0 else given.unsqueeze(-1) if given.dim() == 1 else given
+    if found.dim() != 2 or found.shape[0] not in (1, dims.B) or found.shape[1] not in (1, K):
+        raise InputError(field, f"a number, shape ({dims.B},), or per knot ({dims.B} or 1, {K})", tuple(given.shape))
+    if bool(torch.isnan(found).any()):
+        raise InputError(field, "numbers", "NaN")
+    return found
+
+
+def _points(value: Any, field: str, dims: Dimensions, K: int, size: int) -> Tensor:
+    """Vectors (B|1, K|1, size): given as (size,), (B, size), or (B|1, K, size)."""
+    given = tensor(value, field, dims.like)
+    found = given.view(1, 1, -1) if given.dim() == 1 else given.unsqueeze(1) if given.dim() == 2 else given
+    fits = found.dim() == 3 and found.shape[0] in (1, dims.B) and found.shape[1] in (1, K) and found.shape[2] == size
+    if not fits:
+        expected = f"shape ({size},), ({dims.B}, {size}), or per knot ({dims.B} or 1, {K}, {size})"
+        raise InputError(field, expected, tuple(given.shape))
+    if not bool(torch.isfinite(found).all()):
+        raise InputError(field, "finite numbers", "NaN or infinity")
+    return found

@@ -1,0 +1,169 @@
+"""`torchgco-export RUN`: the trajectories of a finished study as CSV files, with names and units."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pandas as pd
+import torch
+
+from torchgco.base.errors import InputError
+from torchgco.base.options import Positive, check_value
+from torchgco.dynamics import QuadrotorPlant
+from torchgco.dynamics.names import controls_of, states_of
+from torchgco.dynamics.rollout import open_loop
+from torchgco.experiments.ending import ended, say
+from torchgco.experiments.reports.finished import TRUST, Study
+from torchgco.experiments.reports.mission_report import TIME_STEPS
+from torchgco.experiments.results.files import damaged, write
+from torchgco.experiments.results.limits import read_table
+from torchgco.experiments.results.records import SOLUTIONS
+from torchgco.problem.horizons import within_horizons
+from torchgco.problem.sampled import TIME, sampled
+from torchgco.problem.times import times
+
+FOLDER = "export"
+QUATERNION, VELOCITY = slice(6, 10), slice(3, 6)  # of the plant's states
+Table = tuple[str, int, pd.DataFrame]  # solver, layout, columns
+
+
+def write_export(
+    folder: Path,
+    output: Path | None = None,
+    rate: float | None = None,
+    layouts: Sequence[int] = (),
+    solvers: Sequence[str] = (),
+    trust: bool = False,
+) -> list[Path]:
+    """Write a CSV file per solver and layout of a finished study; returns where they lie.
+
+    Single trajectories have the columns of `Solution.trajectories`. Missions have those of the plant: states, the
+    acceleration (differences of the velocities), the joint thrust, and the rotor speeds that are commanded; they are as
+    they were logged, at the plant's time steps where the study kept these (up to four missions), else at its control
+    steps.
+
+    Args:
+        output: a folder; None: `export` in that of the study.
+        rate: samples per second; None: the knots of a trajectory, the rows of a mission's log.
+        layouts, solvers: which; none: all.
+
+    Raises:
+        InputError: as `Study.read`, a layout or solver that the study hasn't, or a rate that isn't above 0.
+    """
+    check_value(rate, Positive | None, "--rate")
+    study, place = Study.read(folder, trust), folder / FOLDER if output is None else output
+    ids, names = study.layouts.ids.tolist(), list(study.manifest.solvers)
+    for option, given, known in (("--layout", layouts, ids), ("--solver", solvers, names)):
+        if missing := [one for one in given if one not in known]:
+            raise InputError(option, f"among {', '.join(map(str, known[:20]))} of the study", missing[0])
+    if place.exists() and not place.is_dir():
+        raise InputError("--output", "a folder", place)
+    tables, written = _missions if study.missions else _trajectories, list[Path]()
+    for solver, number, columns in tables(study, rate, lambda solver, number: number in (layouts or ids)):
+        if solver in (solvers or names):
+            written.append(place / f"{solver}-{number}.csv")
+            place.mkdir(parents=True, exist_ok=True)
+            text = columns.to_csv(index=False)
+            write(written[-1], lambda file, text=text: file.write(text.encode()))
+    return written
+
+
+def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
+    """Single trajectories, rolled out from the controls that the study kept."""
+    for places, problem in study.batches():
+        for name, controls in study.flown(SOLUTIONS, "U").items():
+            U = torch.from_numpy(controls[places, : problem.N])
+            X = open_loop(within_horizons(problem).dynamics, problem.x0, U)
+            t = times(problem).expand(problem.B, -1)
+            for b, number in enumerate(study.layouts.ids[places].tolist()):
+                last = problem.N if problem.horizon is None else int(problem.horizon[b])
+                if wanted(name, number) and bool(torch.isfinite(U[b, :last]).all()):
+                    dynamics = problem.take(slice(b, b + 1)).dynamics
+                    columns = sampled(dynamics, X[b, : last + 1], U[b, :last], t[b, : last + 1], rate)
+                    yield name, number, pd.DataFrame(columns)
+
+
+def _missions(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
+    """Missions as they were flown."""
+    fine = _time_steps(study)
+    kept = {} if fine is None else dict(iter(fine.groupby(["solver", "mission"], sort=False)))
+    for (name, number), steps in study.log.groupby(["solver", "mission"], sort=False):  # type: ignore[misc]
+        if wanted(name, number):
+            yield name, number, _flown(kept.get((name, number), steps), rate)
+
+
+def _time_steps(study: Study) -> pd.DataFrame | None:
+    """The plant's time steps of few missions; None where the study kept none."""
+    path = study.folder / TIME_STEPS
+    if not path.is_file():
+        return None
+    try:
+        return read_table(path, study.trust)
+    except InputError:
+        raise
+    except Exception as error:  # damaged bytes make readers raise nearly anything
+        raise damaged(path, f"is damaged ({type(error).__name__})") from None
+
+
+def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:
+    """The columns of a mission, from its log."""
+    plant = QuadrotorPlant()
+    t, x, u = (log[names].to_numpy(float) for names in (["t"], _numbered("x", plant.n), _numbered("u", plant.m, 1)))
+    at = t[:, 0] if rate is None else np.arange(int((t[-1, 0] - t[0, 0]) * rate + 1e-9) + 1) / rate + t[0, 0]
+    if rate is not None:
+        u = u[np.clip(np.searchsorted(t[:, 0], at + 1e-9, side="right") - 1, 0, len(u) - 1)]  # they hold
+    rates = np.gradient(x[:, VELOCITY], t[:, 0], axis=0) if len(t) > 1 else np.zeros((1, 3))
+    x, rates = _between(at, t[:, 0], x), _between(at, t[:, 0], rates)
+    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
+    columns: dict[str, Any] = {TIME: at}
+    columns |= {one.label: x[:, i] for i, one in enumerate(states_of(plant))}
+    columns |= {f"a{axis} [m/s^2]": rates[:, i] for i, axis in enumerate("xyz")}
+    columns["thrust [N]"] = x[:, 13:].sum(1)
+    return pd.DataFrame(columns | {one.label: u[:, i] for i, one in enumerate(controls_of(plant))})
+
+
+def _numbered(letter: str, count: int, first: int = 0) -> list[str]:
+    return [f"{letter}{i}" for i in range(first, first + count)]
+
+
+def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Without the usage before an error: one line for every mistake."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError("command line", "RUN and the options of --help", message)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="torchgco-export", description="The trajectories of a study as CSV, with names and units.")
+    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
+    parser.add_argument("--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN")
+    parser.add_argument("--rate", metavar="HZ", type=float, help="samples per second; default: as they were computed")
+    parser.add_argument(
+        "--layout", metavar="N", type=int, nargs="+", default=[], help="numbers of layouts; default: all"
+    )
+    parser.add_argument("--solver", metavar="NAME", nargs="+", default=[], help="default: all of the study")
+    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`torchgco-export`. Returns the exit code, see `ended`."""
+
+    def work() -> int:
+        options = _parser().parse_args(arguments)
+        files = write_export(
+            options.run, options.output, options.rate, options.layout, options.solver, options.trust
+        )  # fmt: skip
+        size = sum(path.stat().st_size for path in files)
+        say(f"{files[0].parent if files else options.run}: {len(files)} files, {size / 1e6:.2f} MB")
+        return 0
+
+    return ended("torchgco-export", work)

@@ -1,0 +1,77 @@
+"""A trajectory as a table over time, at the knots or at any rate: names, units, and what follows from states."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.func import jvp
+
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.names import Quantity, controls_of, states_of
+from torchgco.problem.between import between
+
+TIME = "t [s]"
+ROUNDING = 1e-9  # of a sample: an end this close after one is that sample's
+
+
+def sampled(dynamics: Dynamics | None, X: Tensor, U: Tensor, t: Tensor, rate: float | None) -> dict[str, np.ndarray]:
+    """Columns by label: times, states, controls, and what the model knows beside them.
+
+    Controls hold from their knot to the next one; the last row has the last ones. Of models that integrate a
+    derivative, states between the knots are the integrator's, and of their position come the acceleration and, where no
+    state has these names, the velocity. Of others there are straight lines between the knots.
+
+    Args:
+        dynamics: None: not known, and numbers stand for names.
+        X, U, t: of one trajectory, (N+1, n), (N, m), (N+1,) s.
+        rate: samples per second; None: the knots.
+    """
+    k, h, lengths = _places(t, rate)
+    x, u = X[k].clone(), U[k]
+    if bool((h > 0).any()):
+        one = X.unsqueeze(0), U.unsqueeze(0), k, h, lengths
+        x = between(dynamics, *one)[0] if dynamics is not None else x + (h / lengths).unsqueeze(-1) * (X[k + 1] - x)
+    ends = h >= lengths * (1 - ROUNDING)  # a whole stage leads to the knot after it, which may not obey the model
+    x[ends] = X[k[ends] + 1]
+    if dynamics is None:
+        named = [Quantity(f"x[{i}]") for i in range(X.shape[-1])], [Quantity(f"u[{i}]") for i in range(U.shape[-1])]
+    else:
+        named = states_of(dynamics), controls_of(dynamics)
+    columns = {TIME: t[k] + h}
+    columns |= {one.label: x[:, i] for i, one in enumerate(named[0])}
+    if dynamics is not None:
+        columns |= _of_position(dynamics, x, u, k, {one.name for one in named[0]}) | dynamics.derived(x, u)
+    columns |= {one.label: u[:, i] for i, one in enumerate(named[1])}
+    return {label: values.detach().cpu().numpy() for label, values in columns.items()}
+
+
+def _places(t: Tensor, rate: float | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Stages k (T,), times h since their knots and lengths of stages, s, of the samples from t[0] to t[-1]."""
+    N = len(t) - 1
+    if rate is None:
+        k = torch.arange(N + 1, device=t.device).clamp(max=N - 1)
+        h = torch.zeros_like(t)
+        h[-1] = t[-1] - t[-2]
+    else:
+        count = int(float(t[-1] - t[0]) * rate + ROUNDING)
+        at = t[0] + torch.arange(count + 1, dtype=t.dtype, device=t.device) / rate
+        k = (torch.searchsorted(t.contiguous(), at + ROUNDING / rate, right=True) - 1).clamp(0, N - 1)
+        h = (at - t[k]).clamp(min=0.0)
+    return k, h, t[k + 1] - t[k]
+
+
+def _of_position(dynamics: Dynamics, x: Tensor, u: Tensor, k: Tensor, taken: set[str]) -> dict[str, Tensor]:
+    """Velocity and acceleration of the position, (T,) each, of models that integrate a derivative."""
+    at = dynamics.position
+    if at is None or at.stop - at.start > 3 or not dynamics.is_integrated:
+        return {}
+    model, x, u = dynamics.at(k), x.unsqueeze(0), u.unsqueeze(0)
+    rates = model.field(x, u)
+    change = jvp(lambda z: model.field(z, u), (x,), (rates,))[1]
+    columns = {}
+    for kind, unit, values in (("v", "m/s", rates), ("a", "m/s^2", change)):
+        names = [f"{kind}{letter}" for letter in "xyz"[: at.stop - at.start]]
+        if not taken & set(names):
+            columns |= {f"{name} [{unit}]": values[0, :, at.start + i] for i, name in enumerate(names)}
+    return columns
