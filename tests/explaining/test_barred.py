@@ -27,7 +27,7 @@ def problem(cells: np.ndarray, radius: float, goal: tuple[float, float] = (8.0, 
     cost = QuadraticCost([1, 1, 0, 2], [0.5, 0.5], [200, 200, 0, 10], [*goal, 0, 0])
     parts = [Field(OccupancyGrid(cells, [0, 0], RESOLUTION), radius), ControlBounds([-2, -1.5], [2, 1.5])]
     x0 = torch.tensor([[2.0, 3.0, 0, 0]]).double()
-    return Problem(Unicycle(dt=0.1), cost, parts, x0, 60, Goal(list(goal), 0.3))
+    return Problem(Unicycle(dt=0.1), cost, parts, x0, 80, Goal(list(goal), 0.3))
 
 
 def told(task: Problem) -> str:

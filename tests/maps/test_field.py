@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 from tests.reference.maps import distance_from_cells, lower_square, signed_distance
 from torchgco import ControlBounds, Field, Goal, InputError, Planar, Problem, QuadraticCost, QuadrotorPlanning
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
+from torchgco.maps import field as field_module
 from torchgco.maps.field import BoundField
 from torchgco.maps.lookup import lengths
 
@@ -220,6 +222,32 @@ def test_segments_are_measured_where_they_come_near() -> None:
         assert found <= due[e] + 1e-9 and (due[e] - found < 0.1 or due[e] == 0)
     together = part.segment_clearance(p[:1], p[1:])
     assert float(together.amin()) + 0.1 <= due.min() + 1e-9
+
+
+def test_a_segment_that_leads_far_beyond_the_map_is_looked_up_near_it_alone(monkeypatch) -> None:
+    """In pieces, of which all that can't be nearer are skipped: the smallest of all points is found."""
+    grid = random_grid(2, share=0.03)
+    part = bound(DistanceField.of(grid), 0.1)
+    middle = 0.5 * (points_around(grid, 40).min(0) + points_around(grid, 40).max(0))
+    looked, real = [], field_module.squares
+    monkeypatch.setattr(field_module, "squares", lambda *words: looked.append(words[1].shape[:2]) or real(*words))
+    for angle in np.linspace(0.1, 6.0, 5):
+        way = torch.tensor([np.cos(angle), np.sin(angle)])
+        a, b = (torch.from_numpy(middle) + far * way for far in (-31.7, 450.3))
+        looked.clear()
+        found = float(part.segment_clearance(a.view(1, 1, 2), b.view(1, 1, 2)))
+        pieces = math.ceil(482.0 / (0.5 * part.field.spacing))
+        assert pieces > 3 * field_module.PIECE and sum(B * K for B, K in looked) < 0.7 * pieces
+        assert max(B * K for B, K in looked) <= field_module.PIECE + 1
+        points = a + torch.linspace(0, 1, pieces + 1, dtype=torch.float64).unsqueeze(-1) * (b - a)
+        r = float(part.signed_distance(points.unsqueeze(0), torch.zeros(pieces + 1)).amin()) + 0.1
+        half = 0.5 * 482.0 / pieces
+        due = (r * r - half * half) ** 0.5 if r > half else r - half
+        assert found + 0.1 == pytest.approx(due, abs=1e-6)
+    far = torch.tensor([[[1e7, 0.0], [torch.inf, 0.0], [torch.nan, 1.0]]], dtype=torch.float64)
+    looked.clear()
+    part.segment_clearance(-far, far)  # no memory for the points between
+    assert max(B * K for B, K in looked) <= field_module.AT_ONCE
 
 
 @pytest.mark.parametrize(

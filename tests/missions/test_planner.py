@@ -15,6 +15,7 @@ from torchgco import (
     Airframe,
     ControlBounds,
     FirstStepRates,
+    Goal,
     InputError,
     Planar,
     Problem,
@@ -22,8 +23,10 @@ from torchgco import (
     Restarts,
     kernels,
 )
+from torchgco.baselines import Hold
 from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import followed
+from torchgco.lagrangian.quality import has_arrived
 from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import Margin
@@ -31,7 +34,7 @@ from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.search import Solve, Tighten
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Solver
+from torchgco.solvers.contracts import Call, Solver
 
 FRAME = Airframe()
 FIRM = replace(SOLVER, max_outer_iterations=30, violation_tolerance=1e-3)
@@ -406,3 +409,26 @@ def test_another_model_is_refused() -> None:
     with pytest.raises(InputError) as caught:
         Planner(SOLVER).problem(planar, torch.zeros(1, 17, **DOUBLE))
     assert caught.value.field == "model"
+
+
+class Waits(Solver):
+    """Solves as another one at first; later plans hover, and are feasible."""
+
+    def in_closed_loop(self, limit: int) -> tuple[Solver, Solver]:
+        return FIRM, Hold()
+
+    def run(self, call: Call) -> Solution:
+        return FIRM.run(call)
+
+
+def test_where_a_plan_has_arrived_one_that_waits_is_not_the_last_word() -> None:
+    problem, planner = far(), Planner(Waits())
+    problem = replace(problem, goal=Goal(first_plan(planner, problem)[0].X[:, -1, :3], 0.03))  # within the horizon
+    first, now = first_plan(planner, problem)
+    assert bool(first.arrived.all()) and bool(has_arrived(now, first.X).all())
+    for step, known, arrives in ((8, True, False), (9, True, True), (9, False, False)):
+        before = replace(first, step=step, arrived=first.arrived & known, violation=first.violation * 0.0)
+        before = replace(before, X=now.x0.unsqueeze(1).repeat(1, now.N + 1, 1), U=now.cost.rest_controls(first.U))
+        plan, later = next_plan(planner, problem, now, before, hovering(FRAME, problem.x0[:, :3]))
+        assert bool(has_arrived(later, plan.X).all()) == arrives and bool((plan.violation <= 1e-2).all())
+        assert bool(plan.arrived.all()) == known and bool((plan.iterations > 5).all()) == arrives

@@ -21,7 +21,7 @@ from torchgco import (
     Unicycle,
 )
 from torchgco.dynamics import Dynamics
-from torchgco.search.reach import longest_step, short_horizons
+from torchgco.search.reach import longest_step, short_horizons, strongest_push
 
 FREE = float("inf")
 POINT = FunctionDynamics(lambda x, u: u, 2, 2, 0.1, "euler", slice(0, 2))
@@ -95,3 +95,43 @@ def test_a_limit_is_seen_where_there_is_one_alone() -> None:
     assert longest(jump, [SPEED]) == pytest.approx(0.2), "of a step without a field"
     flow = FunctionDynamics(lambda x, u: u + x[..., :1] * 0.5, 2, 2, 0.1, "euler", slice(0, 2))
     assert longest(flow, [SPEED]) is None, "a flow that grows with the place"
+
+
+def pushed(x: Tensor, u: Tensor) -> Tensor:
+    return torch.cat((x[..., 2:], u), -1)
+
+
+def dragged(x: Tensor, u: Tensor) -> Tensor:
+    return torch.cat((x[..., 2:], u - 10.0 * x[..., 2:]), -1)
+
+
+def blown(x: Tensor, u: Tensor) -> Tensor:
+    return torch.cat((x[..., 2:], u + 0.1 * x[..., 2:]), -1)
+
+
+def test_where_acceleration_alone_is_limited_the_least_time_counts() -> None:
+    """A double integrator covers 0.5 a t^2 from rest; from rest to rest the way takes 2 sqrt(way / a)."""
+    model = FunctionDynamics(pushed, 4, 2, 0.1, "rk4", slice(0, 2))
+    along, goal = ControlBounds([-2.0, 0.0], [2.0, 0.0]), Goal([8.0, 1.0], 0.25)
+    starts = [[1.75, 1.0, 0.0, 0.0], [1.75, 1.0, 3.0, 0.0]]  # 6 m to the edge of the goal; one of them moves
+    for N, who in ((24, [0]), (25, []), (13, [0, 1]), (14, [0])):  # 24.5 stages from rest; 3 t + t^2 = 6 at 1.37 s
+        said = short_horizons(task(model, [along], N, starts, goal))
+        assert (said is None) == (not who)
+        if said is not None:
+            assert said.startswith(f"{len(who)} of 2 horizons") and f"problem {', '.join(map(str, who))})" in said
+            assert "from rest to rest it takes N = 35 at full acceleration" in said  # 2 sqrt(3) s
+    both = ControlBounds([-2.0, -2.0], [2.0, 2.0])
+    assert float(strongest_push(task(model, [both], 9, starts, None))[0]) == pytest.approx(8**0.5, rel=1e-6)  # type: ignore
+
+
+def test_what_limits_the_acceleration_is_seen_in_the_equations() -> None:
+    def strongest(model: Dynamics, parts: list, climbs: int = 40) -> float | None:
+        found = strongest_push(task(model, parts, 5, [[0.0] * model.n], None), climbs)
+        return None if found is None else float(found[0])
+
+    bounds = ControlBounds([-2.0, -1.5], [2.0, 1.5])
+    drag, wind, free = (FunctionDynamics(f, 4, 2, 0.1, "rk4", slice(0, 2)) for f in (dragged, blown, pushed))
+    assert strongest(Unicycle(dt=0.1), [bounds]) == pytest.approx(2.0), "whatever its heading and speed"
+    assert strongest(drag, [bounds]) == pytest.approx(2.5, rel=0.02), "where it stands"
+    assert strongest(wind, [bounds]) is None, "which grows with the speed"
+    assert strongest(free, []) is None and strongest(POINT, [SPEED]) is None

@@ -8,16 +8,17 @@ import torch
 from torch import Tensor
 
 from tests.search.rows import proposed, varied, without
-from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
+from torchgco import ControlBounds, PathProposals, Problem, Restarts, Status, compose, presets
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.roadmap.scene import has_paths
 from torchgco.search import Converge, Follow
 from torchgco.search.following import Paths, followed
-from torchgco.search.proposals import Proposal, propose
+from torchgco.search.proposals import Part, Proposal, propose
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.ilqr import ILQR, descend
+from torchgco.solvers.interior import InteriorPoint
 
 LAYOUTS = 4
 
@@ -173,3 +174,28 @@ def test_a_converged_solve_is_enough_where_the_goal_is_assumed() -> None:
     assert alone.statuses == [Status.CONVERGED] * 2 and float(assumed.goal.distance(alone.X[:, -1, :3]).min()) > 2
     assert torch.equal(solver.solve(assumed, U0).iterations, alone.iterations)
     assert bool((solver.solve(given, U0).iterations > alone.iterations).all())
+
+
+def test_what_the_bounds_on_controls_cost_is_no_reason_for_more_paths(woods) -> None:
+    """A vehicle that can hardly tilt takes long without trunks, too."""
+    rest = woods.cost.rest_controls(woods.x0.new_zeros(woods.B, woods.N, woods.m))
+    half = 0.04 * (woods.control_bounds.upper - woods.control_bounds.lower)[:1, :1]
+    weak = ControlBounds(rest[:1, 0] - half[0], rest[:1, 0] + half[0])
+    tight = replace(woods, constraints=[*woods.obstacles, weak])
+    bare = replace(woods, constraints=[weak])
+    limited = InteriorPoint(tolerance=1e-8).solve(bare, rest)
+    assert bool((limited.violation <= 1e-6).all())
+    part = Part(tight, rest, torch.arange(tight.B), None)
+    torch.testing.assert_close(part.limited(torch.tensor([2, 0])), limited.cost[[2, 0]], rtol=1e-3, atol=0)
+    assert (part.proposal.iterations > 0).tolist() == [True, False, True, False]
+    assert part.limited(torch.tensor([], dtype=torch.int64)).shape == (0,)
+    unbounded = Part(replace(woods, constraints=woods.obstacles), rest, torch.arange(woods.B), None)
+    assert bool(torch.isinf(unbounded.limited(torch.tensor([1]))).all())
+    once, _ = noted([FIRST], tight)
+    cost = tight.cost.total(open_loop(tight.dynamics, tight.x0, once.U), once.U)
+    over, free = cost / limited.cost - 1, gaps(tight, once.U)
+    assert bool((free > over + 0.05).all())
+    limit = float((over.max() + free.min()) / 2) if bool(over.max() < free.min()) else float(over.max()) + 1e-3
+    assert bool((free > limit).any())
+    _, times = noted([FIRST, replace(COSTLY, max_gap=limit)], tight)
+    assert times == [(3, LAYOUTS, False)]

@@ -23,20 +23,22 @@ from torchgco import (
     presets,
     solve,
 )
+from torchgco.dynamics import Dynamics
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps import OccupancyGrid
 from torchgco.roadmap.geometry import length
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
-from torchgco.search import Solve, Tube, tube
+from torchgco.search import Solve, Tube, directly, pursue, tube
 from torchgco.search.following import Free, Paths
 
 D = torch.float64
 RADIUS = 0.25
+UNICYCLE = Unicycle(dt=0.1)
 
 
-def room(walls: float = 0.4, B: int = 2, N: int = 110) -> Problem:
+def room(walls: float = 0.4, B: int = 2, N: int = 110, model: Dynamics = UNICYCLE) -> Problem:
     """Rooms beside each other, joined by a door at the far end of a thick wall between start and goal."""
     cells = np.zeros((80, 60), bool)
     cells[[0, -1]], cells[:, [0, -1]] = True, True
@@ -45,7 +47,7 @@ def room(walls: float = 0.4, B: int = 2, N: int = 110) -> Problem:
     start = torch.tensor([[1.5, 1.5, 0.5 * b, 0.0] for b in range(B)], dtype=D)
     cost = QuadraticCost(Q=[0.1, 0.1, 0, 2], R=[0.5, 0.5], Qf=[200, 200, 0, 10], x_ref=[6.3, 1.5, 0, 0])
     rows = [Field(OccupancyGrid(cells, [0.0, 0.0], 0.1), RADIUS), ControlBounds([-2, -1.5], [2, 1.5])]
-    return Problem(Unicycle(dt=0.1), cost, rows, start, N, Goal([6.3, 1.5], 0.3))
+    return Problem(model, cost, rows, start, N, Goal([6.3, 1.5], 0.3))
 
 
 def rest(problem: Problem) -> Tensor:
@@ -57,24 +59,31 @@ def alone(problem: Problem, row: Tube) -> Restarts:
     return Restarts(presets.gco(problem).local, (Solve(single_contact_after=3), row))
 
 
-def test_it_arrives_behind_a_thick_wall_of_a_map() -> None:
-    problem = room()
+# Whose equations can't be seen: it is tracked in a tube, and not driven.
+STEPS = FunctionDynamics(UNICYCLE.step, 4, 2, 0.1, "none", position=slice(0, 2))
+MODELS = pytest.mark.parametrize("model", [UNICYCLE, STEPS], ids=["driven", "tracked"])
+
+
+@MODELS
+def test_it_arrives_behind_a_thick_wall_of_a_map(model: Dynamics) -> None:
+    problem = room(model=model)
     found = judge(problem, alone(problem, Tube("maps")).solve(problem, rest(problem)).U)
     assert bool(found.reached.all())
     assert bool(judge(problem, solve(problem).U).sound.all())
 
 
-def test_the_cheapest_that_is_feasible_and_arrives_is_kept(monkeypatch) -> None:
-    problem, ends = room(B=1), list[tuple[Problem, SolveEnd]]()
+@MODELS
+def test_the_cheapest_that_is_feasible_and_arrives_is_kept(monkeypatch, model: Dynamics) -> None:
+    problem, ends = room(B=1, model=model), list[tuple[Problem, SolveEnd]]()
 
-    def note(solver, call, X, real=tube.solved_nearby):
+    def note(solver, call, X, real=directly.solved_nearby):
         ends.append((call.problem, real(solver, call, X)))
         return ends[-1][1]
 
-    monkeypatch.setattr(tube, "solved_nearby", note)
+    monkeypatch.setattr(directly, "solved_nearby", note)
     found = alone(problem, Tube("maps")).solve(problem, rest(problem))
     ((part, end),) = ends
-    assert 1 < part.B <= tube.TOP
+    assert 1 < part.B <= (tube.TOP if model is STEPS else pursue.TOP)
     good = [
         float(end.best.cost[i])
         for i in range(part.B)
@@ -83,8 +92,9 @@ def test_the_cheapest_that_is_feasible_and_arrives_is_kept(monkeypatch) -> None:
     assert len(good) > 1 and float(found.cost[0]) == pytest.approx(min(good) * float(problem.cost_unit[0]), rel=1e-9)
 
 
-def test_the_result_does_not_depend_on_the_batch() -> None:
-    problem = room()
+@MODELS
+def test_the_result_does_not_depend_on_the_batch(model: Dynamics) -> None:
+    problem = room(model=model)
     solver, ids = alone(problem, Tube("maps")), torch.arange(2)
     whole = solver.solve(problem, rest(problem), ids=ids)
     for b in (1, 0):
@@ -168,8 +178,9 @@ def test_one_path_keeps_clear_of_the_map() -> None:
     assert scene is not None and Roadmap().clear_path(scene)[1].tolist() == [False, False]
 
 
-def test_candidates_are_told_in_the_record() -> None:
-    problem = room(B=1)
+@MODELS
+def test_candidates_are_told_in_the_record(model: Dynamics) -> None:
+    problem = room(B=1, model=model)
     found = solve(problem, record=True)
     assert found.search is not None
     one = next(one for one in found.search.comparisons if one.number == 2)

@@ -14,15 +14,14 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_model
-from torchgco.kernels import chord_clearance, measured
-from torchgco.lagrangian.quality import leaves_goal
-from torchgco.lagrangian.state import SolveEnd
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.maps.ways import Ways, length
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.scene import scene_of
-from torchgco.search.chords import MARGIN, MIN_GROWTH
+from torchgco.search.chords import cleared, serving
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.infeasible import least_violated
@@ -159,28 +158,18 @@ class PathPursuit(Solver):
         as they are, arrives where the old one did, and keeps more clearance.
         """
         problem, best = call.problem, end.best
-        if not problem.obstacles:
-            return end
-        held, limit = chord_clearance(problem, best.X), ADMITTED
-        by, now = torch.zeros_like(held), held.clone()
-        for _ in range(self.rounds):
-            rows = ((best.violation <= limit) & (held < 0)).nonzero().flatten()
-            if rows.numel() == 0 or call.late:
-                break
-            by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
-            part, old = call.take(rows), take(best, rows)
-            grown = replace(part, problem=part.problem.grown(by[rows]), U0=old.U, warm=old.multipliers, X0=None)
+
+        def once(rows: Tensor, grown: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
             new = self.solver.solved(replace(grown, callback=None), old.X)
-            X, U = new.best.X, new.best.U
             end.iterations[rows] += new.iterations
-            now[rows] = chord_clearance(part.problem, X)
-            serves = (measured(part.problem, X, U) <= limit) & (now[rows] > held[rows])
-            serves &= ~leaves_goal(part.problem, X, old.X)
+            serves, found, clearance = serving(problem.take(rows), new.best, old, least, ADMITTED)
             kept = serves.nonzero().flatten()
-            found = replace(take(new.best, kept), violation=measured(part.problem, X, U)[kept])
-            put(best, rows[kept], found)
+            put(best, rows[kept], take(found, kept))
             end.status[rows[kept]] = new.status[kept]
-            held[rows[kept]] = now[rows[kept]]
+            return serves, clearance
+
+        if problem.obstacles:
+            cleared(call, best, self.rounds, ADMITTED, once)
         return end
 
 
@@ -206,22 +195,3 @@ def clearance(problem: Problem, points: Tensor) -> Tensor:
             away = part.signed_distance(points, points.new_zeros(points.shape[1]))[0]
             found = torch.minimum(found, away.masked_fill(part.absent[0], torch.inf).amin(-1))
     return found
-
-
-def evenly(way: Array, step: float) -> Array:
-    """Points (P, d) at equal distances of about `step`, m, along a way (Q, d)."""
-    along = np.concatenate(([0.0], np.linalg.norm(np.diff(way, axis=0), axis=1).cumsum()))
-    at = np.linspace(0.0, along[-1], max(2, round(along[-1] / step) + 1))
-    return np.stack([np.interp(at, along, x) for x in way.T], axis=1)
-
-
-def smoothed(points: Array, deviation: float) -> Array:
-    """Points (P, d) averaged by a Gaussian of so many points; the ends stay where they are."""
-    from scipy.ndimage import gaussian_filter1d
-
-    if deviation <= 0.0:
-        return points
-    between = points - np.linspace(points[0], points[-1], len(points))  # 0 at both ends
-    odd = np.concatenate((-between[:0:-1], between, -between[-2::-1]))  # about both: averages there are 0, too
-    averaged = gaussian_filter1d(odd, deviation, axis=0, mode="nearest")[len(points) - 1 : 2 * len(points) - 1]
-    return points - between + averaged

@@ -23,6 +23,7 @@ from torchgco.obstacles.inputs import dimension, vehicle_radii
 Interpolation = Literal["smooth", "linear"]
 STEPS = 0.5  # spacings of the lattice between points at which a segment's distance is looked up
 AT_ONCE = 2**16  # points looked up together
+PIECE = 2**10  # of these along one segment
 
 
 @dataclass(frozen=True)
@@ -165,12 +166,15 @@ class BoundField(Obstacles):
         bound = 0.5 * (at_ends[0] + at_ends[1] - along)
         near = ~self.absent & (bound < gap.amin(-1, keepdim=True) + self.field.spacing) if gap.numel() > 0 else gap > 0
         steps = (along / (STEPS * self.field.spacing)).ceil()
-        i, e = (near & (steps > 1)).nonzero(as_tuple=True)
-        most = max(1, AT_ONCE // (int(steps[i, e].amax()) + 1)) if len(i) > 0 else 1
-        for first in range(0, len(i), most):
-            rows, segments = i[first : first + most], e[first : first + most]
-            ends = a[rows, segments], b[rows, segments]
-            gap[rows, segments] = self._between(rows, *ends, steps[rows, segments])
+        looked = near & (steps > 1) & torch.isfinite(steps)
+        for some in (looked & (steps <= PIECE), looked & (steps > PIECE)):
+            i, e = some.nonzero(as_tuple=True)
+            if len(i) == 0:
+                continue
+            most = max(1, AT_ONCE // (int(steps[i, e].amax().clamp(max=PIECE)) + 1))
+            for rows, segments in zip(i.split(most), e.split(most), strict=True):
+                ends = a[rows, segments], b[rows, segments]
+                gap[rows, segments] = self._between(rows, *ends, steps[rows, segments], gap[rows, segments])
         gap = self._along(gap, 0.5 * along / steps.clamp(min=1.0))
         return torch.where(near | self.absent, gap, bound).unsqueeze(-1)
 
@@ -184,12 +188,24 @@ class BoundField(Obstacles):
         between = (r.square() - half.square()).clamp(min=0.0).sqrt()
         return torch.where(r > half, between, r - half) - limits
 
-    def _between(self, rows: Tensor, a: Tensor, b: Tensor, steps: Tensor) -> Tensor:
-        """Smallest distances (E,) at points in equal steps along segments from a to b (E, d) of problems `rows`."""
-        count = torch.arange(int(steps.amax()) + 1, dtype=a.dtype, device=a.device)
-        share = (count / steps.unsqueeze(-1)).clamp(max=1.0).unsqueeze(-1)
-        p = a.unsqueeze(1) + share * (b - a).unsqueeze(1)
-        return self.take(rows).signed_distance(p, count)[..., 0].amin(-1)
+    def _between(self, rows: Tensor, a: Tensor, b: Tensor, steps: Tensor, gap: Tensor) -> Tensor:
+        """Smallest distances (E,) at points in equal steps along segments from a to b (E, d) of problems `rows`.
+
+        In pieces of `PIECE` steps, each begun where the distance may come down to the smallest one so far, `gap` (E,)
+        at the beginning: of a segment that leads far beyond the map, few are near it.
+        """
+        gap, length = gap.clone(), (b - a).square().sum(-1).sqrt() / steps
+        count = torch.arange(int(steps.amax().clamp(max=PIECE)) + 1, dtype=a.dtype, device=a.device)
+        first, left = torch.zeros_like(steps), torch.arange(len(rows), device=rows.device)
+        while left.numel() > 0:
+            at = (first[left].unsqueeze(-1) + count) / steps[left].unsqueeze(-1)
+            p = a[left].unsqueeze(1) + at.clamp(max=1.0).unsqueeze(-1) * (b - a)[left].unsqueeze(1)
+            distance = self.take(rows[left]).signed_distance(p, count)[..., 0]
+            gap[left] = torch.minimum(gap[left], distance.amin(-1))
+            skipped = ((distance[:, -1] - gap[left]) / length[left]).floor().clamp(min=0.0)
+            first[left] += len(count) - 1 + skipped
+            left = left[first[left] < steps[left]]
+        return gap
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """As for all obstacles; where the field's bound says no, each cell, or point, near the start is measured."""

@@ -16,6 +16,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
 from torchgco.kernels import followed, measured, open_loop, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
+from torchgco.lagrangian.quality import has_arrived
 from torchgco.missions.planning_problem import (
     Margin,
     acceleration,
@@ -49,6 +50,7 @@ class Plan:
     bias: Tensor  # (B, 3): estimated acceleration that the model lacks, m/s^2
     model: Dynamics  # that was planned with
     step: int
+    arrived: Tensor  # (B,) bool: whether this plan or one before it ends at the goal
 
     def continued(self, problem: Problem) -> Multipliers:
         """The multipliers one stage later; where a group of obstacles ends, a knot takes those of the next group.
@@ -75,12 +77,13 @@ class Plan:
         unknown = torch.full_like(like, torch.nan)
         return cls(
             X, U, X.new_zeros(*U.shape, n), Multipliers((), unknown), unknown, unknown, unknown, none.bool(), none,
-            none, measured, X.new_zeros(B, 3), model, step,
+            none, measured, X.new_zeros(B, 3), model, step, none.bool(),
         )  # fmt: skip
 
 
 TRAJECTORY = ("X", "U", "K", "multipliers", "penalty", "cost", "violation", "shifted")
-OTHERS = ("guided", "iterations", "measured", "bias")
+OTHERS = ("guided", "iterations", "measured", "bias", "arrived")
+AGAIN = 10  # control periods after which a plan that only waits, where one before it arrived, is sought again
 CONTINUED = 4  # outer iterations at most that continue a former plan
 MIN_SECONDS = 1e-4  # s, of a time limit
 
@@ -91,7 +94,9 @@ class Planner:
 
     A first plan is the solver's. Later, where the solver makes attempts around a local solver (`gco`), the local solver
     continues from the former plan for up to four outer iterations. Where the result is infeasible, the former plan one
-    stage later is flown if it is less violated; where that is infeasible, too, the whole solver searches again.
+    stage later is flown if it is less violated; where that is infeasible, too, the whole solver searches again. So it
+    does every ten periods where plans end short of the goal and an earlier one didn't: what a search returned that
+    found no way waits, and is feasible.
 
     Args:
         solver: any solver of the library.
@@ -245,7 +250,8 @@ class _Solve:
 
     def first(self, U0: Tensor) -> Plan:
         """The solver's plans, from controls U0 (B, N, 4)."""
-        return self._plan(self._solved(self.solver, self.problem, U0, None, self.ids), self.allowed)
+        plan = self._plan(self._solved(self.solver, self.problem, U0, None, self.ids), self.allowed)
+        return replace(plan, arrived=self._arrives(plan))
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
         """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
@@ -262,7 +268,34 @@ class _Solve:
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
                 getattr(plan, name)[rows] += getattr(found, name)
-        return replace(plan, penalty=torch.where(plan.violation <= self.allowed, plan.penalty, before.penalty))
+        if (before.step + 1) % AGAIN == 0:
+            self._from_waiting(plan, before)
+        return replace(
+            plan,
+            arrived=before.arrived | self._arrives(plan),
+            penalty=torch.where(plan.violation <= self.allowed, plan.penalty, before.penalty),
+        )
+
+    def _from_waiting(self, plan: Plan, before: Plan) -> None:
+        """Search for plans that arrive where these don't, but one before did: they wait where a search found no way.
+
+        Each is feasible, and nothing else would look for another one.
+        """
+        rows = (before.arrived & ~self._arrives(plan)).nonzero().flatten()
+        left = self._time_left()
+        if self.local is self.solver or rows.numel() == 0 or (left is not None and left <= MIN_SECONDS):
+            return
+        part = self.problem.take(rows)
+        rest = part.cost.rest_controls(part.x0.new_zeros(part.B, part.N, part.m))
+        found = self._plan(self._solved(self.solver, part, rest, None, self.ids[rows]), self.allowed[rows])
+        arrives = (found.violation <= self.allowed[rows]) & has_arrived(part, found.X)
+        for name in TRAJECTORY:
+            put(getattr(plan, name), rows[arrives], take(getattr(found, name), arrives.nonzero().flatten()))
+        for name in ("guided", "iterations"):
+            getattr(plan, name)[rows] += getattr(found, name)
+
+    def _arrives(self, plan: Plan) -> Tensor:
+        return has_arrived(self.problem, plan.X)
 
     def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
         return solver.solve(problem, U0, seed=self.seed, ids=ids, warm=warm, max_seconds=self._time_left())
@@ -299,7 +332,7 @@ class _Solve:
         return Plan(
             solution.X, solution.U, solution.K, solution.multipliers, _penalty(solution.multipliers, allowed),
             solution.cost, solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0],
-            solution.X[:, 0, :3], self.problem.dynamics, 0,
+            solution.X[:, 0, :3], self.problem.dynamics, 0, none,
         )  # fmt: skip
 
 

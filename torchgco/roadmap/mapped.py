@@ -14,7 +14,7 @@ from functools import cached_property, partial
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, map_coordinates
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -31,8 +31,6 @@ from torchgco.roadmap.search import DIVERSITY, HOPS
 # may fit between its knots.
 SEARCHES = ((2**18, 0.5, True), (2**18, 0.5, False), (2**18, 0.0, False), (2**21, 0.0, False))
 MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
-WIDE = 4.0  # the same of a path that keeps clear, which takes the middle of doors up to eight units wide
-AVERAGED = 0.8  # units: the standard deviation over which the corners of such a path are averaged
 LEAST = 1e-6  # of the price: no edge may cost nothing
 LONGEST = 2.0  # times as dear as the cheapest one other paths may be
 TRIED = 3  # candidates per path in space that are drawn taut, and compared with those before
@@ -49,46 +47,40 @@ ROUNDING = 1e-9  # m
 KEY = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
 
 Price = Callable[[Array], Array]  # per metre at points (V, d)
+Search = Callable[[Lattice, Array, Price, float, float], list[Array]]  # with the vehicle's radius and the unit, m
 
 
 def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Tensor]:
     """As `Roadmap.paths`, where there are maps among the obstacles."""
-    return _in_each(scene, count, overlap, partial(paths, count=count, corners=HOPS + 1))
+    return in_each(scene, count, overlap, partial(paths, count=count, corners=HOPS + 1))
 
 
-def clear_path_in_maps(scene: Scene, overlap: float) -> tuple[Tensor, Tensor]:
-    """A path of each problem that keeps clear of obstacles as far as its way allows: as `Roadmap.paths`, with one.
-
-    It isn't drawn taut, as a taut path turns at the very corners; a vehicle that turns slowly has to stop there.
-    """
-    return _in_each(scene, 1, overlap, _clear_path)
-
-
-def _in_each(
-    scene: Scene, count: int, overlap: float, search: Callable[[Lattice, Array, Price, float, float], list[Array]]
-) -> tuple[Tensor, Tensor]:
+def in_each(scene: Scene, count: int, overlap: float, search: Search) -> tuple[Tensor, Tensor]:
     """The paths (B, count, HOPS+1, d) that a search of each problem finds, and whether it finds any, (B,)."""
     start, goal = scene.start, scene.goal
     corners = torch.stack((start, goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1).repeat(1, count, 1, 1)
     found = torch.zeros_like(start[:, 0], dtype=torch.bool)
     for b in range(len(start)):
-        row = torch.tensor([b], device=start.device)
-        obstacles = on_cpu(take(scene.obstacles, row)).reduced(overlap)
-
-        def price(points: Array, row: Tensor = row) -> Array:
-            with computing_on(start.device):
-                return scene.traversal_cost(start.new_tensor(points)[None], row)[0].double().cpu().numpy()
-
-        ends = torch.stack((start[b], goal[b])).double().cpu().numpy()
-        with computing_on(torch.device("cpu")):  # the search is of NumPy's arrays, wherever the problem lies
-            lattice = lattice_of(obstacles.maps, obstacles.kinds, ends)
-            radius = float(obstacles.maps[0].vehicle_radius[0])
-            ways = list(search(lattice, ends, price, radius, float(obstacles.largest)))
-        for k, path in enumerate(ways):
+        for k, path in enumerate(in_one(scene, b, overlap, search)):
             corners[b, k, : len(path)] = start.new_tensor(path)
             if k == 0:
                 corners[b, 1:], found[b] = corners[b, :1], True  # the first stands in for those that there aren't
     return corners, found
+
+
+def in_one(scene: Scene, b: int, overlap: float, search: Search) -> list[Array]:
+    """What a search of the problem at place b finds."""
+    row = torch.tensor([b], device=scene.start.device)
+    obstacles = on_cpu(take(scene.obstacles, row)).reduced(overlap)
+
+    def price(points: Array) -> Array:
+        with computing_on(scene.start.device):
+            return scene.traversal_cost(scene.start.new_tensor(points)[None], row)[0].double().cpu().numpy()
+
+    ends = torch.stack((scene.start[b], scene.goal[b])).double().cpu().numpy()
+    with computing_on(torch.device("cpu")):  # the search is of NumPy's arrays, wherever the problem lies
+        lattice = lattice_of(obstacles.maps, obstacles.kinds, ends)
+        return search(lattice, ends, price, float(obstacles.maps[0].vehicle_radius[0]), float(obstacles.largest))
 
 
 def sweep_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
@@ -116,6 +108,7 @@ class Ways:
 
     def __init__(self, blocks: Blocks, ends: Array, price: Price, margin: float, least: float = 0.0) -> None:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
+        self.parts = blocks, ends, price, least
         self.least = least_at(blocks.lattice, ends)
         close = 1.0 + np.clip(1.0 - blocks.clearance / margin, 0.0, 1.0)
         rate = _smoothed(price, self.points, blocks.counts)
@@ -128,6 +121,11 @@ class Ways:
             apart = np.linalg.norm(self.points[seeds] - end, axis=1)
             self.seeds.append((seeds, apart * self.weight[seeds]))
             self.costs[i], self.before[i] = blocks.costs(self.weight, *self.seeds[i])
+
+    def nearer(self, margin: float) -> Ways:
+        """The same, but only nearer to obstacles than another margin, m, costs more."""
+        blocks, ends, price, least = self.parts
+        return Ways(blocks, ends, price, margin, least)
 
     @property
     def total(self) -> Array:
@@ -193,26 +191,14 @@ def paths(
     lattice: Lattice, ends: Array, price: Price, radius: float, unit: float, count: int, corners: int
 ) -> list[Array]:
     """Up to `count` taut paths (P, d), P <= corners, between two points (2, d), the cheapest first."""
-    ways = _ways(lattice, ends, price, radius, MARGIN * unit)
+    ways = ways_of(lattice, ends, price, radius, MARGIN * unit)
     if ways is None:
         return []
     found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
     return [path for path in found if len(path) <= corners]
 
 
-def _clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
-    """The cheapest path (HOPS+1, d) where all that is near obstacles is dear, its corners averaged; none, or one."""
-    ways = _ways(lattice, ends, price, radius, WIDE * unit)
-    if ways is None:
-        return []
-    path = ways.path(int(ways.total.argmin()))
-    step = max(lattice.spacing, length(path) / (HOPS * WIDE))
-    even = _even(path, max(2, int(np.ceil(length(path) / step)) + 1))
-    inner = gaussian_filter1d(even, AVERAGED * unit / step, axis=0, mode="nearest")
-    return [_even(np.concatenate((ends[:1], inner[1:-1], ends[1:])), HOPS + 1)]
-
-
-def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, margin: float) -> Ways | None:
+def ways_of(lattice: Lattice, ends: Array, price: Price, radius: float, margin: float) -> Ways | None:
     """The ways of the first search that finds any; None where none does."""
     for number, (most, share, merged) in enumerate(SEARCHES):
         if number == 1 and not lattice.may_join(ends):
@@ -228,16 +214,24 @@ def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, margin: fl
 
 
 def _in_the_plane(ways: Ways, count: int) -> list[Array]:
-    """The cheapest way of each homotopy class that leads through one block on the cheapest ways from both ends."""
+    """The cheapest way of each homotopy class, drawn taut."""
+    return [ways.taut(v) for v in itertools.islice(one_of_each_class(ways).values(), count)]
+
+
+def one_of_each_class(ways: Ways) -> dict[int, int]:
+    """Blocks on the cheapest way of each homotopy class in the plane, by what the class sweeps, the cheapest first.
+
+    Of each class that leads through one block on the cheapest ways from both ends.
+    """
     total = ways.total
     live = np.flatnonzero(np.isfinite(total))
     sums = [_swept_on_the_way(ways, i) for i in (0, 1)]
     kind = (sums[0] - sums[1])[live]
     order = np.argsort(total[live], kind="stable")
     _, first = np.unique(kind[order], return_index=True)
-    chosen = live[order[np.sort(first)[:count]]]
-    chosen = chosen[total[chosen] <= LONGEST * total[chosen[0]]]
-    return [ways.taut(int(v)) for v in chosen]
+    chosen = order[np.sort(first)]
+    chosen = chosen[total[live[chosen]] <= LONGEST * total[live[chosen[0]]]]
+    return dict(zip(kind[chosen].tolist(), live[chosen].tolist(), strict=True))
 
 
 def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
@@ -288,10 +282,10 @@ def _beside(ways: Ways, found: list[Array], count: int, unit: float) -> list[Arr
 
 def _spread(path: Array) -> Array:
     """Points (COMPARED, d) at equal shares of a path's length."""
-    return _even(path, COMPARED)
+    return even(path, COMPARED)
 
 
-def _even(path: Array, count: int) -> Array:
+def even(path: Array, count: int) -> Array:
     """Points (count, d) at equal shares of a path's length."""
     along = np.concatenate(([0.0], np.sqrt((np.diff(path, axis=0) ** 2).sum(1)).cumsum()))
     share = np.linspace(0.0, along[-1], count)

@@ -183,6 +183,8 @@ class Search:
         self._round: tuple[Tensor, Round] | None = None
         self.waiting: list[tuple[Tensor, SolveEnd]] = []  # rows and results that compete at the end
         self.proposed = torch.zeros_like(call.ids, dtype=torch.bool)  # (B,): whether there was ever a proposal
+        # (B,): whether the vehicle has been steered along all paths, so that there is no use in tracking these.
+        self.steered = torch.zeros_like(call.ids, dtype=torch.bool)
         self.rejected = torch.full_like(call.U0[:, 0, 0], torch.nan)  # (B,): mu of the proposals rejected so far
 
     @property
@@ -270,6 +272,7 @@ class Search:
         """A pass of proposals: of a new round, or of the one that has begun."""
         if not proposals.continues:
             rows = self.rows(proposals.when)
+            rows = rows[~self.steered[rows]]
             watches = self.call.callback is not None or self.call.deadline is not None
             watch = partial(self._watched, rows) if watches else unwatched
             problem, places = self.call.problem.take(rows), self.call.rows[rows]

@@ -6,6 +6,7 @@ step, the straight line between two knots may come closer than both.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -17,12 +18,15 @@ from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import leaves_goal
-from torchgco.lagrangian.state import SolveEnd
+from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued, mapped
 from torchgco.search.row import Row
+from torchgco.solvers.contracts import Call
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
+IN_MAPS = 2  # times as many rounds, which are short there
 GROWN_BARRIER = 1e-4  # of warm solves among grown obstacles, which lie deeper than rounding
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
 
@@ -37,7 +41,8 @@ class ClearChords(Row):
     dearer trajectory of the passes before that is clear is taken back.
 
     Args:
-        rounds: solves at most, each with larger obstacles than the one before.
+        rounds: solves at most, each with larger obstacles than the one before; in maps, by the interior point alone,
+            twice as many.
 
     Raises:
         InputError: a field out of its range.
@@ -60,34 +65,23 @@ class ClearChords(Row):
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
-        best, problem, limit = search.best, search.call.problem, search.solver.violation_tolerance
-        clearance = chord_clearance(problem, best.end.best.X)
-        by, now = torch.zeros_like(clearance), clearance.clone()
-        rows = touching = ((best.end.best.violation <= limit) & (clearance < 0)).nonzero().flatten()
-        for _ in range(self.rounds):
-            if rows.numel() == 0:
-                break
+        best = search.best
+
+        def once(rows: Tensor, call: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
             best.next_attempt()
-            by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
-            old = take(best.end.best, rows)
-            call = search.call.take(rows)
-            call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
             if mapped(call.problem):  # along whose one row per knot AL-iLQR takes many short steps
                 grown = replace(search.interior, warm_barrier=GROWN_BARRIER)
-                new = tight = continued(grown, replace(call, callback=None), old)
-                serves, now[rows] = self._kept(search, rows, new, clearance[rows])
-                clearance[rows] = torch.where(serves, now[rows], clearance[rows])
-                rows = rows[clearance[rows] < 0]
-                continue
+                return self._kept(search, rows, continued(grown, replace(call, callback=None), old), least)
             new = best.attempt(call)
-            serves, now[rows] = self._kept(search, rows, new, clearance[rows])
+            serves, now = self._kept(search, rows, new, least)
             tight = continued(search.interior, replace(call, callback=None), new.best)
-            least = torch.where(serves & is_over(tight.status), now[rows].clamp(max=0.0), torch.inf)
+            least = torch.where(serves & is_over(tight.status), now.clamp(max=0.0), torch.inf)
             too, clear = self._kept(search, rows, tight, least)
-            now[rows] = torch.where(too, clear, now[rows])
-            clearance[rows] = torch.where(serves, now[rows], clearance[rows])
-            rows = rows[clearance[rows] < 0]
-        best.restore(touching, clearance[touching] < 0)
+            return serves, torch.where(too, clear, now)
+
+        limit = search.solver.violation_tolerance
+        rounds = self.rounds * (IN_MAPS if mapped(search.call.problem) else 1)
+        best.restore(*cleared(search.call, best.end.best, rounds, limit, once))
 
     def _kept(self, search: Search, rows: Tensor, new: SolveEnd, least: Tensor) -> tuple[Tensor, Tensor]:
         """Where new trajectories of `rows` serve, with more clearance than `least`, they replace the best.
@@ -95,9 +89,51 @@ class ClearChords(Row):
         Returns where they did, and their clearances.
         """
         best, problem = search.best, search.call.problem.take(rows)
-        found = replace(new.best, violation=measured(problem, new.best.X, new.best.U))
-        clearance = chord_clearance(problem, found.X)
-        serves = (found.violation <= search.solver.violation_tolerance) & (clearance > least)
-        serves &= ~leaves_goal(problem, found.X, take(best.end.best, rows).X)
+        old, limit = take(best.end.best, rows), search.solver.violation_tolerance
+        serves, found, clearance = serving(problem, new.best, old, least, limit)
         best.replace(rows, serves, found, new)
         return serves, clearance
+
+
+Once = Callable[[Tensor, Call, Iterate, Tensor], tuple[Tensor, Tensor]]
+
+
+def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) -> tuple[Tensor, Tensor]:
+    """Solve the feasible problems of a call that touch an obstacle between two knots again, among larger obstacles.
+
+    Args:
+        best: the trajectories so far, of all problems; `once` puts better ones into it.
+        limit: violation up to which they are feasible.
+        once: solves problems `rows` (b,), by a call with obstacles that have grown for them, from their trajectories,
+            where more clearance than `least` (b,) is wanted. Returns where it has put new ones, and the clearances
+            (b,) that it has found.
+
+    Returns:
+        The problems that touched, and whether they still do.
+    """
+    clearance = chord_clearance(call.problem, best.X)
+    by, now = torch.zeros_like(clearance), clearance.clone()
+    rows = touching = ((best.violation <= limit) & (clearance < 0)).nonzero().flatten()
+    for _ in range(rounds):
+        if rows.numel() == 0 or call.late:
+            break
+        by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
+        old, part = take(best, rows), call.take(rows)
+        part = replace(part, problem=part.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
+        serves, now[rows] = once(rows, part, old, clearance[rows])
+        clearance[rows] = torch.where(serves, now[rows], clearance[rows])
+        rows = rows[clearance[rows] < 0]
+    return touching, clearance[touching] < 0
+
+
+def serving(
+    problem: Problem, new: Iterate, old: Iterate, least: Tensor, limit: float
+) -> tuple[Tensor, Iterate, Tensor]:
+    """Where new trajectories may replace old ones, as they are among the problems' own obstacles, and their clearances.
+
+    They do where they are feasible, arrive if the old ones do, and keep more clearance than `least`, (B,), m.
+    """
+    found = replace(new, violation=measured(problem, new.X, new.U))
+    clearance = chord_clearance(problem, found.X)
+    serves = (found.violation <= limit) & (clearance > least)
+    return serves & ~leaves_goal(problem, found.X, old.X), found, clearance

@@ -1,5 +1,8 @@
 """The interior point beside a search, where it is cheap: from the guess, and from where the first solve was caught.
 
+A vehicle that drives along its heading is steered along the paths, too (`pursue`); where that arrives there is no
+search, and where it doesn't, only samples are left: tracking the same paths by iLQR takes a hundred times as long.
+
 A first solve is stopped where a knot lies millimetres inside one obstacle, and may be at the optimum there. Among few
 obstacles in the plane an interior point from there, or from the guess, takes a hundredth of the iterations that a
 search takes. Its results compete with the search's by cost, at the end; they spare it only where it could save little.
@@ -20,14 +23,14 @@ from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
-from torchgco.search.nearby import without_obstacles
+from torchgco.search.converge import mapped
+from torchgco.search.nearby import FREE, without_obstacles
+from torchgco.search.pursue import pursue
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little
-LIMIT = 100  # iterations
-FREE = InteriorPoint(tolerance=1e-4, max_iterations=LIMIT)  # of the trajectory without obstacles
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class Direct(Row):
     """Solves caught problems by the interior point too; the results are compared with the search's at its end.
 
     Where one arrives and costs little more than the trajectory without obstacles, which keeps all other constraints,
-    there is no search: it could save no more than that.
+    there is no search: it could save no more than that. Nor is there where a vehicle that is steered along the paths
+    arrives.
 
     Args:
         gap: how much more it may cost, as a share.
@@ -56,12 +60,13 @@ class Direct(Row):
 
     @property
     def problems(self) -> str:
-        return f"caught in the plane among at most {self.most} obstacles"
+        return f"caught in the plane among at most {self.most} obstacles and no map"
 
     @property
     def does(self) -> str:
         return (
-            f"interior point from the guess and from there; over {self.gap:.0%} dearer than without obstacles, search"
+            f"interior point from the guess and from there; over {self.gap:.0%} dearer than without obstacles, what "
+            "drives along its heading is steered along the paths; search"
         )
 
     def run(self, search: Search) -> None:
@@ -76,19 +81,21 @@ class Direct(Row):
             free = FREE.solved(replace(call, problem=bare))
             bound = free.best.cost
             search.best.end.iterations[rows] += free.iterations
-        solver = InteriorPoint(max_iterations=LIMIT)
+        solver = InteriorPoint()
         left = self._compared(search, rows, call, solver.solved(call), bound)
         if left.numel() > 0:
             start = take(search.caught.last, rows[left])
             call = replace(call.take(left), U0=start.U)
             solver = replace(solver, initial_barrier=FROM_CAUGHT)
-            self._compared(search, rows[left], call, solver.solved(call, start.X), bound[left])
+            left = left[self._compared(search, rows[left], call, solver.solved(call, start.X), bound[left])]
+        if left.numel() > 0:
+            pursue(search, rows[left])
 
     def serves(self, problem: Problem) -> bool:
         """Whether the interior point is cheap for these problems: among few obstacles in the plane."""
         at = problem.position
         bodies = sum(part.absent.shape[1] for part in problem.geometric if isinstance(part, Obstacles))
-        return at.stop - at.start == 2 and bodies <= self.most
+        return at.stop - at.start == 2 and bodies <= self.most and not mapped(problem)
 
     def _compared(self, search: Search, rows: Tensor, call: Call, end: SolveEnd, bound: Tensor) -> Tensor:
         """Keep results of `rows` that are hardly dearer than a bound (b,); places (b',) of the others, which wait."""

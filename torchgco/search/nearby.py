@@ -24,8 +24,10 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import gates_of
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
+from torchgco.solvers.interior import InteriorPoint
 
 DETOUR = math.sqrt(2.0)  # ways this many times as long as the straight one stay within half of its length from it
+FREE = InteriorPoint(tolerance=1e-4, max_iterations=100)  # of trajectories without obstacles
 FEWER = 0.5  # share of a problem's obstacles that must be far from a trajectory, for leaving any out of its refining
 
 

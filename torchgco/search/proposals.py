@@ -23,6 +23,7 @@ from torchgco.base.options import Count, Natural, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.kernels import cost_unit, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Scene
@@ -32,9 +33,11 @@ from torchgco.roadmap.legs import paths_through
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
 from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
+from torchgco.search.nearby import FREE, without_obstacles
 from torchgco.search.record import comparison
 from torchgco.search.row import Row
 from torchgco.solution import SearchRecord
+from torchgco.solvers.contracts import Call
 
 WHEN = {
     "caught": "caught",
@@ -166,9 +169,11 @@ class PathProposals(Row):
             return torch.arange(part.problem.B, device=part.rest.device)
         if self.max_gap is None:
             return part.proposal.found.new_empty(0, dtype=torch.int64)
-        free, U = part.free(self.follow[0].iterations), part.proposal.U
+        free, U = part.free(self.follow[0].iterations).cost, part.proposal.U
         cost, _ = value(plain(part.problem), open_loop(part.problem, U), U)
-        return (part.proposal.found & (cost > free.cost + self.max_gap * free.cost.abs())).nonzero().flatten()
+        rows = (part.proposal.found & (cost > free + self.max_gap * free.abs())).nonzero().flatten()
+        least = torch.maximum(free[rows], part.limited(rows))
+        return rows[cost[rows] > least + self.max_gap * least.abs()]
 
     def _improve(self, whole: Part, rows: Tensor, watch: Watch) -> None:
         """As `improve`, for the problems in `rows`."""
@@ -284,6 +289,19 @@ class Part:
             self._free = unconstrained(self.problem, self.rest, iterations, unit.nan_to_num(1.0, 1.0, 1.0))
             self.proposal.iterations.add_(self._free.iterations)
         return self._free
+
+    def limited(self, rows: Tensor) -> Tensor:
+        """Costs (b,) of the trajectories of some problems without obstacles, but within all other limits.
+
+        Minus infinity where none is found, or where there are no such limits.
+        """
+        least = torch.full_like(self.rest[rows, 0, 0], -torch.inf)
+        bare = without_obstacles(self.problem.take(rows)) if rows.numel() > 0 else None
+        if bare is None or len(bare.constraints) == len(bare.obstacles):
+            return least
+        end = FREE.solved(Call.checked(bare, self.rest[rows]))
+        self.proposal.iterations[rows] += end.iterations
+        return torch.where(end.best.violation <= ADMITTED, end.best.cost, least)
 
 
 class Round:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,38 +23,94 @@ WIDE = 3.0  # the range, around 0, of what has no bounds
 INERT = 1e-9  # slope, as a share of the largest, of what a step's length doesn't depend on
 CLIMBS = 40  # rounds of ascent from the samples, which halve a step of half the box to 5e-13 of it
 NAMED = 5  # problems that the sentence names
+WIDER, GROWN = 100.0, 0.01  # times that range, in which what has no bounds may raise the acceleration by this share
+TINY = 1e-12  # m^2/s^2: squared speeds below it count as it
+FEWER = 4  # one in so many samples shows how strong the acceleration is
+SHORT = 1e-6  # s, over which a change of velocity is measured
 SEED = 0x5EED
 
 
 def short_horizons(problem: Problem) -> str | None:
     """A sentence on the problems whose horizon is shorter than the way to their goal needs; None without any.
 
-    Only for goals that were stated, and models with a largest step: one that no state or control without bounds makes
-    longer. Through a map the way is the roadmap's, otherwise the straight line.
+    Only for goals that were stated, and models with a largest step, one that no state or control without bounds makes
+    longer, or else with a largest acceleration: of a double integrator with bounded controls. Through a map the way is
+    the roadmap's, otherwise the straight line.
     """
     goal = problem.goal
     if goal is None or goal.assumed or problem.B == 0:
         return None
     with computing_on(problem.x0.device):
-        step = longest_step(problem)
-        if step is None:
+        limit = _limit(problem)
+        if limit is None:
             return None
         far = goal.distance(problem.x0[:, problem.position])
-        reach = problem.stages * step + goal.radius
+        reach = limit.reach(problem) + goal.radius
         far = torch.maximum(far, torch.where(far <= reach, _ways(problem, far <= reach), 0.0))
-        if bool((far > reach).any()):  # the longest step may lie between the samples
-            step = longest_step(problem, CLIMBS)
-            assert step is not None
-    short = (far > problem.stages * step + goal.radius).nonzero().flatten().tolist()
+        if bool((far > reach).any()):  # the largest may lie between the samples
+            limit = _limit(problem, CLIMBS)
+            assert limit is not None
+    short = (far > limit.reach(problem) + goal.radius).nonzero().flatten().tolist()
     if not short:
         return None
     first, named = short[0], ", ".join(map(str, short[:NAMED])) + (", ..." if len(short) > NAMED else "")
-    needed = max(math.ceil(float((far[b] - goal.radius[b]) / step[b])) for b in short)
+    needed = max(math.ceil(float(limit.stages(problem, far - goal.radius)[b])) for b in short)
     return (
         f"{len(short)} of {problem.B} horizons are too short for the way to the goal (problem {named}): the first is "
         f"{float(far[first]):.3g} m long, of which {int(problem.stages[first])} stages cover at most "
-        f"{float(problem.stages[first] * step[first]):.3g} m; N = {needed} would do at full speed"
+        f"{float(limit.reach(problem)[first]):.3g} m; {limit.advice(needed)}"
     )
+
+
+class Step(NamedTuple):
+    """The longest way of a stage, (B,), m."""
+
+    step: Tensor
+
+    def advice(self, N: int) -> str:
+        """Which horizon to take."""
+        return f"N = {N} would do at full speed"
+
+    def reach(self, problem: Problem) -> Tensor:
+        """The way (B,), m, that the horizon covers at most."""
+        return problem.stages * self.step
+
+    def stages(self, problem: Problem, way: Tensor) -> Tensor:
+        """The stages (B,) that ways (B,), m, take at least."""
+        return way / self.step
+
+
+class Push(NamedTuple):
+    """The largest increase of the speed, (B,), m/s^2."""
+
+    push: Tensor
+
+    def advice(self, N: int) -> str:
+        """Which horizon to take."""
+        return f"from rest to rest it takes N = {N} at full acceleration"
+
+    def reach(self, problem: Problem) -> Tensor:
+        """The way (B,), m, on which a vehicle accelerates until the end of the horizon."""
+        time = problem.stages * float(problem.dynamics.dt)
+        u = problem.x0.new_zeros(problem.B, problem.m)
+        speed = problem.dynamics.field(problem.x0, u)[:, problem.position].square().sum(-1).sqrt()
+        return speed * time + 0.5 * self.push * time.square()
+
+    def stages(self, problem: Problem, way: Tensor) -> Tensor:
+        """The stages (B,) that ways (B,), m, take from rest to rest: half of each accelerating, half braking."""
+        return 2.0 * (way / self.push).sqrt() / float(problem.dynamics.dt)
+
+
+def _limit(problem: Problem, climbs: int = 0) -> Step | Push | None:
+    """What limits the way within a horizon; None where nothing does."""
+    box = _Box.of(problem)
+    if box is None:
+        return None
+    step = _longest(problem, box, climbs)
+    if step is not None:
+        return Step(step)
+    push = _strongest(problem, box, climbs)
+    return None if push is None else Push(push)
 
 
 def longest_step(problem: Problem, climbs: int = 0) -> Tensor | None:
@@ -61,31 +119,87 @@ def longest_step(problem: Problem, climbs: int = 0) -> Tensor | None:
     The greatest of samples and corners of what it depends on, which has bounds at all knots, after so many rounds of
     projected gradient ascent from each.
     """
-    if problem.dynamics.position is None or problem.dynamics.at(0) is not problem.dynamics:
-        return None
-    low, high = _box(problem)
-    bounded = torch.isfinite(low) & torch.isfinite(high)
-    draws = torch.Generator("cpu").manual_seed(SEED)  # the same for every problem and device
-    share = torch.rand(1, SAMPLES, problem.n + problem.m, dtype=low.dtype, generator=draws, device="cpu").to(low.device)
-    least, most = torch.where(bounded, low, -WIDE).unsqueeze(1), torch.where(bounded, high, WIDE).unsqueeze(1)
-    z = least + share * (most - least)
-    (slopes,) = gradients(lambda z: _way(problem, z), z)
-    depends = (slopes.abs() > INERT * slopes.abs().amax()).flatten(0, 1).any(0)
-    if not bool(bounded[:, depends].all()):
-        return None
-    z = torch.cat((z, least + (share > 0.5) * (most - least)), dim=1)
-    return _climbed(problem, z, least, most, climbs).amax(-1).sqrt()
+    box = _Box.of(problem)
+    return None if box is None else _longest(problem, box, climbs)
 
 
-def _climbed(problem: Problem, z: Tensor, least: Tensor, most: Tensor, climbs: int) -> Tensor:
-    """The squared lengths (B, S) after ascent from z (B, S, n + m) within a box; steps that don't ascend are halved."""
-    way, size = _way(problem, z), torch.full_like(z[..., :1], 0.5)
-    for _ in range(climbs):
+def strongest_push(problem: Problem, climbs: int = 0) -> Tensor | None:
+    """The largest increase of the speed (B,), m/s^2, within the bounds on states and controls; None without a limit.
+
+    Where controls don't change the speed at once. As `longest_step`, but what has no bounds may matter as long as the
+    increase doesn't grow with it: it is compared in ranges that are a hundred times as wide, or as narrow.
+    """
+    box = _Box.of(problem)
+    return None if box is None else _strongest(problem, box, climbs)
+
+
+class _Box(NamedTuple):
+    """Where states and controls are looked at."""
+
+    bounded: Tensor  # (B, n + m) bool; the others lie within `WIDE` around 0
+    least: Tensor  # (B, 1, n + m)
+    most: Tensor
+    z: Tensor  # (B, 2 SAMPLES, n + m): samples, and corners
+    depends: Tensor  # (n + m,) bool: on what the way of a stage does
+
+    @classmethod
+    def of(cls, problem: Problem) -> _Box | None:
+        """None without a position, or with a model that isn't the same at all stages."""
+        if problem.dynamics.position is None or problem.dynamics.at(0) is not problem.dynamics:
+            return None
+        low, high = bounds_at_inner_knots(problem)
+        bounded = torch.isfinite(low) & torch.isfinite(high)
+        draws = torch.Generator("cpu").manual_seed(SEED)  # the same for every problem and device
+        share = torch.rand(1, SAMPLES, problem.n + problem.m, dtype=low.dtype, generator=draws, device="cpu")
+        share = share.to(low.device)
+        least, most = (torch.where(bounded, *ends).unsqueeze(1) for ends in ((low, -WIDE), (high, WIDE)))
+        z = least + share * (most - least)
         (slopes,) = gradients(lambda z: _way(problem, z), z)
+        depends = (slopes.abs() > INERT * slopes.abs().amax()).flatten(0, 1).any(0)
+        return cls(bounded, least, most, torch.cat((z, least + (share > 0.5) * (most - least)), dim=1), depends)
+
+
+def _longest(problem: Problem, box: _Box, climbs: int) -> Tensor | None:
+    """As `longest_step`."""
+    if not bool(box.bounded[:, box.depends].all()):
+        return None
+    return _climbed(lambda z: _way(problem, z), box.z, box.least, box.most, climbs).amax(-1).sqrt()
+
+
+def _strongest(problem: Problem, box: _Box, climbs: int) -> Tensor | None:
+    """As `strongest_push`."""
+    if bool(box.depends[problem.n :].any()) or not problem.dynamics.is_integrated:
+        return None
+    bounded, some = box.bounded.unsqueeze(1), box.z[:, ::FEWER]
+    z = torch.cat([torch.where(bounded, some, scale * some) for scale in (1.0 / WIDER, 1.0, WIDER)], dim=1)
+    low, near, far = _push(problem, z).unflatten(1, (3, -1)).amax(-1).unbind(1)
+    near = torch.maximum(low, near)  # where drag grows with the speed, the slowest accelerate the most
+    if not bool((torch.isfinite(near) & (near > 0) & (far <= (1.0 + GROWN) * near)).all()):
+        return None
+    if climbs == 0:
+        return near
+    z = z[:, : 2 * some.shape[1]]
+    return torch.maximum(near, _climbed(lambda z: _push(problem, z), z, box.least, box.most, climbs).amax(-1))
+
+
+def _push(problem: Problem, z: Tensor) -> Tensor:
+    """How fast the speed grows, (B, S), m/s^2, at states and controls z (B, S, n + m)."""
+    field, at, n = problem.dynamics.field, problem.position, problem.n
+    x, u = z[..., :n], z[..., n:]
+    rate = field(x, u)
+    change = (field(x + SHORT * rate, u)[..., at] - field(x - SHORT * rate, u)[..., at]) / (2.0 * SHORT)
+    return (rate[..., at] * change).sum(-1) / rate[..., at].square().sum(-1).clamp(min=TINY).sqrt()
+
+
+def _climbed(value: Callable[[Tensor], Tensor], z: Tensor, least: Tensor, most: Tensor, climbs: int) -> Tensor:
+    """The values (B, S) after ascent from z (B, S, n + m) within a box; steps that don't ascend are halved."""
+    way, size = value(z), torch.full_like(z[..., :1], 0.5)
+    for _ in range(climbs):
+        (slopes,) = gradients(value, z)
         slopes = slopes * (most - least)
         tried = z + size * (most - least) * slopes / slopes.abs().amax(-1, keepdim=True).clamp(min=1e-300)
         tried = torch.minimum(torch.maximum(tried, least), most)
-        longer = _way(problem, tried)
+        longer = value(tried)
         better = longer > way
         z, way = torch.where(better.unsqueeze(-1), tried, z), torch.where(better, longer, way)
         size = torch.where(better.unsqueeze(-1), size, 0.5 * size)
@@ -101,7 +215,7 @@ def _way(problem: Problem, z: Tensor) -> Tensor:
     return (dynamics.dt * dynamics.field(x, u)[..., at]).square().sum(-1)
 
 
-def _box(problem: Problem) -> tuple[Tensor, Tensor]:
+def bounds_at_inner_knots(problem: Problem) -> tuple[Tensor, Tensor]:
     """The loosest bounds (B, n + m) of the states at knots 1..N-1 and of the controls; infinite without any."""
     low = problem.x0.new_full((problem.B, problem.n + problem.m), -torch.inf)
     high = -low

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, Self
 
 from torchgco.base.options import Count, Natural, Positive, check_options
@@ -39,7 +40,7 @@ class FirstSolve(Row):
     def __post_init__(self) -> None:
         check_options(self, "guess")
 
-    @property
+    @cached_property
     def steps(self) -> tuple[Row, ...]:
         solve = Solve(single_contact_after=self.single_contact_after)
         return Converge(among="free"), Solve("end", "pathless"), solve, Direct()
@@ -54,7 +55,8 @@ class FirstSolve(Row):
         single = "" if after is None else f", or one after {after} outer iterations"
         return (
             "without obstacles: interior point from the guess or the start held; where no path can be sought: AL-iLQR "
-            f"to the end; else until caught (two obstacles at a knot{single}); {Direct().problems}: interior point too"
+            f"to the end; else until caught (two obstacles at a knot{single}); {Direct().problems}: interior point "
+            "too, and what drives along its heading is steered along the paths"
         )
 
 
@@ -97,7 +99,7 @@ class Paths(Row):
             max_penetration=self.max_penetration,
         )  # fmt: skip
 
-    @property
+    @cached_property
     def steps(self) -> tuple[Row, ...]:
         first, near = self.proposals, closer(self.follow)
         # Obstacles may bar the way from rest to the path, such as a wall between the two.
@@ -163,7 +165,7 @@ class Samples(Row):
     def __post_init__(self) -> None:
         check_options(self, "samples")
 
-    @property
+    @cached_property
     def steps(self) -> tuple[Row, ...]:
         return (
             IntoGoal("pathless"), FromSamples("unproposed"), FromSamples(redraws=self.redraws), IntoGoal(), Join(),
@@ -198,7 +200,7 @@ class Tighten(Row):
     def __post_init__(self) -> None:
         check_options(self, "tighten")
 
-    @property
+    @cached_property
     def steps(self) -> tuple[Row, ...]:
         return Converge(), *((Starts(self.starts),) if self.starts > 0 else ())
 

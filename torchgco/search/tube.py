@@ -15,21 +15,17 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, check_options
-from torchgco.base.status import Status
-from torchgco.base.tree import take
-from torchgco.kernels import chord_clearance, open_loop
-from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.lagrangian.quality import has_arrived
-from torchgco.lagrangian.state import SolveEnd
+from torchgco.kernels import open_loop
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.attempts import Search
-from torchgco.search.candidates import Candidates, Refine, Refined
-from torchgco.search.converge import mapped, solved_nearby
+from torchgco.search.candidates import Candidates
+from torchgco.search.converge import mapped
+from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Follow, Free, Paths
 from torchgco.search.proposals import Part
+from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
 from torchgco.search.row import Row
-from torchgco.solvers.interior import InteriorPoint
 
 AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
 # Tracked candidates lie a small part of R inside an obstacle, from where the interior point leads out of it again; from
@@ -37,23 +33,21 @@ AT_ONCE = 256  # candidates of all problems that are tracked and solved together
 FOLLOW = Follow(smoothing=0.02, tube=0.05, stiffness=(200.0, 2000.0), iterations=40)
 TURN = 0.5  # share of a control's range by which a vehicle is turned on the spot over the first tenth of the horizon
 STILL = 1e-9  # share of the distance to the goal by which it may move then
-DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all others
 LATEST_FIRST = 0.55  # share of the horizon: the slowest that the first pace is
 ROADMAP = Roadmap()
 PACES = 4  # at which each path is tracked
 TOP = 8  # candidates of a problem that are solved, those of least cost as tracked: the lanes of a vector in C
-# From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
-SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
-BOTH = Refine(top=2)  # marks candidates as solved in the record
 
 
 @dataclass(frozen=True)
 class Tube(Row):
     """Tracks paths closely at several paces, solves the cheapest by the interior point, and keeps the best.
 
-    Among the paths is one that keeps clear of a map's obstacles, with its corners averaged. A vehicle that can turn on
-    the spot follows each from rest and after either turn: else it reverses along much of a way behind it. The first
-    pace is that of the trajectory without obstacles, the last takes the whole horizon; the others lie evenly between.
+    In maps, a vehicle that drives along its heading is steered along ways that keep clear of them first (`pursue`).
+    Where that doesn't arrive, and for all others, paths are tracked; among these is one that keeps clear of a map's
+    obstacles, with its corners averaged. A vehicle that can turn on the spot follows each from rest and after either
+    turn: else it reverses along much of a way behind it. The first pace is that of the trajectory without obstacles,
+    the last takes the whole horizon; the others lie evenly between.
     Candidates count where they end feasible and at the goal.
 
     Args:
@@ -83,14 +77,24 @@ class Tube(Row):
 
     @property
     def does(self) -> str:
-        more = " and one that keeps clear" if self.among == "maps" else ""
+        more, first = "", ""
+        if self.among == "maps":
+            more, first = " and one that keeps clear", f"{DOES}; others, or without success: "
         tracked = f"{self.num_paths} paths{more}: {FOLLOW}, {PACES} paces"
-        return f"{tracked}; not relaxed; interior point from the {TOP} cheapest"
+        return f"{first}{tracked}; not relaxed; interior point from the {TOP} cheapest"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         rows = search.rows("unarrived")
         if rows.numel() == 0 or not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
+            return
+        if self.among == "maps":
+            for some in rows.split(PURSUED_AT_ONCE):
+                if not search.call.late:
+                    pursue(search, some)
+            rows = search.rows("unarrived")
+        rows = rows[~search.steered[rows]]
+        if rows.numel() == 0:
             return
         each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
         for some in rows.split(max(1, AT_ONCE // each)):
@@ -115,25 +119,12 @@ class Tube(Row):
         starts = starts.repeat_interleave(PACES, dim=1).repeat(1, paths.corners.shape[1], 1, 1)
         candidates = Candidates.begin(part.problem, starts, paths.R, paths.unit, live)
         tracked = FOLLOW.along(candidates, paths, self._arrivals(paths, part.free(FOLLOW.iterations)), PACES)
-        chosen = tracked.pick(self._order(tracked)[:, :TOP])
+        chosen = tracked.pick(in_order(tracked)[:, :TOP])
         search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
-        solved = self._solved(search, rows, chosen)
+        ends = solved(search, rows, chosen)
         if search.record is not None:
-            found = solved.cost[solved.best].isfinite()
-            part.note(every, paths, BOTH, tracked, chosen, chosen.live, solved, found)
-
-    def _order(self, tracked: Candidates) -> Tensor:
-        """Places (B, count) of each problem's candidates: live ones that aren't deep in an obstacle first, then cheap.
-
-        What a candidate costs as tracked says more of what it will cost than its depth does, which will be mended.
-        """
-        merit = torch.full_like(tracked.unit, torch.inf)
-        for rows in tracked.parts():
-            merit[rows] = tracked.of(rows).cost.total(tracked.X[rows], tracked.U[rows])
-        order = merit.nan_to_num(torch.inf).view(-1, tracked.count).argsort(dim=-1, stable=True)
-        deep, dead = tracked.penetration() > DEEP * tracked.R, ~tracked.live
-        last = torch.where(dead, 2, deep.to(torch.int8)).view(-1, tracked.count)
-        return order.gather(1, last.gather(1, order).argsort(dim=-1, stable=True))
+            found = ends.cost[ends.best].isfinite()
+            part.note(every, paths, BOTH, tracked, chosen, chosen.live, ends, found)
 
     def _arrivals(self, paths: Paths, free: Free) -> Tensor:
         """Shares (B * K * paces,) of the horizon at which each candidate arrives."""
@@ -141,48 +132,6 @@ class Tube(Row):
         first = own.nan_to_num(torch.inf).clamp(min=2.0 * torch.finfo(own.dtype).eps, max=LATEST_FIRST)
         later = torch.linspace(0.0, 1.0, PACES, dtype=first.dtype, device=first.device)
         return (first.unsqueeze(-1) + (1.0 - first.unsqueeze(-1)) * later).flatten()
-
-    def _solved(self, search: Search, rows: Tensor, tracked: Candidates) -> Refined:
-        """Every tracked candidate solved; the best of each problem in `rows` is kept."""
-        problem, limit = tracked.problem, search.solver.violation_tolerance
-        finite = [torch.isfinite(part).flatten(1).all(-1) for part in (tracked.X, tracked.U)]
-        some = (tracked.live & finite[0] & finite[1]).nonzero().flatten()
-        cost, made = torch.full_like(tracked.unit, torch.inf), tracked.iterations
-        multipliers = Multipliers(tuple(tracked.U.new_zeros(0, *s) for s in problem.row_shapes), tracked.unit)
-        if some.numel() == 0:
-            return Refined(tracked, multipliers, some.new_zeros(problem.B), cost)
-        call = replace(search.call.take(rows[some // tracked.count]), U0=tracked.U[some], warm=None, callback=None)
-        end = solved_nearby(SOLVER, call, tracked.X[some])
-        good = (end.best.violation <= limit) & has_arrived(call.problem, end.best.X)
-        cost[some] = torch.where(good, end.best.cost, torch.inf)
-        made = made.index_add(0, some // tracked.count, end.iterations)
-        clear, fits = torch.full_like(cost, torch.inf), good.nonzero().flatten()
-        if fits.numel() > 0:  # others may end anywhere
-            misses = chord_clearance(call.problem.take(fits), end.best.X[fits]) >= 0
-            clear[some[fits]] = torch.where(misses, end.best.cost[fits], torch.inf)
-        for merit in (clear, cost):  # the cheapest that is clear between knots, too, is remembered by `Best.keep`
-            self._keep(search, rows, tracked.count, some, end, merit, made)
-            made = torch.zeros_like(made)
-        best = cost.view(-1, tracked.count).argmin(1) + torch.arange(problem.B, device=rows.device) * tracked.count
-        X, U = tracked.X.clone(), tracked.U.clone()
-        X[some], U[some] = end.best.X, end.best.U
-        return Refined(replace(tracked, X=X, U=U), multipliers, best, cost)
-
-    def _keep(
-        self, search: Search, rows: Tensor, count: int, some: Tensor, end: SolveEnd, merit: Tensor, made: Tensor
-    ) -> None:
-        """Keep the solved candidate of least merit (B * count,) of each problem in `rows`; `made` (B,) iterations."""
-        least, at = merit.view(-1, count).min(1)
-        place = torch.full_like(merit, -1, dtype=torch.int64)
-        place[some] = torch.arange(some.numel(), device=some.device)
-        chosen = place.view(-1, count).gather(1, at.unsqueeze(1))[:, 0]
-        found = torch.isfinite(least).nonzero().flatten()
-        one = take(end, chosen[found])
-        one.status[:] = int(Status.MAX_ITERATIONS)  # the last row brings it to its own tolerance
-        one.iterations[:] = made[found]
-        search.best.keep(rows[found], one)
-        lost = (~torch.isfinite(least)).nonzero().flatten()
-        search.best.end.iterations[rows[lost]] += made[lost]
 
 
 def _starts(problem: Problem, rest: Tensor) -> tuple[Tensor, Tensor]:

@@ -269,7 +269,7 @@ class Exploration:
             torch.where(wide, found.X[rows], kept.X), torch.where(wide, found.U[rows], kept.U),
             torch.where(wide.unsqueeze(-1), K[rows], kept.K), kept.multipliers, kept.penalty,
             torch.where(new, found.cost[rows], kept.cost), torch.where(new, found.violation[rows], 0.0), ~new,
-            found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
+            found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0, torch.zeros_like(new),
         )  # fmt: skip
 
     def _best(self, X: Tensor, cost: Tensor, excess: Tensor, kept: Tensor, b: int) -> int | None:

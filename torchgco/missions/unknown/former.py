@@ -32,7 +32,7 @@ def former_plans(problem: Problem, before: Plan | None) -> Plan:
     return Plan(
         X, U.nan_to_num(), K, Multipliers.zero(problem, 1.0), penalty, problem.cost.total(X, U),
         problem.x0.new_zeros(problem.B), torch.ones(problem.B, dtype=torch.bool), none, none.clone(),
-        problem.x0, problem.x0[:, :3], problem.dynamics, 0,
+        problem.x0, problem.x0[:, :3], problem.dynamics, 0, none.bool(),
     )  # fmt: skip
 
 

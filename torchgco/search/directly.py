@@ -1,0 +1,84 @@
+"""Candidates that are solved by the interior point as they are: which of them, and the best is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.kernels import chord_clearance
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.state import SolveEnd
+from torchgco.search.attempts import Search
+from torchgco.search.candidates import Candidates, Refine, Refined
+from torchgco.search.converge import solved_nearby
+from torchgco.solvers.interior import InteriorPoint
+
+DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all others
+CUT = 0.3  # depth between two knots, in R, of solved ones that don't count: a step through a wall can't be mended
+# From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
+SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
+BOTH = Refine(top=2)  # marks candidates as solved in the record
+
+
+def in_order(candidates: Candidates) -> Tensor:
+    """Places (B, count) of each problem's candidates: live ones that aren't deep in an obstacle first, then cheap.
+
+    What a candidate costs as it is says more of what it will cost than its depth does, which will be mended.
+    """
+    merit = torch.full_like(candidates.unit, torch.inf)
+    for rows in candidates.parts():
+        merit[rows] = candidates.of(rows).cost.total(candidates.X[rows], candidates.U[rows])
+    order = merit.nan_to_num(torch.inf).view(-1, candidates.count).argsort(dim=-1, stable=True)
+    deep, dead = candidates.penetration() > DEEP * candidates.R, ~candidates.live
+    last = torch.where(dead, 2, deep.to(torch.int8)).view(-1, candidates.count)
+    return order.gather(1, last.gather(1, order).argsort(dim=-1, stable=True))
+
+
+def solved(search: Search, rows: Tensor, chosen: Candidates) -> Refined:
+    """Every chosen candidate solved; of each problem in `rows` the best that is feasible and arrives is kept.
+
+    None that steps over an obstacle from one knot to the next counts.
+    """
+    problem, limit = chosen.problem, search.solver.violation_tolerance
+    finite = [torch.isfinite(part).flatten(1).all(-1) for part in (chosen.X, chosen.U)]
+    some = (chosen.live & finite[0] & finite[1]).nonzero().flatten()
+    cost, made = torch.full_like(chosen.unit, torch.inf), chosen.iterations
+    multipliers = Multipliers(tuple(chosen.U.new_zeros(0, *s) for s in problem.row_shapes), chosen.unit)
+    if some.numel() == 0:
+        return Refined(chosen, multipliers, some.new_zeros(problem.B), cost)
+    call = replace(search.call.take(rows[some // chosen.count]), U0=chosen.U[some], warm=None, callback=None)
+    end = solved_nearby(SOLVER, call, chosen.X[some])
+    made = made.index_add(0, some // chosen.count, end.iterations)
+    fits = ((end.best.violation <= limit) & has_arrived(call.problem, end.best.X)).nonzero().flatten()
+    clear = cost.clone()
+    if fits.numel() > 0:  # others may end anywhere
+        clearance = chord_clearance(call.problem.take(fits), end.best.X[fits])
+        for merit, least in ((cost, -CUT * chosen.R[some[fits]]), (clear, torch.zeros_like(clearance))):
+            merit[some[fits]] = torch.where(clearance >= least, end.best.cost[fits], torch.inf)
+    for merit in (clear, cost):  # the cheapest that is clear between knots, too, is remembered by `Best.keep`
+        _keep(search, rows, chosen.count, some, end, merit, made)
+        made = torch.zeros_like(made)
+    best = cost.view(-1, chosen.count).argmin(1) + torch.arange(problem.B, device=rows.device) * chosen.count
+    X, U = chosen.X.clone(), chosen.U.clone()
+    X[some], U[some] = end.best.X, end.best.U
+    return Refined(replace(chosen, X=X, U=U), multipliers, best, cost)
+
+
+def _keep(search: Search, rows: Tensor, count: int, some: Tensor, end: SolveEnd, merit: Tensor, made: Tensor) -> None:
+    """Keep the solved candidate of least merit (B * count,) of each problem in `rows`; `made` (B,) iterations."""
+    least, at = merit.view(-1, count).min(1)
+    place = torch.full_like(merit, -1, dtype=torch.int64)
+    place[some] = torch.arange(some.numel(), device=some.device)
+    chosen = place.view(-1, count).gather(1, at.unsqueeze(1))[:, 0]
+    found = torch.isfinite(least).nonzero().flatten()
+    one = take(end, chosen[found])
+    one.status[:] = int(Status.MAX_ITERATIONS)  # the last row brings it to its own tolerance
+    one.iterations[:] = made[found]
+    search.best.keep(rows[found], one)
+    lost = (~torch.isfinite(least)).nonzero().flatten()
+    search.best.end.iterations[rows[lost]] += made[lost]
