@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchgco import kernels as kernels
 from torchgco import presets as presets
+from torchgco import sensitivity
 from torchgco.api import compare as compare
 from torchgco.api import plot as plot
 from torchgco.api import show as show
@@ -81,7 +82,6 @@ from torchgco.scenarios import Layouts as Layouts
 from torchgco.search import MultiStart as MultiStart
 from torchgco.search import PathProposals as PathProposals
 from torchgco.search import Restarts as Restarts
-from torchgco.sensitivity import predicted
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
@@ -124,10 +124,10 @@ def _shown(self: Solution, problem: Problem) -> HtmlPage:
 
 
 def _predicted(self: Solution, changed: Problem, problem: Problem | None = None) -> Solution:
-    return predicted(self, changed, problem)
+    return sensitivity.predicted(self, changed, problem)
 
 
-_predicted.__doc__ = predicted.__doc__
+_predicted.__doc__ = sensitivity.predicted.__doc__
 Solution.show, Solution.predict = _shown, _predicted
 
 # On some processors the library behind PyTorch's matrix products (MKL) picks a kernel by a matrix's address in memory,
