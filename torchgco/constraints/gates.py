@@ -54,7 +54,8 @@ class Gates(Constraint):
         centers = _each(self.centers, "gates.centers", dims, (d,))
         G = centers.shape[1]
         if (self.radius is None) == (self.normals is None):
-            raise InputError("gates.radius", "a radius, or normals and half_widths", "both" if self.normals else "none")
+            got = "none" if self.normals is None else "both"
+            raise InputError("gates.radius", "a radius, or normals and half_widths", got)
         if (self.normals is None) != (self.half_widths is None):
             raise InputError("gates.half_widths", "half widths where there are normals", shown(self.half_widths))
         gap = 1 if self.normals is None else 2
