@@ -44,7 +44,8 @@ class MPPIController:
         U: the plan (B, N, m), of which the last command returned the first controls.
 
     Raises:
-        InputError: a problem on another device or with stages of several lengths, a covariance that doesn't fit.
+        InputError: a problem on another device, with stages of several lengths or a free time; a covariance that
+            doesn't fit.
     """
 
     def __init__(

@@ -99,7 +99,7 @@ def compile(
         tolerance: of the optimality conditions; None: that of `InteriorPoint`.
 
     Raises:
-        InputError: another solver, a name that isn't there, or a problem on another device.
+        InputError: another solver, a name that isn't there, a problem on another device, or a free time.
     """
     check_untransformed("compile")
     problem = current_problem(problem)

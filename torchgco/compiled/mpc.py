@@ -51,7 +51,7 @@ class MPC:
         answer: the last solve's `Answer`, whether it is flown or not; None before the first step.
 
     Raises:
-        InputError: as `torchgco.compile`; stages that differ in length, horizons of each problem or free starts.
+        InputError: as `torchgco.compile`; stages that differ in length, horizons of each problem, free starts or times.
     """
 
     def __init__(

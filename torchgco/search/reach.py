@@ -35,10 +35,10 @@ def short_horizons(problem: Problem) -> str | None:
 
     Only for goals that were stated, and models with a largest step, one that no state or control without bounds makes
     longer, or else with a largest acceleration: of a double integrator with bounded controls. Through a map the way is
-    the roadmap's, otherwise the straight line.
+    the roadmap's, otherwise the straight line. Where the time is free, `solvers.timing` tells which would do.
     """
     goal = problem.goal
-    if goal is None or goal.assumed or problem.B == 0:
+    if goal is None or goal.assumed or problem.B == 0 or problem.time is not None:
         return None
     with computing_on(problem.x0.device):
         limit = _limit(problem)
