@@ -22,7 +22,7 @@ from torchgco.base.shapes import as_states, check_untransformed
 from torchgco.problem.free_start import moved_inside
 from torchgco.problem.goal import with_goal, without_goal
 
-PARTS = "dynamics", "cost", "constraints", "x0"  # a goal judges trajectories and changes none: it takes no gradients
+PARTS = "dynamics", "cost", "constraints", "x0"  # tensors of a goal that ask for gradients are refused when it is bound
 
 
 @dataclass(frozen=True)
