@@ -57,8 +57,9 @@ def solve(
     """Solve every problem of the batch.
 
     A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots; a
-    ScaleWarning those whose violation is tolerated but large beside the values of the constraint; a HorizonWarning,
-    before the solve, the horizons that are too short for the way to a stated goal at the limits on speed.
+    ScaleWarning those whose violation is tolerated but large beside the values of the row; a HorizonWarning, before the
+    solve, the horizons that are too short for the way to a stated goal at the limits on speed or acceleration, and
+    after it, where the time is free, the problems whose longest time is too short (`solution.needed`).
 
     Where tensors in the problem ask for gradients, or ones that its functions capture, X, U, cost and multipliers of
     the solution are functions of them (`solution.differentiable`); under `torch.no_grad()` they are numbers.
@@ -70,10 +71,11 @@ def solve(
         solver: a solver, or the name of a preset (`torchgco.presets`). Default: "gco".
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
-            its controls; where starts are free, from its starts too.
+            its controls; where starts are free, from its starts too; where the time is, from its states and times.
         max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
-            and `fatrop`, and without obstacles `gco`. Default: those that U0 leads to.
+            and `fatrop`, and without obstacles, or with a free time, `gco`. Default: those that U0 leads to; where the
+            time is free, those of its estimate.
         record: keep `solution.trace` and, of `gco`, `solution.search`, where the solver can: `solution.explain` then
             says more. The results are the same.
         verbose: True: a line on stdout for every row of the solver's table that worked on some problem, and one at the

@@ -50,7 +50,8 @@ class Verdict:
     clearance: Tensor  # the same along the straight segments between the knots
     goal_distance: Tensor  # m, last knot to goal, positions only; NaN without a goal
     feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
-    reached: Tensor  # bool: feasible, and closer to the goal than the goal radius; False without a goal
+    # bool: feasible, and closer to the goal than the goal radius, of a required one 1e-3 m more; False without a goal
+    reached: Tensor
     sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
     gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, between the knots too
 

@@ -20,11 +20,10 @@ from torch import Tensor
 from torchgco.base.autodiff import jacobian
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
-from torchgco.search.reach import bounds_at_inner_knots
+from torchgco.search.reach import WIDE, bounds_at_inner_knots
 
 SAMPLES = 16  # states and controls at which the equations are looked at
 GRID = 65  # values of a control at which its effect is tabulated
-WIDE = 3.0  # the range, around 0, of what has no bounds
 SAME = 1e-9  # share by which equations may differ from those of a vehicle that drives along its heading
 SEED = 0x57EE
 TURNING = 3.0  # rad/s of turn rate per rad of error in the heading

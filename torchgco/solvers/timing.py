@@ -1,9 +1,10 @@
-"""Solves of problems with a free time: at a time that is held first, then with the time free.
+"""Solves of problems with a free time: from a long guess that obeys the model, and with the time held where that fails.
 
 From a guess that doesn't obey the dynamics, the first step of a method may shorten the time until no trajectory is
 left, and no local method gets out of that: a vehicle that moves away from its goal is closest to being at rest there
 after the time it takes to stop. From a trajectory the same method converges in a few iterations, however long it takes.
-So a trajectory at a held time is sought first; where there is none, at twice the time, up to the longest.
+So the guess is the trajectory of a linear model, from which the time is free at once. Where that fails, and among
+obstacles, a trajectory at a held time is sought first; where there is none, at twice the time, up to the longest.
 """
 
 from __future__ import annotations
