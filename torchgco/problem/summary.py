@@ -6,7 +6,7 @@ from typing import Any
 
 
 def summary(problem: Any) -> str:
-    """Sizes, parts and goal of a bound problem."""
+    """Sizes, parts, goal and free time of a bound problem."""
     sizes = f"B={problem.B}, N={problem.N}, n={problem.n}, m={problem.m}"
     lines = [f"Problem({sizes}, {str(problem.x0.dtype).removeprefix('torch.')}"]
     parts = {"dynamics": problem.dynamics, "cost": problem.cost, "constraints": list(problem.constraints)}
@@ -17,4 +17,6 @@ def summary(problem: Any) -> str:
         radii = sorted({f"{float(radius):.4g}" for radius in (goal.radius.min(), goal.radius.max())})
         kind = "" if not goal.required else ", a state required" if goal.state is not None else ", required"
         lines.append(f"  goal={where}, radius {' to '.join(radii)} m{kind}")
+    if problem.time is not None:
+        lines.append(f"  time={problem.time!r}")
     return "\n".join(lines) + ")"
