@@ -58,7 +58,8 @@ def solve(
 
     A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots; a
     ScaleWarning those whose violation is tolerated but large beside the values of the constraint; a HorizonWarning,
-    before the solve, the horizons that are too short for the way to a stated goal at the limits on speed.
+    before the solve, the horizons that are too short for the way to a stated goal at the limits on speed or
+    acceleration; where the time is free, after it, the problems that need more of it than they may take.
 
     Where tensors in the problem ask for gradients, or ones that its functions capture, X, U, cost and multipliers of
     the solution are functions of them (`solution.differentiable`); under `torch.no_grad()` they are numbers.

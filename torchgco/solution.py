@@ -275,7 +275,7 @@ class Solution:
         own = problem if problem is not None else None if self.account is None else self.account.problem
         if own is not None:
             check_shape(self.X, (own.B, own.N + 1, own.n), "problem: solution.X")
-        t, frames = self.t if problem is None else times(problem), []
+        t, frames = times(problem) if problem is not None and self.times is None else self.t, []
         for b in range(len(self)):
             last = self.U.shape[1] if self.horizon is None else int(self.horizon[b])
             X, U = self.X[b, : last + 1].detach(), self.U[b, :last].detach()

@@ -17,8 +17,10 @@ def stage_of(problem: Problem) -> float:
     """The length of all stages, s.
 
     Raises:
-        InputError: dynamics without a time step, or with several.
+        InputError: dynamics without a time step, or with several; a free time.
     """
+    if problem.time is not None:
+        raise InputError("problem", "one of fixed times: torchgco.solve chooses times", "a free time")
     lengths = times(problem).diff()
     if not torch.allclose(lengths, lengths.flatten()[0], rtol=1e-9):
         raise InputError("dynamics.dt", "stages of one length in a loop", "several")

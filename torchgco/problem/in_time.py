@@ -29,7 +29,7 @@ from torchgco.problem.rates import IN_PLACE
 
 FORM = "in free time"  # what is kept with the form of the problem for this one
 PIN = 1e-3  # cost of a next tau that nobody reads, per unit squared, as a share of that of the nominal stages' time
-EQUAL = 1e-9  # difference of two stages of a segment, as a share, that is due to rounding
+EQUAL = 1e-6  # difference of two stages of a segment, as a share of the duration, that is due to rounding, float32 too
 
 
 def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:

@@ -33,12 +33,12 @@ SEED = 0x5EED
 def short_horizons(problem: Problem) -> str | None:
     """A sentence on the problems whose horizon is shorter than the way to their goal needs; None without any.
 
-    Only for goals that were stated, and models with a largest step, one that no state or control without bounds makes
-    longer, or else with a largest acceleration: of a double integrator with bounded controls. Through a map the way is
-    the roadmap's, otherwise the straight line.
+    Only for goals that were stated, times that are fixed, and models with a largest step, one that no state or control
+    without bounds makes longer, or else with a largest acceleration: of a double integrator with bounded controls.
+    Through a map the way is the roadmap's, otherwise the straight line.
     """
     goal = problem.goal
-    if goal is None or goal.assumed or problem.B == 0:
+    if goal is None or goal.assumed or problem.B == 0 or problem.time is not None:
         return None
     with computing_on(problem.x0.device):
         limit = _limit(problem)
