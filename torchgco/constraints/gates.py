@@ -54,12 +54,13 @@ class Gates(Constraint):
         centers = _each(self.centers, "gates.centers", dims, (d,))
         G = centers.shape[1]
         if (self.radius is None) == (self.normals is None):
-            raise InputError("gates.radius", "a radius, or normals and half_widths", "both" if self.normals else "none")
+            got = "none" if self.normals is None else "both"
+            raise InputError("gates.radius", "a radius, or normals and half_widths", got)
         if (self.normals is None) != (self.half_widths is None):
             raise InputError("gates.half_widths", "half widths where there are normals", shown(self.half_widths))
         gap = 1 if self.normals is None else 2
         last = dims.N + 1 - gap
-        ends = torch.full((dims.B,), last) if dims.horizon is None else dims.horizon.cpu() + 1 - gap
+        ends = torch.full((dims.B,), last, device="cpu") if dims.horizon is None else dims.horizon.cpu() + 1 - gap
         if bool((1 + gap * (G - 1) > ends).any()):
             raise InputError("gates.centers", f"at most {(int(ends.min()) - 1) // gap + 1} gates in N = {dims.N}", G)
         given = self.knots
