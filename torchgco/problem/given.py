@@ -22,7 +22,7 @@ from torchgco.base.shapes import as_states, check_untransformed
 from torchgco.problem.free_start import moved_inside
 from torchgco.problem.goal import with_goal, without_goal
 
-PARTS = "dynamics", "cost", "constraints", "x0"  # a goal judges trajectories and changes none: it takes no gradients
+PARTS = "dynamics", "cost", "constraints", "x0"  # whose tensors may ask for gradients; those of others are refused
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ class Given:
         """The same of `problem`, which is of these parts, with other starts, constraints, cost and dynamics."""
         if self.then:  # of a part of its batch
             return None
-        fields = {"x0": x0, "constraints": replaced(constraints, problem.constraints, self.fields["constraints"])}
+        stated = without_goal(self.fields["goal"], problem._dimensions(x0), constraints)  # whose row binds itself
+        fields = {"x0": x0, "constraints": replaced(stated, problem.constraints, self.fields["constraints"])}
         fields |= {name: part for name, part in zip(("cost", "dynamics"), others, strict=True) if part is not None}
         return Given.of({**self.fields, **fields})
 
