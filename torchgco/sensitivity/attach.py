@@ -24,7 +24,7 @@ from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
 NEAR = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
-SERVED = "a problem in float64 with one horizon, a given start and no RateBounds"
+SERVED = "a problem in float64 with one horizon, a given start, a fixed time and no RateBounds"
 
 
 def asks_for_gradients(problem: Problem) -> bool:

@@ -44,8 +44,8 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
         the solution itself, where the controls are those of before.
 
     Raises:
-        InputError: a problem of another form, one in float32 or with horizons per problem, a free start or RateBounds,
-            or a solution that no longer knows its problem.
+        InputError: a problem of another form, one in float32 or with horizons per problem, a free start, a free time or
+            RateBounds, or a solution that no longer knows its problem.
     """
     changed = current_problem(changed)
     before = problem if problem is not None else solution.account and solution.account.problem
