@@ -20,11 +20,10 @@ from torch import Tensor
 from torchgco.base.autodiff import jacobian
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
-from torchgco.search.reach import bounds_at_inner_knots
+from torchgco.search.reach import WIDE, bounds_at_inner_knots
 
 SAMPLES = 16  # states and controls at which the equations are looked at
 GRID = 65  # values of a control at which its effect is tabulated
-WIDE = 3.0  # the range, around 0, of what has no bounds
 SAME = 1e-9  # share by which equations may differ from those of a vehicle that drives along its heading
 SEED = 0x57EE
 TURNING = 3.0  # rad/s of turn rate per rad of error in the heading
@@ -210,7 +209,7 @@ def speed_limit(vehicle: Steered, points: Array, step: float, ahead: int) -> Arr
     cross, along = toward[:, 0] * before[:, 1] - toward[:, 1] * before[:, 0], (toward * before).sum(1)
     bend = np.abs(np.arctan2(cross, along)) / (half * step)
     turning = min(-vehicle.turn.effect[0], vehicle.turn.effect[-1])
-    braking = min(-vehicle.push.effect[0], vehicle.push.effect[-1])
+    braking = max(0.0, min(-vehicle.push.effect[0], vehicle.push.effect[-1]))  # none where it can't brake
     # v^2 at a point is at most that at any later one, and twice the braking times the way there.
     energy = (turning / np.maximum(bend, 1e-12)) ** 2 + 2.0 * braking * step * at
     return np.sqrt(np.minimum.accumulate(energy[::-1])[::-1] - 2.0 * braking * step * at)
