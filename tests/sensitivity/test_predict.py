@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from tests.sensitivity.problems import TIGHT, D, asking, box_numbers, boxed, discs, growth, numbers, solved, vector
+from tests.sensitivity.problems import TIGHT, D, box_numbers, boxed, discs, growth, numbers, solved
 from torchgco import ControlBounds, FunctionDynamics, InputError, Problem, QuadraticCost, Solution, Spheres, Status
 from torchgco.base.differentiability import Differentiability as Why
 
@@ -114,4 +114,3 @@ def test_what_it_is_not_for_is_refused() -> None:
     spheres = Problem(problem.dynamics, problem.cost, [Spheres([[9.0, 9.0]], [0.1])], problem.x0, problem.N)
     with pytest.raises(InputError, match="rows as before"):
         known.predict(spheres)
-    assert asking(numbers()).keys() == numbers().keys() and vector(1.0).dtype == D

@@ -43,7 +43,9 @@ class MPC:
             "interior_point".
         period: s, from one step to the next; None: a stage.
         max_seconds: of a step; a solve that isn't ready by then is late. None: none is.
-        changes, tolerance: as `torchgco.compile` takes them.
+        changes: names of the numbers that steps may change, beside the starts and `previous`, which each step writes.
+            None: all.
+        tolerance: as `torchgco.compile` takes it.
 
     Attributes:
         t: time of the last step, s; the first one's is 0, or what `step` was told.
@@ -73,9 +75,10 @@ class MPC:
         self.max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
+        self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if _follows(part)]
+        changes = None if changes is None else ["x0", *self._previous, *changes]
         self.compiled: Compiled = compile(problem, solver, changes, tolerance=tolerance)
         self._problem = problem
-        self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if _follows(part)]
         self.reset()
 
     def reset(self) -> None:

@@ -60,7 +60,7 @@ class Gates(Constraint):
             raise InputError("gates.half_widths", "half widths where there are normals", shown(self.half_widths))
         gap = 1 if self.normals is None else 2
         last = dims.N + 1 - gap
-        ends = torch.full((dims.B,), last) if dims.horizon is None else dims.horizon.cpu() + 1 - gap
+        ends = torch.full((dims.B,), last, device="cpu") if dims.horizon is None else dims.horizon.cpu() + 1 - gap
         if bool((1 + gap * (G - 1) > ends).any()):
             raise InputError("gates.centers", f"at most {(int(ends.min()) - 1) // gap + 1} gates in N = {dims.N}", G)
         given = self.knots

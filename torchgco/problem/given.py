@@ -64,7 +64,8 @@ class Given:
         """The same of `problem`, which is of these parts, with other starts, constraints, cost and dynamics."""
         if self.then:  # of a part of its batch
             return None
-        fields = {"x0": x0, "constraints": replaced(constraints, problem.constraints, self.fields["constraints"])}
+        stated = without_goal(self.fields["goal"], problem._dimensions(x0), constraints)  # whose row binds itself
+        fields = {"x0": x0, "constraints": replaced(stated, problem.constraints, self.fields["constraints"])}
         fields |= {name: part for name, part in zip(("cost", "dynamics"), others, strict=True) if part is not None}
         return Given.of({**self.fields, **fields})
 

@@ -209,7 +209,7 @@ def speed_limit(vehicle: Steered, points: Array, step: float, ahead: int) -> Arr
     cross, along = toward[:, 0] * before[:, 1] - toward[:, 1] * before[:, 0], (toward * before).sum(1)
     bend = np.abs(np.arctan2(cross, along)) / (half * step)
     turning = min(-vehicle.turn.effect[0], vehicle.turn.effect[-1])
-    braking = min(-vehicle.push.effect[0], vehicle.push.effect[-1])
+    braking = max(0.0, min(-vehicle.push.effect[0], vehicle.push.effect[-1]))  # none where it can't brake
     # v^2 at a point is at most that at any later one, and twice the braking times the way there.
     energy = (turning / np.maximum(bend, 1e-12)) ** 2 + 2.0 * braking * step * at
     return np.sqrt(np.minimum.accumulate(energy[::-1])[::-1] - 2.0 * braking * step * at)

@@ -247,8 +247,7 @@ def of_user(problem: Problem, found: Solution, needed: Tensor | None = None) -> 
     multipliers = Multipliers(found.multipliers.lam[:count], found.multipliers.mu)
     X, K = found.X[..., :n].contiguous(), found.K[..., :m, :n].contiguous()
     U, d = found.U[..., :m].contiguous(), found.d[..., :m].contiguous()
-    search = None if found.search is None else found.search.of_first_states(n)
-    return replace(found, X=X, U=U, K=K, d=d, multipliers=multipliers, search=search, times=times, needed=needed)
+    return replace(found, X=X, U=U, K=K, d=d, multipliers=multipliers, times=times, needed=needed)
 
 
 def lifted_multipliers(problem: Problem, whole: Problem, warm: Multipliers) -> Multipliers:
