@@ -17,7 +17,7 @@ from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
-from torchgco.judging.scale import MET, SHARE, dwarfed
+from torchgco.judging.scale import SHARE, dwarfed
 from torchgco.judging.worst import NONE, kind_of
 from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
@@ -56,13 +56,10 @@ def solve(
 ) -> Solution:
     """Solve every problem of the batch.
 
-    A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots; a
-    ScaleWarning those whose violation is tolerated but large beside the values of the row; a HorizonWarning, before the
-    solve, the horizons that are too short for the way to a stated goal at the limits on speed or acceleration, and
-    after it, where the time is free, the problems whose longest time is too short (`solution.needed`).
-
-    Where tensors in the problem ask for gradients, or ones that its functions capture, X, U, cost and multipliers of
-    the solution are functions of them (`solution.differentiable`); under `torch.no_grad()` they are numbers.
+    A ContactWarning names feasible trajectories that touch an obstacle between knots; a ScaleWarning those with a
+    tolerated violation that is large beside its row; a HorizonWarning horizons too short for the way to a stated goal,
+    or longest times (`solution.needed`). Where tensors in the problem, or captured ones, ask for gradients, X, U, cost
+    and multipliers are functions of them (`solution.differentiable`); under `torch.no_grad()` they are numbers.
 
     Args:
         problem: B problems.
@@ -106,8 +103,8 @@ def solve(
         watcher.end(found)
     finally:
         watcher.close()
-    if name is not None and found.account is not None:
-        found = replace(found, account=found.account.of_preset(name))
+    if found.account is not None:
+        found = replace(found, account=found.account.asked(asked, name))
     found = _warned_of_contact(problem, found)
     return attached(asked, problem, found) if differentiates else found
 
@@ -238,7 +235,7 @@ def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
 def _warn_of_scale(problem: Problem, solution: Solution) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    rows = (claims & (solution.violation > SHARE * MET)).nonzero().flatten()
+    rows = (claims & (solution.violation > 0)).nonzero().flatten()
     if rows.numel() == 0:
         return
     some, X, U = at_times(

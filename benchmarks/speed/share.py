@@ -18,7 +18,7 @@ PHASES = {
     "candidates refined": ("torchgco.search.candidates.Candidates.refined",),
     "rest of the proposal": ("torchgco.search.proposals.PathProposals.improve",),
     "plans sampled": ("torchgco.guidance.mppi.MPPI.improve",),
-    "tubes solved": ("torchgco.search.tube.Tube._solved",),
+    "tubes solved": ("torchgco.search.tube.Tube._some",),
     "tightened": ("torchgco.search.converge.Converge.run", "torchgco.search.chords.ClearChords.run"),
     "verdict": ("torchgco.solvers.session.Session.finished",),
     "packed for C": ("torchgco.native.engine.Engine.packed", "torchgco.native.engine.Engine.terms"),

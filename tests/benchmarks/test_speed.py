@@ -75,6 +75,7 @@ def numbers(bench: Bench, quantity: str) -> list[float]:
     return [float(row["value"]) for row in bench.results.rows if row["quantity"] == quantity]
 
 
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # steps of sizes for tests are long
 @pytest.mark.parametrize(
     "section",
     [

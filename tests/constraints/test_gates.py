@@ -241,3 +241,9 @@ def test_wrong_input_is_named(gates: Gates, message: str) -> None:
     if "within" in message:
         with pytest.raises(InputError, match=r"gates.knots: expected knots within 1..9"):
             points(Gates(PLACES, 0.1, knots=[5, 10]), horizon=torch.tensor([N, 9]))
+
+
+def test_loops_whose_plans_begin_again_refuse_them() -> None:
+    for loop in (torchgco.MPC, torchgco.MPPIController):
+        with pytest.raises(InputError, match="one without Gates in a loop"):
+            loop(points(BALLS))

@@ -278,3 +278,21 @@ def test_wrong_input_is_named(field: str) -> None:
     if field == "cone.angle":
         with pytest.raises(InputError, match="rad"):
             lander(WRONG[field][1])
+
+
+class Lenient(NormBounds):
+    """A user's class whose violation isn't that of its rows."""
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return 0.5 * super().violation(X, U)
+
+
+def test_an_own_violation_is_the_one_that_is_measured() -> None:
+    model = FunctionDynamics(lambda x, u: u, 2, 2, 0.1, "euler")
+    cost = QuadraticCost([1.0] * 2, [0.1] * 2, [1.0] * 2)
+    x0 = torch.ones(1, 2, dtype=torch.float64)
+    X, U = x0.unsqueeze(1).repeat(1, 6, 1), torch.ones(1, 5, 2, dtype=torch.float64)
+    worst = [
+        float(measured(Problem(model, cost, [kind("u", upper=0.5)], x0, 5), X, U)) for kind in (NormBounds, Lenient)
+    ]
+    assert abs(worst[0] - (2**0.5 - 0.5)) < 1e-12 and abs(worst[1] - 0.5 * worst[0]) < 1e-12

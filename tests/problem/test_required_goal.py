@@ -19,6 +19,7 @@ from torchgco import (
     FunctionCost,
     FunctionDynamics,
     Goal,
+    HorizonWarning,
     InputError,
     InteriorPoint,
     Problem,
@@ -140,7 +141,8 @@ def test_models_without_a_position_take_states() -> None:
 
 
 def test_one_out_of_reach_or_covered_is_infeasible_and_told() -> None:
-    far = torchgco.solve(points(BALL, N=5))
+    with pytest.warns(HorizonWarning, match="3 of 3 horizons are too short"):
+        far = torchgco.solve(points(BALL, N=5))
     assert far.statuses == [Status.INFEASIBLE] * 3
     told = " ".join(far.explain(0).split())
     assert "goal is required, and no trajectory that was found meets it" in told

@@ -114,3 +114,12 @@ def test_what_it_is_not_for_is_refused() -> None:
     spheres = Problem(problem.dynamics, problem.cost, [Spheres([[9.0, 9.0]], [0.1])], problem.x0, problem.N)
     with pytest.raises(InputError, match="rows as before"):
         known.predict(spheres)
+
+
+def test_numbers_changed_in_place_are_no_other_problem() -> None:
+    th = {key: part.detach().clone() for key, part in numbers().items()}
+    problem = discs(th)
+    known = torchgco.solve(problem, solver="interior_point", verbose=False)
+    th["x0"] += 0.01
+    with pytest.raises(InputError, match="have been changed in place"):
+        known.predict(problem)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.constraints.gates import has_gates
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.problem import Problem
 from torchgco.problem.times import times
@@ -17,8 +18,10 @@ def stage_of(problem: Problem) -> float:
     """The length of all stages, s.
 
     Raises:
-        InputError: dynamics without a time step, or with several, or a free time.
+        InputError: dynamics without a time step, or with several, a free time, or gates.
     """
+    if has_gates(problem):
+        raise InputError("problem", "one without Gates in a loop, whose plans begin again at their knot 0", "Gates")
     if problem.time is not None:
         raise InputError("problem", "one of fixed times in a loop", "a free time")
     lengths = times(problem).diff()

@@ -191,6 +191,11 @@ def _sizes(value: Any, name: str, dims: Dimensions, G: int) -> Tensor:
     return found.expand(dims.B, G).contiguous()
 
 
+def has_gates(problem: Any) -> bool:
+    """Whether gates are among a problem's constraints, whose knots count from its start: a loop would put them off."""
+    return any(isinstance(part, GateBalls | GateSquares) for part in problem.constraints)
+
+
 def _given(knots: Any, dims: Dimensions, G: int, gap: int, ends: Tensor) -> Tensor:
     """Knots (B, G), given so or as (G,)."""
     name, expected = "gates.knots", f"{G} whole numbers, or {dims.B} rows of them"

@@ -49,9 +49,9 @@ class Account(PerElement):
         """What solved the problem; None where that isn't known."""
         return type(self.solver).__name__ if self._name is None and self.solver is not None else self._name
 
-    def of_preset(self, name: str) -> Account:
-        """The same, solved by a preset of this name."""
-        return Account(self._whole, self.solver, name, self._rows, self._t, self.kernels)
+    def asked(self, problem: Problem, name: str | None) -> Account:
+        """The same of the problem as the user gave it, and of a preset of this name; None: of no preset."""
+        return Account(problem, self.solver, name, self._rows, self._t, self.kernels)
 
     def times(self) -> Tensor:
         """The times of the knots, (N+1,) or (b, N+1), s.

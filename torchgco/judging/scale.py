@@ -12,8 +12,8 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
 
 SHARE = 0.05  # of a row's values: a larger violation leaves little of the row
-MET = 1e-15  # values up to rounding say nothing of a row's size: where it has no others, ...
-ROUGH = 1e-6  # ... no violation up to this counts as large, which the interior point may leave
+NOISE = 1e-9  # of the largest state or control: values up to this are rounding, and say nothing of a row's size; ...
+ROUGH = 1e-6  # ... where a row has no others, no violation up to this counts as large, which solves may leave
 
 
 def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -28,6 +28,7 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """
     place = torch.full((problem.B,), NONE, device=problem.x0.device)
     problem = within_horizons(problem.held_at(X[:, 0]))
+    noise = NOISE * torch.maximum(X.abs().flatten(1).amax(-1), U.abs().flatten(1).amax(-1)).view(-1, 1, 1)
     for number, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             continue
@@ -36,8 +37,8 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
             continue
         sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
         rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
-        size = torch.where(rows > MET, rows, rows.amax(-1, keepdim=True))
-        admitted = torch.where(size > MET, SHARE * size, ROUGH)
+        size = torch.where(rows > noise, rows, rows.amax(-1, keepdim=True))
+        admitted = torch.where(size > noise, torch.maximum(SHARE * size, noise), ROUGH)
         large = (constraint.violation(X, U) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place

@@ -19,6 +19,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
 from torchgco.base.shapes import check_tensor, computing_on
 from torchgco.base.tree import take
+from torchgco.constraints.gates import has_gates
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
@@ -168,6 +169,10 @@ def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | Non
         raise InputError("goal", "a Goal in the problem", None)
     if problem.time is not None:
         raise InputError("time", "None for a mission, whose control periods are fixed", "a free time")
+    if problem.goal.required:
+        raise InputError("goal.required", "False for a mission, whose plans may end before the goal", True)
+    if has_gates(problem):
+        raise InputError("constraints", "no Gates in a mission, whose plans begin again at their knot 0", "Gates")
     if problem.horizon is not None:
         raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
     mission.check(problem.dynamics)

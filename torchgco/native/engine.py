@@ -16,7 +16,8 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Constraint, innermost
+from torchgco.constraints.norms import NormBounds
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
@@ -333,10 +334,9 @@ os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child has none of 
 
 def _measured(part: Constraint) -> bool:
     """Whether violations are what the base class says of rows, or C finds them from these."""
-    return part.row_radii is not None or (type(part).violation, type(part).worst) == (
-        Constraint.violation,
-        Constraint.worst,
-    )
+    if part.row_radii is not None:
+        return type(innermost(part)).violation is NormBounds.violation
+    return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
 
 
 def _is_blank(lam: Tensor) -> bool:

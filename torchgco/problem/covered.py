@@ -11,7 +11,7 @@ from torchgco.problem.problem import Problem
 def covered_goals(problem: Problem) -> Tensor:
     """Whether one obstacle that holds at the last knot covers all of each problem's required goal, (B,) bool."""
     covered, goal = torch.zeros_like(problem.x0[:, 0], dtype=torch.bool), problem.goal
-    if goal is None or not goal.required:
+    if goal is None or not goal.required or problem.horizon is not None:  # whose last knots differ
         return covered
     center, N = goal.position.unsqueeze(1), problem.N
     for part in problem.obstacles:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchgco.base.draws import scattered
 from torchgco.base.shapes import MISTAKES
+from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.recorder import looks_at_values
 
 FOREIGN = (torch.nan, torch.inf, -torch.inf)
@@ -63,12 +64,20 @@ def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence
         arguments: (2, K, ...).
         reads_k: every knot is tried, as a number finds places that a tensor doesn't: those of a dict, for instance.
     """
+    with whole_numbers_become(arguments[0].dtype):
+        return _forms_differ(function, rows, k, arguments, reads_k)
+
+
+def _forms_differ(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor], reads_k: bool) -> bool:
     several = _tried(function, rows, k, *arguments)
     if several is None or several.shape[:2] != (len(rows), len(k)):
         return False
     some = {0, len(k) // 2, len(k) - 1}
     for at in range(len(k)) if reads_k else some:
         one, due = [z[:, at] for z in arguments], several[:, at]
+        alone = _tried(function, rows, k[at : at + 1], *(z.unsqueeze(1) for z in one))
+        if alone is None or alone[:, 0].shape != due.shape or bool(unlike(alone[:, 0], due).any()):
+            continue  # it joins knots, which is another matter
         forms = [_tried(function, rows, int(k[at]), *one)]
         if at in some:
             samples = _tried(function, rows, int(k[at]), *(torch.stack((z, z, z), dim=1) for z in one))

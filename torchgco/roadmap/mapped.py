@@ -110,7 +110,7 @@ class Ways:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
         self.parts = blocks, ends, price, least
         self.least = least_at(blocks.lattice, ends)
-        close = 1.0 + np.clip(1.0 - blocks.clearance / margin, 0.0, 1.0)
+        close = 1.0 + (np.clip(1.0 - blocks.clearance / margin, 0.0, 1.0) if margin > 0.0 else 0.0)  # 0: no obstacles
         rate = _smoothed(price, self.points, blocks.counts)
         usable = (blocks.clearance > least) & np.isfinite(rate)
         self.weight = np.where(usable, np.maximum(rate, 0.0) * close + LEAST, np.inf)

@@ -51,7 +51,9 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
     before = problem if problem is not None else solution.account and solution.account.problem
     if before is None:
         raise InputError("problem", "the problem that was solved", "a solution that no longer knows it")
-    before = current_problem(before)
+    if current_problem(before) is not before:
+        expected = "another problem: numbers of the one that was solved have been changed in place"
+        raise InputError("changed", expected, "what is left of it")
     for one in (before, changed):
         refuse_forms(one, "a prediction")
     _check_same(before, changed)

@@ -25,7 +25,7 @@ from torchgco.solvers.rules import Rules
 from torchgco.solvers.unbounded import falls_without_end
 
 # Where a required goal is covered by an obstacle, the reason is known; these say only how the solve came to its end.
-GAVE_UP = int(Status.MAX_ITERATIONS), int(Status.LINE_SEARCH_FAILED), int(Status.NOT_POSITIVE_DEFINITE)
+GAVE_UP = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE
 UNLIKE = 1e-6  # difference of two rollouts' steps, as a share of the largest state, that no rounding explains
 
 
@@ -76,7 +76,8 @@ class Session:
         ended = torch.where(finite | (ended == Status.INVALID_START), ended, int(Status.NON_FINITE))
         status = final_status(ended, left, found.violation, tolerance, constrained)
         user = self.given.problem
-        status[torch.isin(status, status.new_tensor(GAVE_UP)) & covered_goals(user)] = Status.INFEASIBLE
+        gave_up = torch.stack([status == reason for reason in GAVE_UP]).any(0)
+        status = torch.where(gave_up & covered_goals(user), int(Status.INFEASIBLE), status)
         falls = falls_without_end(user, self.given.U0, found, left, tolerance)
         status[falls] = Status.UNBOUNDED
         return Solution(

@@ -78,5 +78,5 @@ def _told(setup: Setup, layouts: Layouts) -> dict[int, str]:
     task = setup.vehicle.task(layouts, setup.device, setup.dtype)
     ids = torch.as_tensor(layouts.ids, device=setup.device)
     solution = setup.solver.recording().solve(task.problem, task.U0, seed=setup.seed, ids=ids)
-    solution = replace(solution, account=solution.account.of_preset(setup.solver_name))
+    solution = replace(solution, account=solution.account.asked(task.problem, setup.solver_name))
     return {number: explanation(solution, i, what=f"Layout {number}") for i, number in enumerate(layouts.ids.tolist())}
