@@ -17,7 +17,7 @@ from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
-from torchgco.judging.scale import SHARE, dwarfed
+from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.worst import NONE, kind_of
 from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
@@ -235,7 +235,7 @@ def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
 def _warn_of_scale(problem: Problem, solution: Solution) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    rows = (claims & (solution.violation > 0)).nonzero().flatten()
+    rows = (claims & (solution.violation > noise(solution.X, solution.U))).nonzero().flatten()
     if rows.numel() == 0:
         return
     some, X, U = at_times(

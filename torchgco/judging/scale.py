@@ -16,6 +16,11 @@ NOISE = 1e-9  # of the largest state or control: values up to this are rounding,
 ROUGH = 1e-6  # ... where a row has no others, no violation up to this counts as large, which solves may leave
 
 
+def noise(X: Tensor, U: Tensor) -> Tensor:
+    """Violations (B,) up to which rounding may be all, of trajectories X (B, N+1, n), U (B, N, m)."""
+    return NOISE * torch.maximum(X.abs().flatten(1).amax(-1), U.abs().flatten(1).amax(-1))
+
+
 def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """The place (B,) of a constraint with a violation that is large beside a row's values; `NONE` where there is none.
 
@@ -28,7 +33,7 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """
     place = torch.full((problem.B,), NONE, device=problem.x0.device)
     problem = within_horizons(problem.held_at(X[:, 0]))
-    noise = NOISE * torch.maximum(X.abs().flatten(1).amax(-1), U.abs().flatten(1).amax(-1)).view(-1, 1, 1)
+    least = noise(X, U).view(-1, 1, 1)
     for number, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             continue
@@ -37,8 +42,8 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
             continue
         sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
         rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
-        size = torch.where(rows > noise, rows, rows.amax(-1, keepdim=True))
-        admitted = torch.where(size > noise, torch.maximum(SHARE * size, noise), ROUGH)
+        size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))
+        admitted = torch.where(size > least, torch.maximum(SHARE * size, least), ROUGH)
         large = (constraint.violation(X, U) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place

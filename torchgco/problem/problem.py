@@ -259,7 +259,7 @@ class Problem:
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
-        return self.current()._with({})
+        return self._with({})
 
     def current(self) -> Self:
         """The same problems with numbers as they are now, where these were changed in place since; else this one."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.base.autodiff import gradients
+from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.shapes import computing_on
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.problem.problem import Problem
@@ -154,7 +154,7 @@ class _Box(NamedTuple):
         share = share.to(low.device)
         least, most = (torch.where(bounded, *ends).unsqueeze(1) for ends in ((low, -WIDE), (high, WIDE)))
         z = least + share * (most - least)
-        (slopes,) = gradients(lambda z: _way(problem, z), z)
+        (slopes,) = gradients_at_once(lambda z: _way(problem, z), z)
         depends = (slopes.abs() > INERT * slopes.abs().amax()).flatten(0, 1).any(0)
         return cls(bounded, least, most, torch.cat((z, least + (share > 0.5) * (most - least)), dim=1), depends)
 
@@ -195,7 +195,7 @@ def _climbed(value: Callable[[Tensor], Tensor], z: Tensor, least: Tensor, most: 
     """The values (B, S) after ascent from z (B, S, n + m) within a box; steps that don't ascend are halved."""
     way, size = value(z), torch.full_like(z[..., :1], 0.5)
     for _ in range(climbs):
-        (slopes,) = gradients(value, z)
+        (slopes,) = gradients_at_once(value, z)
         slopes = slopes * (most - least)
         tried = z + size * (most - least) * slopes / slopes.abs().amax(-1, keepdim=True).clamp(min=1e-300)
         tried = torch.minimum(torch.maximum(tried, least), most)

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchgco.base.autodiff import jacobian
+from torchgco.base.autodiff import gradients_at_once
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 from torchgco.search.reach import WIDE, bounds_at_inner_knots
@@ -80,7 +80,8 @@ def steered(problem: Problem) -> Steered | None:
     z = low + share * (high - low)
     x, u = z[..., :n], z[..., n:]
     rates = model.field(x, u)[0]
-    slopes = torch.cat(jacobian(model.field, x, u), dim=-1)[0]
+    each = (gradients_at_once(lambda x, u, i=i: model.field(x, u)[..., i], x, u) for i in range(n))
+    slopes = torch.stack([torch.cat(parts, dim=-1) for parts in each], dim=-2)[0]
     if not bool(torch.isfinite(slopes).all() & torch.isfinite(rates).all()):
         return None
     places = _heading_and_speed(x[0], rates[:, at], slopes[:, at])
