@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
 from array import array
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,17 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import ControlBounds, FunctionConstraint, Planar, Problem, QuadraticCost, Spheres, StateBounds
+from torchgco import (
+    ControlBounds,
+    FunctionConstraint,
+    FunctionDynamics,
+    Planar,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+    Spheres,
+    StateBounds,
+)
 
 D = torch.float64
 NUMBERS: dict[str, Callable[[], Tensor]] = {
@@ -125,3 +137,45 @@ def test_a_list_of_constraints_is_followed() -> None:
     rows[0] = speed(0.4)
     found = torchgco.solve(kept, solver="interior_point")
     assert float(found.X[..., 2:4].abs().max()) < 0.4 + 1e-6
+
+
+def line(N: int, rows: list[Any]) -> Problem:
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1, "euler")
+    x0 = torch.tensor([[0.0, 0.0], [0.3, -0.2]], dtype=D)
+    return Problem(model, QuadraticCost([1.0, 0.1], [0.05], [9.0, 1.0], x_ref=[1.0, 0.0]), rows, x0, N)
+
+
+ROWS: dict[str, Callable[[], list[Any]]] = {
+    "states": lambda: [StateBounds(-0.5, 0.5), ControlBounds(-2.0, 2.0)],
+    "function": lambda: [FunctionConstraint(lambda x: x[..., 1:] - 0.5)],
+    "last": lambda: [FunctionConstraint(lambda x: x[..., :1] - 0.8, "equality", [-1])],
+    "rates": lambda: [RateBounds(-0.2, 0.2)],
+}
+
+
+@pytest.mark.parametrize("kind", ROWS)
+@pytest.mark.parametrize("N", [6, 25])
+def test_parts_of_a_problem_are_bound_anew_to_another_one(kind: str, N: int) -> None:
+    old = line(12, ROWS[kind]())
+    due = torchgco.solve(line(N, ROWS[kind]()), solver="interior_point")
+    for other in (replace(old, N=N), Problem(old.dynamics, old.cost, old.constraints, old.x0, N)):
+        assert torch.equal(torchgco.solve(other, solver="interior_point").U, due.U)
+
+
+@pytest.mark.parametrize("name", [name for name in NUMBERS if name != "x0"])
+def test_a_problem_made_of_another_one_has_its_numbers_of_now(name: str) -> None:
+    given = {key: make() for key, make in NUMBERS.items()}
+    old = problem(given)
+    change(given[name])
+    due = torchgco.solve(problem(given), solver="interior_point")
+    for other in (replace(old, x0=old.x0), pickle.loads(pickle.dumps(replace(old, constraints=old.constraints[:3])))):
+        found = torchgco.solve(other, solver="interior_point")
+        assert len(other.constraints) < 4 or torch.equal(found.U, due.U)
+
+
+def test_gradients_survive() -> None:
+    Q = torch.tensor([1.0, 0.1], dtype=D, requires_grad=True)
+    old = line(12, [])
+    asks = Problem(old.dynamics, QuadraticCost(Q, [0.05], [9.0, 1.0], x_ref=[1.0, 0.0]), [], old.x0, 12)
+    torchgco.solve(replace(asks, x0=old.x0 + 0.1)).cost.sum().backward()
+    assert Q.grad is not None and bool((Q.grad > 0).all())

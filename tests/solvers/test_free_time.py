@@ -256,3 +256,16 @@ def test_the_time_frees_itself_of_its_guess_among_obstacles() -> None:
     assert bool(verdict.sound.all())
     straight = least_time(torch.tensor([[-4.0, 0.0]], dtype=D))[0] / 2.0**0.5  # thrust 2, without discs
     assert bool((found.duration > straight).all())
+
+
+def test_state_bounds_are_certified_too() -> None:
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1, "rk4")
+    cost = QuadraticCost([0.0, 0.0], [1e-3], [0.0, 0.0])
+    x0 = torch.tensor([[0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)
+    for rows in ([StateBounds(-0.6, [2.0, 0.6])], [StateBounds(-0.6, [2.0, 0.6], knots=[5]), ControlBounds(-3.0, 3.0)]):
+        goal = Goal(state=[1.0, 0.0], required=True)
+        bounds = rows if len(rows) > 1 else [*rows, ControlBounds(-1.0, 1.0)]
+        problem = Problem(model, cost, bounds, x0, 20, goal, time=FreeTime())
+        found = torchgco.solve(problem, solver="interior_point")
+        proof = torchgco.certify(problem, found.X, found.U, times=found.t)
+        assert float(proof.bound_violation.max()) < 1e-6

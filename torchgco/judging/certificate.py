@@ -162,8 +162,8 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     worst = X.new_zeros(())
     for bounds in problem.constraints:
         if isinstance(bounds, (ControlBounds, StateBounds)):
-            z = (U if bounds.of == "u" else X)[:, bounds.knots]
             lower, upper = bounds.by_knot
+            z = (U if bounds.of == "u" else X)[:, bounds.knots, : upper.shape[-1]]  # a free time is another state
             excess = torch.maximum(z - upper, lower - z)
             worst = torch.maximum(worst, excess.amax())
     return worst

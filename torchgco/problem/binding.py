@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, describe
@@ -18,6 +19,8 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles
 
 Part = TypeVar("Part")
+# Of bound parts, by identity, the ones that were given.
+_given: MutableMapping[Any, Any] = WeakIdKeyDictionary()
 # What a class says of its own fields, which a bound part of another class has no use for.
 OF_FIELDS = {"bind", "batched", "per_element"}
 # Methods that say what a part is, and those that a class of ours computes beside them from its own fields alone.
@@ -51,6 +54,25 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
         expected = f"a method of {type(found).__name__}, which has a `{own}` of its own, or a class without {heir}'s"
         raise InputError(f"{field}.{name}", expected, f"the one of {heir}, which doesn't call this `{own}`")
     return found
+
+
+def remember(pairs: Iterable[tuple[Any, Any]]) -> None:
+    """Keep what was given with each bound part, for `as_given`."""
+    for part, found in pairs:
+        if found is not part:
+            _given[found] = part
+
+
+def as_given(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """A problem's fields with the parts that were given in place of ones that are bound to another problem.
+
+    These have that one's knots, numbers and shapes: with another N, say, they would be other constraints.
+    """
+    parts = {name: _given.get(fields[name], fields[name]) for name in ("dynamics", "cost")}
+    rows = fields["constraints"]
+    if isinstance(rows, list | tuple) and any(row in _given for row in rows):
+        parts["constraints"] = [_given.get(row, row) for row in rows]
+    return {**fields, **parts}
 
 
 def _lost(part: Any, found: Any) -> Iterator[str]:

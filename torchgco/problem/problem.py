@@ -20,7 +20,7 @@ from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles, warn_of_small
-from torchgco.problem.binding import bound
+from torchgco.problem.binding import as_given, bound, remember
 from torchgco.problem.border import check_code
 from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
 from torchgco.problem.free_time import FreeTime, check_served
@@ -71,9 +71,9 @@ class Problem:
     given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
 
     def __post_init__(self) -> None:
-        fields_given = {f.name: getattr(self, f.name) for f in fields(self)}
+        fields_given = as_given({f.name: getattr(self, f.name) for f in fields(self)})
         given = Given.of(fields_given)
-        for name, part in (given.numbers | {"given": given}).items():
+        for name, part in (fields_given | given.numbers | {"given": given}).items():
             object.__setattr__(self, name, part)
         self._check_border()
         with computing_on(self.x0.device):
@@ -88,8 +88,10 @@ class Problem:
         goal, dims = bound_goal(self.goal, self.cost, dims)
         object.__setattr__(self, "constraints", _all_bound(self.constraints, dims, self.goal))
         object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
-        rows = zip(without_goal(self.goal, dims, constraints), self.constraints, strict=False)  # the goal's row is last
+        stated = without_goal(self.goal, dims, constraints)
+        rows = list(zip(stated, self.constraints, strict=False))  # the goal's row is last
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
+        remember([(dynamics, self.dynamics), (cost, self.cost), *rows])
         for i, part in enumerate(self.constraints):
             if isinstance(part, Obstacles):
                 warn_of_small(part, f"constraints[{i}]")
@@ -233,7 +235,7 @@ class Problem:
 
     def __getstate__(self) -> dict[str, Any]:
         """The parts alone: native kernels stay in their process."""
-        return {f.name: getattr(self, f.name) for f in fields(self)} | {"known": Known()}
+        return {f.name: getattr(self.current(), f.name) for f in fields(self)} | {"known": Known()}
 
     def take(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a slice); a row may occur more than once.

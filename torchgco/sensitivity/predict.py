@@ -53,7 +53,7 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
         raise InputError("problem", "the problem that was solved", "a solution that no longer knows it")
     if current_problem(before) is not before:
         expected = "another problem: numbers of the one that was solved have been changed in place"
-        raise InputError("changed", expected, "what is left of it")
+        raise InputError("changed", expected, "the changed one itself")
     for one in (before, changed):
         refuse_forms(one, "a prediction")
     _check_same(before, changed)
