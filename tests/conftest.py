@@ -54,10 +54,14 @@ def pytest_report_header() -> str | None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Without a compiler: no tests of these folders, and no cases of native kernels (`native=True`) of others."""
+    """Without a compiler: no tests of these folders, and no cases of native kernels (`native=True`) of others.
+
+    Samples of nets in double precision are drawn in it there, which a warning says.
+    """
     if find_compiler() is not None:
         return
     for item in items:
+        item.add_marker(pytest.mark.filterwarnings("ignore:guided in part:torchgco.GuidanceWarning"))
         natively = getattr(item, "callspec", None) is not None and item.callspec.params.get("native") is True
         if natively or not set(COMPILED).isdisjoint(item.path.relative_to(ROOT).parts):
             item.add_marker(pytest.mark.skip(reason="no C compiler"))
