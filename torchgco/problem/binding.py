@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
@@ -60,7 +61,8 @@ def remember(pairs: Iterable[tuple[Any, Any]]) -> None:
     """Keep what was given with each bound part, for `as_given`."""
     for part, found in pairs:
         if found is not part:
-            _given[found] = part
+            with suppress(TypeError):  # no weak reference to it
+                _given[found] = part
 
 
 def as_given(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,11 +70,17 @@ def as_given(fields: Mapping[str, Any]) -> dict[str, Any]:
 
     These have that one's knots, numbers and shapes: with another N, say, they would be other constraints.
     """
-    parts = {name: _given.get(fields[name], fields[name]) for name in ("dynamics", "cost")}
-    rows = fields["constraints"]
-    if isinstance(rows, list | tuple) and any(row in _given for row in rows):
-        parts["constraints"] = [_given.get(row, row) for row in rows]
+    parts, rows = {name: _origin(fields[name]) for name in ("dynamics", "cost")}, fields["constraints"]
+    if isinstance(rows, list | tuple) and any(_origin(row) is not row for row in rows):
+        parts["constraints"] = [_origin(row) for row in rows]
     return {**fields, **parts}
+
+
+def _origin(part: Any) -> Any:
+    """What was given where `part` is bound; itself elsewhere."""
+    with suppress(TypeError):  # no weak reference to it
+        return _given.get(part, part)
+    return part
 
 
 def _lost(part: Any, found: Any) -> Iterator[str]:
