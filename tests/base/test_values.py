@@ -149,7 +149,7 @@ def test_values_of_another_problem_are_refused() -> None:
     bound = problem()
     with pytest.raises(InputError, match=r"cost\.values\['goal'\]: expected shape \(1, \.\.\.\)"):
         Problem(problem(slice(0, 1)).dynamics, bound.cost, [], bound.x0[:1], N)
-    with pytest.raises(InputError, match=r"constraint: value 'most': expected torch.float64 of shape"):
+    with pytest.raises(InputError, match=r"constraint\.knot_values\['most'\]: expected shape"):
         Problem(bound.dynamics, bound.cost, [bound.constraints[1]], bound.x0, N - 5)
 
 
