@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from tests.sensitivity.problems import TIGHT, D, box_numbers, boxed, discs, growth, numbers, solved
 from torchgco import ControlBounds, FunctionDynamics, InputError, Problem, QuadraticCost, Solution, Spheres, Status
 from torchgco.base.differentiability import Differentiability as Why
@@ -73,6 +74,7 @@ def test_a_solve_begins_with_it() -> None:
     torch.testing.assert_close(warm.cost, cold.cost, rtol=1e-6, atol=0)
 
 
+@compiled
 def test_each_problem_is_predicted_as_in_its_batch() -> None:
     before, known = solved(discs, numbers)
     problem = discs(changed({key: part.detach() for key, part in before.items()}, "radii", 1e-3))
