@@ -18,13 +18,12 @@ from torchgco.base.autodiff import jacobian
 from torchgco.dynamics.base import Dynamics, WrappedDynamics
 from torchgco.dynamics.unicycle import Unicycle
 from torchgco.problem.problem import Problem
+from torchgco.search.steering import BRAKING as BRAKING
+from torchgco.search.steering import TURNING, WITHIN
 
 Array = NDArray[np.float64]
 Driver = Callable[[Problem, "Track"], Array]
 
-TURNING = 3.0  # rad/s of turn rate per rad of error in the heading
-WITHIN = 0.95  # share of the range of the controls that is used
-BRAKING = 0.1  # share of the horizon in which the vehicle comes to rest from its speed
 AHEAD = 4  # stages after which a point's place is predicted
 EVENLY = 0.1  # a point's weakest push, as a share of its strongest, at least
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint, innermost
 from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.judging.segments import segment_distance
 from torchgco.obstacles.base import ADMITTED
 
 
@@ -33,8 +34,8 @@ def passes(constraint: Constraint, X: Tensor) -> Passes | None:
 
 def _balls(gates: GateBalls, p: Tensor) -> Passes:
     assert gates.places is not None
-    before, at, after = (_knots(p, gates.places + shift) for shift in (-1, 0, 1))
-    away = torch.minimum(_apart(gates.centers, before, at), _apart(gates.centers, at, after))
+    before, at, after = (_knots(p, gates.places + shift) - gates.centers for shift in (-1, 0, 1))
+    away = torch.minimum(segment_distance(before, at), segment_distance(at, after))
     return Passes(away, away <= gates.sizes + ADMITTED)
 
 
@@ -54,11 +55,3 @@ def _knots(p: Tensor, places: Tensor) -> Tensor:
     """Positions (B, G, d) at knots (B, G), the first and the last for those beyond."""
     index = places.clamp(0, p.shape[1] - 1).unsqueeze(-1).expand(-1, -1, p.shape[-1])
     return p.gather(1, index)
-
-
-def _apart(c: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Distances (...) of points c from the segments between a and b (..., d)."""
-    along = b - a
-    length = along.square().sum(-1).clamp(min=torch.finfo(a.dtype).tiny)
-    share = (((c - a) * along).sum(-1) / length).clamp(0.0, 1.0)
-    return (c - a - share.unsqueeze(-1) * along).norm(dim=-1)

@@ -21,6 +21,7 @@ from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
 from torchgco.judging.gates import passes
 from torchgco.judging.maps import segment_distances
+from torchgco.judging.segments import segment_distance
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
@@ -353,14 +354,6 @@ def by_kind(measures: dict[type[Constraint], Any], obstacles: Constraint) -> Any
             return measure
     known = ", ".join(kind.__name__ for kind in measures)
     raise InputError("constraints", f"obstacles that can be judged ({known})", type(obstacles).__name__)
-
-
-def segment_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Distance (...) of the origin from the segment between a and b (..., d)."""
-    along = b - a
-    length = along.square().sum(-1)
-    share = (-(a * along).sum(-1) / length.clamp(min=torch.finfo(a.dtype).tiny)).clamp(0.0, 1.0)
-    return (a + share.unsqueeze(-1) * along).norm(dim=-1)
 
 
 def frame_columns(verdict: Verdict) -> dict[str, Any]:

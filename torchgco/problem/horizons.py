@@ -19,6 +19,7 @@ from torchgco.base.shapes import lead
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.constraints.norms import AWAY
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -32,7 +33,6 @@ from torchgco.problem.problem import Problem
 from torchgco.problem.rates import with_controls_before
 
 FORM = "within horizons"  # what is kept with the form of the problem for this one
-OUT_OF_THE_WAY = -1.0  # of inequalities that don't count, as of absent obstacles
 
 
 def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
@@ -266,7 +266,7 @@ class _Rows(WrappedConstraint):
     batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else OUT_OF_THE_WAY)
+        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else AWAY)
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         return self._where(self.constraint.violation(X, U), 0.0)
@@ -274,7 +274,7 @@ class _Rows(WrappedConstraint):
     def at(self, x: Tensor, k: int) -> Tensor:
         rows, knots = self.constraint.at(x, k), self.knots
         place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
-        return torch.where(self.counts[:, place, None, None] > 0, rows, OUT_OF_THE_WAY)
+        return torch.where(self.counts[:, place, None, None] > 0, rows, AWAY)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)

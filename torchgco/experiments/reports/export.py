@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.finished import TRUST, Study
 from torchgco.experiments.reports.mission_report import TIME_STEPS
+from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.files import damaged, write
 from torchgco.experiments.results.limits import read_table
 from torchgco.experiments.results.records import SOLUTIONS
@@ -134,15 +135,8 @@ def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Without the usage before an error: one line for every mistake."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError("command line", "RUN and the options of --help", message)
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="torchgco-export", description="The trajectories of a study as CSV, with names and units.")
+    parser = RunParser(prog="torchgco-export", description="The trajectories of a study as CSV, with names and units.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN")
     parser.add_argument("--rate", metavar="HZ", type=float, help="samples per second; default: as they were computed")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.finished import TRUST, Study, document_of
 from torchgco.experiments.reports.mission_view import missions
+from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.records import SOLUTIONS
@@ -92,15 +93,8 @@ def told(row: Mapping[str, Any]) -> Rows:
     return [*held, ("iterations", f"{row['iterations']:g}"), ("time", time)]
 
 
-class _Parser(argparse.ArgumentParser):
-    """Without the usage before an error: one line for every mistake."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError("command line", "RUN and the options of --help", message)
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
+    parser = RunParser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
     parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {NAME} in RUN")
     words = "solve the layouts of these numbers again, and show the search"
