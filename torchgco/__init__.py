@@ -70,6 +70,7 @@ from torchgco.maps import Field as Field
 from torchgco.maps import OccupancyGrid as OccupancyGrid
 from torchgco.maps import PointCloud as PointCloud
 from torchgco.missions.constraints import FirstStepRates as FirstStepRates
+from torchgco.obstacles import Body as Body
 from torchgco.obstacles import Boxes as Boxes
 from torchgco.obstacles import Capsules as Capsules
 from torchgco.obstacles import OscillatingBoxes as OscillatingBoxes
@@ -99,7 +100,7 @@ __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "FreeTime", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning",
     "QuadrotorPlant",
-    "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules",
+    "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
     "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates", "Separation",
     "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps

@@ -133,6 +133,7 @@ class Dimensions:
     obstacles_from: int = 1  # the first knot at which obstacles hold: 0 where the position may be chosen there
     goal: Tensor | None = None  # (B, d), m: the goal's position, where one is known
     horizon: Tensor | None = None  # (B,) int64: stages of each problem, where they differ
+    state_names: tuple[str, ...] = ()  # of the model's states, where it names them
 
 
 def space_of(dims: Dimensions, field: str) -> int:

@@ -18,6 +18,7 @@ from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
 from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import ABSENT, CONTACT_FACTOR, Obstacles
+from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import dimension, vehicle_radii
 
 Interpolation = Literal["smooth", "linear"]
@@ -38,7 +39,7 @@ class Field(Constraint):
 
     Args:
         field: a `DistanceField`; or a grid or cloud, whose field is made with the defaults.
-        vehicle_radius: number or (B,), m.
+        vehicle_radius: number or (B,), m; or a `Body`.
         interpolation: "smooth", quadratic B-splines, or "linear", with kinks between the cells.
         knots: default 1..N.
 
@@ -63,6 +64,8 @@ class Field(Constraint):
         check_value(self.interpolation, Interpolation, "field.interpolation")
 
     def bind(self, dims: Dimensions) -> Constraint:
+        if isinstance(self.vehicle_radius, Body):
+            return self.vehicle_radius.around(self, dims)
         d, field, like = dimension(dims, "field.field"), self.field, dims.like
         if field.d != d:
             raise InputError("field.field", f"a {d}-D map, as the vehicle's position is {d}-D", f"{field.d}-D")

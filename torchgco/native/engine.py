@@ -21,6 +21,7 @@ from torchgco.constraints.norms import NormBounds
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
+from torchgco.native.codegen.body import trace_lift
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
@@ -28,16 +29,17 @@ from torchgco.native.codegen.stages import trace_model
 from torchgco.native.compiler import Unit
 from torchgco.native.declarations import load
 from torchgco.native.packing import (
-    KINDS,
     constraint_of,
     guide_of,
     is_bounded,
+    is_lifted,
+    kind_of,
     numbers_of,
     quadratic_arrays,
     shared_fields,
 )
 from torchgco.native.shared import Captured, Shared
-from torchgco.native.structures import STRUCTURES, array
+from torchgco.native.structures import STRUCTURES, Kind, array
 from torchgco.problem.problem import Problem
 
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
@@ -63,15 +65,17 @@ class Engine:
         self.model = trace_model(problem)
         quadratic = problem.cost if type(problem.cost) is BoundQuadratic else None
         self.cost = trace_cost(problem) if quadratic is None else None
-        traced = (i for i, constraint in enumerate(problem.constraints) if type(constraint) not in KINDS)
-        sources = ((i, trace_rows(problem, i)) for i in traced)
+        parts = problem.constraints
+        traced = (i for i, part in enumerate(parts) if is_lifted(part) or kind_of(part) is Kind.FUNCTION)
+        sources = ((i, trace_lift(problem, i) if is_lifted(parts[i]) else trace_rows(problem, i)) for i in traced)
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
-        self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
+        self.measures = all(kind_of(part) is not Kind.FUNCTION or _measured(part) for part in parts)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
         self.captured = Captured(self.model, self.cost, self.functions)
         self.shared = self._first_shared()
-        self.form = Form(self.model, at, self.cost, dense, functions)
+        lifted = frozenset(i for i in self.functions if is_lifted(parts[i]))
+        self.form = Form(self.model, at, self.cost, dense, functions, lifted)
         if ahead is not None:
             ahead(self)
         self._libraries: dict[Hashable, ctypes.CDLL] = {}

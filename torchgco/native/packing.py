@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from torchgco.native import structures as c
 from torchgco.native.shared import Shared
 from torchgco.native.structures import NOWHERE, QUADRATIC, Guide, Kind, array
 from torchgco.obstacles.base import ABSENT, marked
+from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
@@ -24,6 +26,7 @@ KINDS = {
     ControlBounds: Kind.BOUNDS, StateBounds: Kind.BOUNDS, BoundSpheres: Kind.SPHERES, BoundBoxes: Kind.BOXES,
     BoundField: Kind.FIELD,
 }  # fmt: skip
+SOLIDS = BoundSpheres, BoundBoxes, BoundField
 REACH_SLACK = 1.0 + 1e-4  # as below
 BOUND_SLACK = 1.0 + 1e-4  # so that rounding, in single precision too, can't make a row active beyond its box's bounds
 
@@ -54,27 +57,41 @@ def constraint_of(
     place = torch.full((problem.N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
         place[constraint.knots] = torch.arange(knots, dtype=torch.int32)
-    kind = KINDS.get(type(constraint), Kind.FUNCTION)
+    kind = kind_of(constraint)
     equality, geometric = constraint.sense == "equality", constraint.geometric
     return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
 
 
 def numbers_of(constraint: Constraint, numbers: Tensor | None, problem: Problem) -> dict[str, Any]:
     """The fields of a `Constraint` in C that hold the numbers of this one; `numbers` (B|1, K|1, count) if traced."""
-    if KINDS.get(type(constraint)) is None:
+    if kind_of(constraint) is Kind.FUNCTION:
         return {"bound": array(numbers, knots=True)}
     if isinstance(constraint, ControlBounds | StateBounds):
         return _bounds(constraint, problem)
+    parts: tuple[Any, ...] = constraint.balls if isinstance(constraint, BoundBody) else (constraint,)
     own: dict[str, Any] = {}
-    if isinstance(constraint, BoundSpheres):
-        own = _spheres(constraint)
-    elif isinstance(constraint, BoundBoxes):
-        own = {"bound": array(_box_numbers(constraint), knots=False)}
-    elif isinstance(constraint, BoundField):
-        own = _field(constraint)
-    if isinstance(constraint, BoundSpheres | BoundBoxes | BoundField) and constraint.stops is not None:
-        own["stops"] = array(constraint.stops.unsqueeze(-1), knots=False)
+    if isinstance(parts[0], BoundSpheres):
+        own = _spheres(parts)
+    elif isinstance(parts[0], BoundBoxes):
+        own = {"bound": array(torch.cat([_box_numbers(part) for part in parts], dim=-1), knots=False)}
+    elif isinstance(parts[0], BoundField):
+        own = _field(parts)
+    if isinstance(parts[0], SOLIDS) and parts[0].stops is not None:
+        own["stops"] = array(parts[0].stops.unsqueeze(-1), knots=False)
+    if isinstance(constraint, BoundBody):
+        own |= {"lift": array(numbers, knots=True), "balls": len(parts)}
     return own
+
+
+def kind_of(constraint: Constraint) -> Kind:
+    """How C computes a constraint's rows; those of a body as the rows of its balls, where it `is_lifted`."""
+    part = constraint.balls[0] if isinstance(constraint, BoundBody) else constraint
+    return KINDS.get(type(part), Kind.FUNCTION)
+
+
+def is_lifted(constraint: Constraint) -> bool:
+    """Whether C traces where the balls of a body are, and computes their rows itself."""
+    return isinstance(constraint, BoundBody) and kind_of(constraint) is not Kind.FUNCTION
 
 
 def guide_of(guide: Penalty | None) -> dict[str, Any]:
@@ -98,12 +115,14 @@ def _bounds(constraint: ControlBounds | StateBounds, problem: Problem) -> dict[s
     return {"variable": torch.cat((above, below)), "sign": sign, "bound": array(bound, knots=True)}
 
 
-def _spheres(spheres: BoundSpheres) -> dict[str, Any]:
-    squares = marked(spheres.inflated_radii.square(), spheres.absent)
-    own = {"bound": array(spheres.centers.flatten(1), knots=False), "squares": array(squares, knots=False)}
-    if spheres.velocities is not None:
-        own["velocities"] = array(spheres.velocities.flatten(1), knots=False)
-    return {**own, "dt": spheres.dt}
+def _spheres(parts: Sequence[BoundSpheres]) -> dict[str, Any]:
+    joined = lambda rows: array(torch.cat([row.flatten(1) for row in rows], dim=-1), knots=False)
+    squares = [marked(part.inflated_radii.square(), part.absent) for part in parts]
+    own = {"bound": joined([part.centers for part in parts]), "squares": joined(squares)}
+    velocities = [part.velocities for part in parts if part.velocities is not None]
+    if velocities:
+        own["velocities"] = joined(velocities)
+    return {**own, "dt": parts[0].dt}
 
 
 def _box_numbers(boxes: BoundBoxes) -> Tensor:
@@ -115,16 +134,21 @@ def _box_numbers(boxes: BoundBoxes) -> Tensor:
     return torch.cat((bounds.flatten(1), 2.0 * boxes.depths, numbers.flatten(1)), dim=1)
 
 
-def _field(field: BoundField) -> dict[str, Any]:
+def _field(parts: Sequence[BoundField]) -> dict[str, Any]:
     """The numbers (B, ...) that field.c reads, and the map itself, which isn't copied."""
-    h, d, R, like = field.field.spacing, field.origins.shape[-1], field.vehicle_radius, field.origins
-    factors = torch.where(field.absent[:, 0], ABSENT, field.factors)
-    reach = REACH_SLACK * (R + 1.5 * h * d**0.5)  # nodes read for a point lie within h sqrt(d) of the nearest one
-    columns = [like.new_full((len(R),), 1.0 / h), like.new_full((len(R),), h * h), R.square(), factors, field.cores]
-    numbers = torch.cat((field.origins, torch.stack([*columns, field.limits, reach], dim=-1)), dim=-1)
-    nodes = field.field.nodes(like.device)
+    field = parts[0]
+    nodes = field.field.nodes(field.origins.device)
     x, y, z = (*nodes.shape[1:], 1)[:3]
+    numbers = torch.cat([_field_numbers(part) for part in parts], dim=-1)
     return {
         "bound": array(numbers, knots=False), "map": nodes, "map_of": field.which.contiguous(),
         "map_x": x, "map_y": y, "map_z": z, "smooth": field.smooth,
     }  # fmt: skip
+
+
+def _field_numbers(field: BoundField) -> Tensor:
+    h, d, R, like = field.field.spacing, field.origins.shape[-1], field.vehicle_radius, field.origins
+    factors = torch.where(field.absent[:, 0], ABSENT, field.factors)
+    reach = REACH_SLACK * (R + 1.5 * h * d**0.5)  # nodes read for a point lie within h sqrt(d) of the nearest one
+    columns = [like.new_full((len(R),), 1.0 / h), like.new_full((len(R),), h * h), R.square(), factors, field.cores]
+    return torch.cat((field.origins, torch.stack([*columns, field.limits, reach], dim=-1)), dim=-1)

@@ -68,6 +68,10 @@ class Constraint(Structure):
         ("const int64_t *", "map_of"),  # FIELD: (E)
         ("int64_t", "map_x map_y map_z"),
         ("int32_t", "smooth"),  # FIELD: three nodes per axis, or two
+        # SPHERES, BOXES, FIELD of a body: of how many balls, each with an equal share of rows and numbers; else 0. The
+        # function that places them is traced, with p as of a FUNCTION (E, knots, ...).
+        ("int32_t", "balls"),
+        (Array, "lift"),
     )
     _fields_ = fields(declared)
 

@@ -2,6 +2,7 @@
 
 from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.obstacles.base import Obstacles as Obstacles
+from torchgco.obstacles.body import Body as Body
 from torchgco.obstacles.boxes import Boxes as Boxes
 from torchgco.obstacles.capsules import Capsules as Capsules
 from torchgco.obstacles.oscillating import OscillatingBoxes as OscillatingBoxes

@@ -113,6 +113,11 @@ class Obstacles(Constraint):
         return False
 
     @property
+    def core(self) -> Obstacles:
+        """The obstacles as the vehicle's position meets them: themselves, or of a body the ball that it holds."""
+        return self
+
+    @property
     def margins(self) -> Tensor:
         """Lengths (B, M), m: bodies touch at (1 - CONTACT_FACTOR) times these beneath the full surface."""
         raise undefined(self, "margins")

@@ -13,6 +13,7 @@ from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.obstacles.base import ABSENT, Obstacles, picked
+from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
 
@@ -35,7 +36,7 @@ class Boxes(Constraint):
             empty list stands for (0, d).
         half_sizes: as centers: half the lengths of the sides before rounding, m; NaN where the centre is. Above 0, or
             at least 0 where the box has a radius above 0: a box with a single side above 0 is then a capsule.
-        vehicle_radius: number or (B,), m.
+        vehicle_radius: number or (B,), m; or a `Body`.
         rotations: those that turn the axes of space into the box's sides. In the plane angles (M,) or (B, M), rad; in
             space unit quaternions [w, x, y, z], (M, 4) or (B, M, 4). None: sides along the axes.
         radii: (M,) or (B, M), m, at least 0; NaN where the centre is. The surface of a rounded box lies so far outside
@@ -59,6 +60,8 @@ class Boxes(Constraint):
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
+        if isinstance(self.vehicle_radius, Body):
+            return self.vehicle_radius.around(self, dims)
         d = dimension(dims, "boxes.centers")
         centers, absent = points(self.centers, "boxes.centers", d, dims)
         half = rows(self.half_sizes, "boxes.half_sizes", d, dims)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import from_quaternions
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.inputs import dimension, own_radii, points, vehicle_radii
@@ -27,7 +28,7 @@ class Capsules(Constraint):
         starts, ends: of the segments, (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent capsules
             (padding); M may be 0, and empty lists stand for (0, d). Equal points make a sphere.
         radii: (M,) or (B, M), m, above 0; NaN where the start is.
-        vehicle_radius: number or (B,), m.
+        vehicle_radius: number or (B,), m; or a `Body`.
         knots: default 1..N.
 
     Raises:
@@ -45,6 +46,8 @@ class Capsules(Constraint):
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
+        if isinstance(self.vehicle_radius, Body):
+            return self.vehicle_radius.around(self, dims)
         d = dimension(dims, "capsules.starts")
         starts, absent = points(self.starts, "capsules.starts", d, dims)
         ends, gone = points(self.ends, "capsules.ends", d, dims)

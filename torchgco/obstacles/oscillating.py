@@ -15,6 +15,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.constraints.base import Constraint, Sense
 from torchgco.obstacles.base import ABSENT, TOUCH, Obstacles, least, picked
+from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, excess, segment_distance, signed_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
 from torchgco.obstacles.inputs import per_problem
@@ -42,6 +43,8 @@ class OscillatingBoxes(Constraint):
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
+        if isinstance(self.boxes.vehicle_radius, Body):
+            return self.boxes.vehicle_radius.around(self, dims)
         boxes = self.boxes.bind(dims)
         assert isinstance(boxes, BoundBoxes)
         if dims.dt is None:

@@ -18,6 +18,7 @@ from torchgco.base.shapes import Dimensions, check_shape, space_of
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.obstacles.base import ABSENT, TOUCH, Obstacles, Solids, least, picked
 from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
+from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, per_problem, points, vehicle_radii
 
 
@@ -29,7 +30,7 @@ class Spheres(Constraint):
         centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent obstacles (padding); M may be 0,
             and an empty list stands for (0, d).
         radii: (M,) or (B, M), m; NaN where the centre is.
-        vehicle_radius: number or (B,), m.
+        vehicle_radius: number or (B,), m; or a `Body`.
         velocities: as centers, m/s; the obstacle is at centers + velocities * k dt. None: static.
         knots: default 1..N.
 
@@ -48,6 +49,8 @@ class Spheres(Constraint):
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
+        if isinstance(self.vehicle_radius, Body):
+            return self.vehicle_radius.around(self, dims)
         d = space_of(dims, "obstacles.centers")
         assert dims.position is not None
         centers, absent = points(self.centers, "obstacles.centers", d, dims)

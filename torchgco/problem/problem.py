@@ -105,7 +105,8 @@ class Problem:
         model = dynamics or self.dynamics
         first = 0 if chooses_position(self.free_start, model.position) else 1
         goal, dt = self.goal and self.goal.place, getattr(model, "dt", None)
-        return Dimensions(len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon)
+        names = tuple(getattr(model, "state_names", ()))
+        return Dimensions(len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon, names)
 
     def __repr__(self) -> str:
         return summary(self)

@@ -6,6 +6,27 @@ static inline int64_t row_of(const Barrier *t, int64_t i, int64_t k) {
     return t->first[i] + con->place[k] * con->rows;
 }
 
+#if DIM > 0
+/* Values c of obstacles at knot k. */
+static inline void solids_at(const Constraint *con, const Rows *rows, int64_t k, const V *x, V *c) {
+    V away[DIM];
+    if (con->kind == SPHERES) for (int j = 0; j < con->rows; j++) c[j] = sphere(con, rows, j, k, x, away);
+    else if (con->kind == BOXES) for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
+    else c[0] = field_row(con, rows, k, x, 0, 0);
+}
+
+static void body_at(const Lanes *s, int64_t i, int64_t k, const V *x, V *c) {
+    const Constraint *con = s->of->constraint + i;
+    V centers[con->balls * DIM];
+    Ball ball;
+    ball_centers(s, i, k, x, centers);
+    for (int b = 0; b < con->balls; b++) {
+        ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
+        solids_at(&ball.con, &ball.rows, k, ball.x, c + b * ball.con.rows);
+    }
+}
+#endif
+
 /* Values c of constraint i at knot k. */
 static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *c) {
     const Constraint *con = s->of->constraint + i;
@@ -13,13 +34,10 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) c[j] = bound(con, rows, j, k, x, u);
 #if DIM > 0
-    } else if (con->kind == SPHERES) {
-        V away[DIM];
-        for (int j = 0; j < con->rows; j++) c[j] = sphere(con, rows, j, k, x, away);
-    } else if (con->kind == BOXES) {
-        for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
-    } else if (con->kind == FIELD) {
-        c[0] = field_row(con, rows, k, x, 0, 0);
+    } else if (con->balls > 0) {
+        body_at(s, i, k, x, c);
+    } else if (con->kind != FUNCTION) {
+        solids_at(con, rows, k, x, c);
 #endif
     } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
 }
@@ -44,20 +62,22 @@ static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
 }
 
 #if DIM > 0
+/* Where rows of the position add: gradients of the parts (POSITION + DIM at least), and an upper triangle by rows of S. */
+typedef struct { V *g[PARTS], *H; } Into;
+
 /* A row of the position alone, with its slopes and lam times its curvature (DIM, DIM), upper triangle. */
-static inline void add_row(Barrier *t, int64_t k, int64_t q, const V *slopes, const V *curvature) {
-    V by[PARTS], cc = weigh(t, 0, q, by), *H = t->H + k * S * S;
+static inline void add_row(const Barrier *t, Into to, int64_t q, const V *slopes, const V *curvature) {
+    V by[PARTS], cc = weigh(t, 0, q, by);
     for (int a = 0; a < DIM; a++) {
-        for (int part = 0; part < PARTS; part++) ADD(t->g[part][k * S + POSITION + a], by[part], slopes[a]);
+        for (int part = 0; part < PARTS; part++) ADD(to.g[part][POSITION + a], by[part], slopes[a]);
         for (int b = a; b < DIM; b++)
-            H[(POSITION + a) * S + POSITION + b] += cc * slopes[a] * slopes[b] + curvature[a * DIM + b];
+            to.H[(POSITION + a) * S + POSITION + b] += cc * slopes[a] * slopes[b] + curvature[a * DIM + b];
     }
 }
 
-static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
-    const Constraint *con = t->lanes.of->constraint + i;
-    const Rows *rows = t->lanes.rows + i;
-    int64_t q = row_of(t, i, k);
+/* Those that follow add the rows of obstacles, which begin at row q, at knot k. */
+static inline void add_spheres(
+    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
     for (int j = 0; j < con->rows; j++, q++) {
         V slopes[DIM], curvature[DIM * DIM], bend;
         sphere(con, rows, j, k, x, slopes);
@@ -66,7 +86,7 @@ static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
             slopes[a] *= SET(-2.0);
             for (int b = 0; b < DIM; b++) curvature[a * DIM + b] = a == b ? bend : SET(0.0);
         }
-        add_row(t, k, q, slopes, curvature);
+        add_row(t, to, q, slopes, curvature);
     }
 }
 #endif
@@ -93,26 +113,64 @@ static inline void bend_box(
     }
 }
 
-static inline void add_boxes(Barrier *t, int64_t i, int64_t k, const V *x) {
-    const Constraint *con = t->lanes.of->constraint + i;
-    const Rows *rows = t->lanes.rows + i;
-    int64_t q = row_of(t, i, k);
+static inline void add_boxes(
+    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
     V slopes[DIM], curvature[DIM * DIM];
     for (int j = 0; j < con->rows; j++, q++) {
         solid(con, rows, j, k, x, slopes);
         bend_box(con, rows, j, k, x, t->objective * t->z[q], curvature);
-        add_row(t, k, q, slopes, curvature);
+        add_row(t, to, q, slopes, curvature);
     }
 }
-#endif
 
-#if DIM > 0
-static inline void add_field(Barrier *t, int64_t i, int64_t k, const V *x) {
-    int64_t q = row_of(t, i, k);
+static inline void add_field(
+    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
     V slopes[DIM], curvature[DIM * DIM], lam = t->objective * t->z[q];
-    field_row(t->lanes.of->constraint + i, t->lanes.rows + i, k, x, slopes, curvature);
+    field_row(con, rows, k, x, slopes, curvature);
     for (int a = 0; a < DIM; a++) for (int b = a; b < DIM; b++) curvature[a * DIM + b] *= lam;
-    add_row(t, k, q, slopes, curvature);
+    add_row(t, to, q, slopes, curvature);
+}
+
+/* The same of any kind. */
+static inline void add_solids(
+    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
+    if (con->kind == SPHERES) add_spheres(t, to, con, rows, q, k, x);
+    else if (con->kind == BOXES) add_boxes(t, to, con, rows, q, k, x);
+    else add_field(t, to, con, rows, q, k, x);
+}
+
+/* Rows of a body: each ball's by its center, then by the state, with the curvature of its way. */
+static void add_body(Barrier *t, int64_t i, int64_t k, const V *x) {
+    const Lanes *s = &t->lanes;
+    const Constraint *con = s->of->constraint + i;
+    const V *numbers = at(s->rows[i].lift, &con->lift, con->place[k]);
+    int64_t q = row_of(t, i, k), P = con->balls;
+    V centers[P * DIM], e[P * DIM * S], own[PARTS * (POSITION + DIM)], square[(POSITION + DIM) * S], *H = t->H + k * S * S;
+    V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], *g[PARTS];
+    const int *columns;
+    Into to = {.H = square};
+    Ball ball;
+    ball_centers(s, i, k, x, centers);
+    int count = model_slopes((int)i, x, 0, numbers, con->shared, e, &columns);
+    for (int part = 0; part < PARTS; part++) {
+        to.g[part] = own + part * (POSITION + DIM);
+        g[part] = t->g[part] + k * S;
+    }
+    for (int b = 0; b < P; b++) {
+        ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
+        for (int a = POSITION; a < POSITION + DIM; a++) {
+            for (int part = 0; part < PARTS; part++) to.g[part][a] = SET(0.0);
+            for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
+        }
+        add_solids(t, to, &ball.con, &ball.rows, q + b * ball.con.rows, k, ball.x);
+        pull_square(count, columns, e + b * DIM * count, square + POSITION * S, H);
+        for (int a = 0; a < DIM; a++) {
+            for (int part = 0; part < PARTS; part++) by[part * MAX_ROWS + b * DIM + a] = to.g[part][POSITION + a];
+            cc[b * DIM + a] = SET(0.0);
+            lam[b * DIM + a] = t->objective * to.g[0][POSITION + a]; /* by[0] are multipliers: weigh */
+        }
+    }
+    model_bend_rows((int)i, x, 0, numbers, con->shared, by, cc, lam, g, H);
 }
 #endif
 
@@ -133,9 +191,13 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
     const Rows *rows = t->lanes.rows + i;
     if (con->kind == BOUNDS) { add_bounds(t, i, k); return; }
 #if DIM > 0
-    if (con->kind == SPHERES) { add_spheres(t, i, k, x); return; }
-    if (con->kind == BOXES) { add_boxes(t, i, k, x); return; }
-    if (con->kind == FIELD) { add_field(t, i, k, x); return; }
+    if (con->balls > 0) { add_body(t, i, k, x); return; }
+    if (con->kind != FUNCTION) {
+        Into to = {.H = t->H + k * S * S};
+        for (int part = 0; part < PARTS; part++) to.g[part] = t->g[part] + k * S;
+        add_solids(t, to, con, rows, row_of(t, i, k), k, x);
+        return;
+    }
 #endif
     V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], own[PARTS];
     int64_t q = row_of(t, i, k);
@@ -150,6 +212,37 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
     model_bend_rows((int)i, x, u, numbers, con->shared, by, cc, lam, g, t->H + k * S * S);
 }
 
+#if DIM > 0
+/* The change of rows of obstacles at knot k where the position changes by `step` (DIM), into out. */
+static inline void solids_along(
+    const Constraint *con, const Rows *rows, int64_t k, const V *x, const V *step, V *out) {
+    V slopes[DIM];
+    for (int j = 0; j < con->rows; j++) {
+        out[j] = SET(0.0);
+        if (con->kind == SPHERES) {
+            sphere(con, rows, j, k, x, slopes);
+            for (int a = 0; a < DIM; a++) SUBTRACT(out[j], SET(2.0) * slopes[a], step[a]);
+            continue;
+        }
+        if (con->kind == BOXES) solid(con, rows, j, k, x, slopes);
+        else field_row(con, rows, k, x, slopes, 0);
+        for (int a = 0; a < DIM; a++) ADD(out[j], slopes[a], step[a]);
+    }
+}
+
+static void body_along(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *z, V *out) {
+    const Constraint *con = s->of->constraint + i;
+    V centers[con->balls * DIM], steps[con->balls * DIM];
+    Ball ball;
+    ball_centers(s, i, k, x, centers);
+    model_along_rows((int)i, x, u, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, z, steps);
+    for (int b = 0; b < con->balls; b++) {
+        ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
+        solids_along(&ball.con, &ball.rows, k, ball.x, steps + b * DIM, out + b * ball.con.rows);
+    }
+}
+#endif
+
 /* The change of the rows of constraint i at knot k along z = [dx, du], into out. */
 static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z, V *out) {
     const Constraint *con = t->lanes.of->constraint + i;
@@ -157,25 +250,10 @@ static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, con
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) out[j] = SET(con->sign[j]) * z[con->variable[j]];
 #if DIM > 0
-    } else if (con->kind == SPHERES) {
-        for (int j = 0; j < con->rows; j++) {
-            V away[DIM];
-            sphere(con, rows, j, k, x, away);
-            out[j] = SET(0.0);
-            for (int a = 0; a < DIM; a++) SUBTRACT(out[j], SET(2.0) * away[a], z[POSITION + a]);
-        }
-    } else if (con->kind == BOXES) {
-        for (int j = 0; j < con->rows; j++) {
-            V slopes[DIM];
-            solid(con, rows, j, k, x, slopes);
-            out[j] = SET(0.0);
-            for (int a = 0; a < DIM; a++) ADD(out[j], slopes[a], z[POSITION + a]);
-        }
-    } else if (con->kind == FIELD) {
-        V slopes[DIM];
-        field_row(con, rows, k, x, slopes, 0);
-        out[0] = SET(0.0);
-        for (int a = 0; a < DIM; a++) ADD(out[0], slopes[a], z[POSITION + a]);
+    } else if (con->balls > 0) {
+        body_along(&t->lanes, i, k, x, u, z, out);
+    } else if (con->kind != FUNCTION) {
+        solids_along(con, rows, k, x, z + POSITION, out);
 #endif
     } else model_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, z, out);
 }

@@ -32,6 +32,48 @@ static inline void spheres_expand(
 }
 #endif
 
+#if DIM > 0
+/* Rows of a body, ball by ball. */
+__attribute__((noinline)) static V body_value(const Lanes *s, int64_t i, int64_t k, const V *x, V total) {
+    const Constraint *con = s->of->constraint + i;
+    V centers[con->balls * DIM];
+    Ball ball;
+    ball_centers(s, i, k, x, centers);
+    for (int b = 0; b < con->balls; b++) {
+        ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
+        if (con->kind == SPHERES) total = spheres_value(s, &ball.con, &ball.rows, k, ball.x, total);
+        else if (con->kind == BOXES) total = boxes_value(s, &ball.con, &ball.rows, k, ball.x, total);
+        else total = field_value(s, &ball.con, &ball.rows, k, ball.x, total);
+    }
+    return total;
+}
+
+__attribute__((noinline)) static void body_expand(const Lanes *s, int64_t i, int64_t k, const V *x, V *g, V *H) {
+    const Constraint *con = s->of->constraint + i;
+    V centers[con->balls * DIM], e[con->balls * DIM * S], own[POSITION + DIM], square[(POSITION + DIM) * S];
+    const int *columns = 0;
+    int count = -1;
+    Ball ball;
+    ball_centers(s, i, k, x, centers);
+    for (int b = 0; b < con->balls; b++) {
+        ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
+        for (int a = POSITION; a < POSITION + DIM; a++) {
+            own[a] = SET(0.0);
+            for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
+        }
+        if (con->kind == SPHERES) spheres_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
+        else if (con->kind == BOXES) boxes_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
+        else field_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
+        if (adds_nothing(own + POSITION, square + POSITION * S)) continue;
+        if (count < 0)
+            count = model_slopes(
+                (int)i, x, 0, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, e, &columns);
+        pull_slope(count, columns, e + b * DIM * count, own + POSITION, g);
+        pull_square(count, columns, e + b * DIM * count, square + POSITION * S, H);
+    }
+}
+#endif
+
 /* Rows that are traced, in functions of their own: room for any number of them would cost the others time. */
 __attribute__((noinline)) static V traced_value(
     const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V total) {
@@ -59,6 +101,8 @@ static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, con
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) total += worth(s, 0, bound(con, rows, j, k, x, u), lam[j]);
 #if DIM > 0
+    } else if (con->balls > 0) {
+        total = body_value(s, i, k, x, total);
     } else if (con->kind == SPHERES) {
         total = spheres_value(s, con, rows, k, x, total);
     } else if (con->kind == BOXES) {
@@ -82,6 +126,8 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
             H[v * S + v] += rho;
         }
 #if DIM > 0
+    } else if (con->balls > 0) {
+        body_expand(s, i, k, x, g, H);
     } else if (con->kind == SPHERES) {
         spheres_expand(s, con, rows, k, x, g, H);
     } else if (con->kind == BOXES) {

@@ -13,6 +13,9 @@ void model_pull_back(const V *p, const V *f, V *g); /* g = F' p */
 void model_rows(int i, const V *x, const V *u, const V *p, const double *w, V *c);
 void model_add_rows(
     int i, const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc, V *g, V *H);
+/* Of the places of a body's balls, c (balls DIM): their slopes e (balls DIM, count) by the `columns` of z, whose count is
+   returned. */
+int model_slopes(int i, const V *x, const V *u, const V *p, const double *w, V *e, const int **columns);
 /* The cost of stage k at x, u, of the last knot where u is NULL; adds its gradient g (S) and Hessian H (S, S). */
 V cost_value(const Lanes *s, int64_t k, const V *x, const V *u);
 void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H);

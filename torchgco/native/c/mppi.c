@@ -24,7 +24,24 @@ static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
     }
 }
 
-/* The number of obstacles that each sample touches at knot k. */
+#if DIM > 0
+/* How many obstacles of a kind each sample touches at knot k. */
+static inline V touched_solids(const Constraint *con, const Rows *rows, int64_t k, const V *x) {
+    V count = SET(0.0);
+    if (con->kind == SPHERES) {
+        for (int j = 0; j < con->rows; j++) {
+            V away[DIM], c = sphere(con, rows, j, k, x, away);
+            count += tgco_truth(c >= SET(0.0));
+        }
+    } else if (con->kind == BOXES) {
+        for (int j = 0; j < con->rows; j++)
+            if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
+    } else if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, 0, 0) >= SET(0.0));
+    return count;
+}
+#endif
+
+/* The number of obstacles that each sample touches at knot k; of a body, by each of its balls. */
 static V hits(const Samples *q, int64_t k, const V *x) {
     const Problem *p = q->of->of;
     V count = SET(0.0);
@@ -32,22 +49,18 @@ static V hits(const Samples *q, int64_t k, const V *x) {
         const Constraint *con = p->constraint + i;
         if (!q->of->geometric[i] || con->place[k] == NOWHERE) continue;
 #if DIM > 0
-        if (con->kind == SPHERES) {
-            for (int j = 0; j < con->rows; j++) {
-                V away[DIM], c = sphere(con, q->s.rows + i, j, k, x, away);
-                count += tgco_truth(c >= SET(0.0));
+        if (con->balls > 0) {
+            V centers[con->balls * DIM];
+            Ball ball;
+            ball_centers(&q->s, i, k, x, centers);
+            for (int b = 0; b < con->balls; b++) {
+                ball_at(con, q->s.rows + i, b, k, centers + b * DIM, &ball);
+                count += touched_solids(&ball.con, &ball.rows, k, ball.x);
             }
             continue;
         }
-        if (con->kind == BOXES) {
-            const Rows *rows = q->s.rows + i;
-            for (int j = 0; j < con->rows; j++)
-                if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
-            continue;
-        }
-        if (con->kind == FIELD) {
-            const Rows *rows = q->s.rows + i;
-            if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, 0, 0) >= SET(0.0));
+        if (con->kind != FUNCTION) {
+            count += touched_solids(con, q->s.rows + i, k, x);
             continue;
         }
 #endif

@@ -24,6 +24,42 @@ static inline V past_radius(V c, V radius) {
     return (c + c) / (SET(1.0) + tgco_sqrt(tgco_choose(square < SET(0.0), SET(0.0), square)));
 }
 
+#if DIM > 0
+/* Rows of obstacles at one knot. */
+static inline void note_solids(
+    Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, I *pushed, Sweep *sweep) {
+    int64_t place = con->place[k];
+    V *lam = rows->lam + place * con->rows, zero = SET(0.0);
+    if (con->kind == SPHERES) {
+        V c[BLOCK];
+        for (int64_t first = 0; first < con->rows; first += BLOCK) {
+            int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
+            if (!spheres(con, rows, first, last, k, x, c)) continue; /* no multiplier, and none to come */
+            for (int64_t j = first; j < last; j++) {
+                V value = c[j - first], square = square_at(con, rows, j, k);
+                V depth = tgco_sqrt(square) - tgco_sqrt(square - value);
+                note(s, con, value, tgco_choose(value <= zero, zero, depth), lam + j, pushed, sweep);
+            }
+        }
+    } else if (con->kind == BOXES) {
+        const V *factors = rows->bound + con->rows * 2 * DIM;
+        int known = any(rows->pushed[place]);
+        for (int64_t first = 0, last; first < con->rows; first = last) {
+            last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
+            if (!some_matter(con, rows, lam, known, first, last, x)) continue;
+            for (int64_t j = first; j < last; j++) {
+                if (!may_matter(con, rows, lam, known, j, x)) continue;
+                V c = solid(con, rows, j, k, x, 0);
+                note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, pushed, sweep);
+            }
+        }
+    } else if (any(rows->pushed[place]) || !is_far_from_map(con, rows, x)) {
+        V c = field_row(con, rows, k, x, 0, 0);
+        note(s, con, c, tgco_choose(c <= zero, zero, depth_of(rows, c)), lam, pushed, sweep);
+    }
+}
+#endif
+
 /* Rows of one knot of a constraint. */
 static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sweep *sweep) {
     const Constraint *con = s->of->constraint + i;
@@ -37,34 +73,16 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
             note(s, con, c, tgco_choose(c < zero, zero, c), lam + j, &pushed, sweep);
         }
 #if DIM > 0
-    } else if (con->kind == SPHERES) {
-        V c[BLOCK];
-        for (int64_t first = 0; first < con->rows; first += BLOCK) {
-            int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
-            if (!spheres(con, rows, first, last, k, x, c)) continue; /* no multiplier, and none to come */
-            for (int64_t j = first; j < last; j++) {
-                V value = c[j - first], square = square_at(con, rows, j, k);
-                V depth = tgco_sqrt(square) - tgco_sqrt(square - value);
-                note(s, con, value, tgco_choose(value <= zero, zero, depth), lam + j, &pushed, sweep);
-            }
+    } else if (con->balls > 0) {
+        V centers[con->balls * DIM];
+        Ball ball;
+        ball_centers(s, i, k, x, centers);
+        for (int b = 0; b < con->balls; b++) {
+            ball_at(con, rows, b, k, centers + b * DIM, &ball);
+            note_solids(s, &ball.con, &ball.rows, k, ball.x, &pushed, sweep);
         }
-    } else if (con->kind == BOXES) {
-        const V *factors = rows->bound + con->rows * 2 * DIM;
-        int known = any(rows->pushed[place]);
-        for (int64_t first = 0, last; first < con->rows; first = last) {
-            last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
-            if (!some_matter(con, rows, lam, known, first, last, x)) continue;
-            for (int64_t j = first; j < last; j++) {
-                if (!may_matter(con, rows, lam, known, j, x)) continue;
-                V c = solid(con, rows, j, k, x, 0);
-                note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, &pushed, sweep);
-            }
-        }
-    } else if (con->kind == FIELD) {
-        if (any(rows->pushed[place]) || !is_far_from_map(con, rows, x)) {
-            V c = field_row(con, rows, k, x, 0, 0);
-            note(s, con, c, tgco_choose(c <= zero, zero, depth_of(rows, c)), lam, &pushed, sweep);
-        }
+    } else if (con->kind != FUNCTION) {
+        note_solids(s, con, rows, k, x, &pushed, sweep);
 #endif
     } else {
         V c[MAX_ROWS];
@@ -294,7 +312,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
             const Rows *rows = s->rows + i;
-            if (con->kind != SPHERES) continue;
+            if (con->kind != SPHERES || con->balls > 0) continue;
             for (int j = 0; j < con->rows; j++) {
                 V radius = SET(p->gain) * tgco_sqrt(rows->squares[j]), a[DIM], b[DIM], along[DIM], nearest = least;
                 I here = rows->squares[j] >= SET(0.0);

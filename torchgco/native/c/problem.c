@@ -32,6 +32,7 @@ static int64_t lay_out(Lanes *s, V *memory) {
         rows.lam = cut(&m, c->knots * c->rows); rows.bound = cut(&m, length(&c->bound, c->knots));
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
         rows.stops = cut(&m, length(&c->stops, 1)); rows.radii = cut(&m, length(&c->radii, c->knots));
+        rows.lift = cut(&m, length(&c->lift, c->knots));
         rows.pushed = (I *)cut(&m, c->knots);
         for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;
@@ -75,6 +76,7 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
         fill(s->rows[i].velocities, &c->velocities, 1, lane, e);
         fill(s->rows[i].stops, &c->stops, 1, lane, e);
         fill(s->rows[i].radii, &c->radii, c->knots, lane, e);
+        fill(s->rows[i].lift, &c->lift, c->knots, lane, e);
         if (c->map) s->rows[i].map[lane] = c->map + c->map_of[e] * c->map_x * c->map_y * c->map_z;
     }
 }

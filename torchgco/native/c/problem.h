@@ -14,7 +14,7 @@
 
 /* A constraint's multipliers and numbers. */
 typedef struct {
-    V *lam, *bound, *squares, *velocities, *radii, *stops;
+    V *lam, *bound, *squares, *velocities, *radii, *stops, *lift;
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
     const float *map[LANES]; /* of a FIELD: each lane's map */
 } Rows;

@@ -12,6 +12,7 @@ from torchgco.base.tree import apart
 from torchgco.constraints.base import FunctionConstraint
 from torchgco.native.codegen import calls
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
+from torchgco.native.packing import is_lifted
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 
@@ -31,12 +32,18 @@ def trace_rows(problem: Problem, i: int) -> KnotSource:
 
 def rows_numbers(problem: Problem, i: int, source: KnotSource, shared: Tensor) -> Tensor:
     """The numbers (B|1, K|1, count) of constraint i; `shared` are those that all problems share."""
-    return source.numbers(problem.B, own_tensors(problem.constraints[i]), shared, lambda: span_of_rows(problem, i))
+    return source.numbers(problem.B, own_tensors(traced_part(problem, i)), shared, lambda: span_of_rows(problem, i))
+
+
+def traced_part(problem: Problem, i: int) -> Any:
+    """What is traced of constraint i: itself, or what places the balls of a body, whose rows C knows."""
+    part = problem.constraints[i]
+    return part.points if is_lifted(part) else part
 
 
 def span_of_rows(problem: Problem, i: int) -> Span:
     """Constraint i, traced along whole trajectories, as PyTorch calls it."""
-    constraint, n, m, N = apart(problem.constraints[i]), problem.n, problem.m, problem.N
+    constraint, n, m, N = apart(traced_part(problem, i)), problem.n, problem.m, problem.N
     called = isinstance(constraint, FunctionConstraint)
     name = constraint.name if called else f"constraints[{i}] ({type(constraint).__name__})"
     try:

@@ -4,7 +4,7 @@ the sparse Jacobian and its functions, and those of the solver, which are compil
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -65,7 +65,7 @@ class Library:
     shared: tuple[str, ...]
 
 
-BOXES = "box.h", "boxes.c", "field.c"  # left out of problems without a position
+BOXES = "box.h", "boxes.c", "field.c", "body.c"  # left out of problems without a position
 ROWS = ("problem.c", "rows.c", "penalty.c", *BOXES)
 PHASES = "_rows", "_step", "_memory", "_fixed", "_search", "", "_kkt"
 PASSES = "model.c", "passes.h", "cholesky.h", "passes.c"
@@ -89,6 +89,7 @@ class Form:
     cost: CostSource | None  # None: quadratic
     dense: bool  # the quadratic cost's weights are matrices
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
+    lifted: frozenset[int] = frozenset()  # those of which the places of a body's balls are traced
 
     def units(self, library: Library = SOLVER, real: str = "double", lanes: int = LANES) -> tuple[Unit, ...]:
         """The units of a library, for numbers of type `real`."""
@@ -104,7 +105,7 @@ class Form:
         at = self.position
         cost = None if self.cost is None else (self.cost.stage.key, self.cost.last.key)
         functions = tuple((i, rows.key) for i, rows in self.functions)
-        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions
+        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
 
     def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
         model, at = self.dynamics, self.position
@@ -136,7 +137,8 @@ class Form:
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
-        return [*generated, *dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
+        code = dict.fromkeys(rows.code for _, rows in self.functions)
+        return [*generated, *code, _switches(self.functions, self.lifted)]
 
 
 def _products(model: DynamicsSource) -> str:
@@ -186,12 +188,16 @@ def _written_out(model: DynamicsSource) -> str:
     )  # fmt: skip
 
 
-def _switches(functions: Iterable[tuple[int, KnotSource]]) -> str:
-    """`tgco_rows` and `tgco_add_rows`, which call the functions of a constraint by its place."""
-    values, adds = [], []
+def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int]) -> str:
+    """`tgco_rows`, `tgco_add_rows` and `tgco_slopes`, which call the functions of a constraint by its place."""
+    values, adds, slopes = [], [], []
     for i, rows in functions:
-        values.append(f"    case {i}: tgco_{rows.key}_rows(x, u, p, w, c); break;")
-        adds.append(f"    case {i}: tgco_{rows.key}_add(x, u, p, w, by_c, by_cc, g, H); break;")
+        name = f"tgco_{rows.key}"
+        values.append(f"    case {i}: {name}_rows(x, u, p, w, c); break;")
+        if i in lifted:
+            slopes.append(f"    case {i}: {name}_slopes(x, u, p, w, e); *columns = {name}_columns; return {name}_count;")
+        else:
+            adds.append(f"    case {i}: {name}_add(x, u, p, w, by_c, by_cc, g, H); break;")
     return "\n".join(
         [
             "static inline void tgco_rows(int i, const V *x, const V *u, const V *p, const double *w, V *c) {",
@@ -200,5 +206,8 @@ def _switches(functions: Iterable[tuple[int, KnotSource]]) -> str:
             "    int i, const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc,",
             "    V *g, V *H) {",
             "    switch (i) {", *adds, "    }", "}",
+            "static inline int tgco_slopes(",
+            "    int i, const V *x, const V *u, const V *p, const double *w, V *e, const int **columns) {",
+            "    switch (i) {", *slopes, "    }", "    return 0;", "}",
         ]
     )  # fmt: skip

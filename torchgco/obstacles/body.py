@@ -1,0 +1,255 @@
+"""A vehicle's body: balls fixed to it, which turn with it and keep clear of obstacles of every kind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.autodiff import jacobian
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.tree import PerElement
+from torchgco.constraints.base import TOUCH
+from torchgco.obstacles.attitude import Attitude, attitude_of
+from torchgco.obstacles.base import Obstacles, Solids
+
+if TYPE_CHECKING:
+    from torchgco.constraints.base import Constraint
+
+PIECES = 4  # of a step, between which the balls move on straight lines
+
+
+@dataclass(frozen=True)
+class Body:
+    """The shape of a vehicle: P balls at fixed places in its own frame, discs in the plane.
+
+        car = Body([[0.3, 0], [1.3, 0], [2.3, 0]], [1.1, 1.1, 1.1])
+        trees = Spheres(centers, radii, vehicle_radius=car)
+
+    It stands where a number stands for the vehicle's radius, in obstacles of every kind: each ball then keeps clear of
+    each obstacle, with center p + R(x) offset, where p is the vehicle's position. A number is a body of one ball at
+    the position.
+
+    Args:
+        offsets: (P, d), the balls' centers in the vehicle's frame, from its position, m.
+        radii: number or (P,), m, at least 0.
+        attitude: what turns the vehicle's frame into that of space. "heading": the model's state of this name, in the
+            plane; "quaternion": the model's states qw, qx, qy, qz, in space, divided by their norm; or a function of
+            states (..., n) that returns rotation matrices (..., d, d).
+
+    Raises:
+        InputError: offsets or radii that aren't finite numbers of these shapes, no ball, a negative radius, another
+            attitude; on `Problem(...)`: a body of another space than the position's, a model without the attitude, a
+            function that doesn't return rotation matrices.
+    """
+
+    offsets: Any
+    radii: Any
+    attitude: str | Callable[[Tensor], Tensor] = "heading"
+
+    def __post_init__(self) -> None:
+        like = torch.empty(0, dtype=torch.float64)
+        offsets = tensor(self.offsets, "body.offsets", like)
+        radii = tensor(self.radii, "body.radii", like)
+        if offsets.dim() != 2 or offsets.shape[0] < 1 or offsets.shape[1] not in (2, 3):
+            raise InputError("body.offsets", "shape (P, 2) or (P, 3) of at least one ball", tuple(offsets.shape))
+        if radii.dim() == 0:
+            radii = radii.expand(len(offsets))
+        check_shape(radii, (len(offsets),), "body.radii")
+        if not bool(torch.isfinite(offsets).all()):
+            raise InputError("body.offsets", "finite numbers", "NaN or infinity")
+        if not bool(((radii >= 0) & torch.isfinite(radii)).all()):
+            raise InputError("body.radii", "finite radii of at least 0 m", radii.tolist())
+        if self.attitude not in ("heading", "quaternion") and not callable(self.attitude):
+            expected = "'heading', 'quaternion', or a function of states that returns rotation matrices"
+            raise InputError("body.attitude", expected, shown(self.attitude))
+        object.__setattr__(self, "offsets", offsets.clone())
+        object.__setattr__(self, "radii", radii.clone())
+
+    @property
+    def inscribed(self) -> float:
+        """The radius of the largest ball about the position that one of the body's balls holds, m, or 0."""
+        return max(0.0, float((self.radii - self.offsets.norm(dim=-1)).max()))
+
+    @property
+    def reach(self) -> float:
+        """The radius of the smallest ball about the position that holds the body, m."""
+        return float((self.radii + self.offsets.norm(dim=-1)).max())
+
+    def around(self, obstacles: Any, dims: Dimensions) -> Constraint:
+        """Obstacles (`Spheres`, ...) that have this body as their `vehicle_radius`, bound to a problem."""
+        d = space_of(dims, "body.offsets")
+        if self.offsets.shape[1] != d:
+            got = f"{self.offsets.shape[1]}-D"
+            raise InputError("body.offsets", f"{d}-D offsets, as the vehicle's position is {d}-D", got)
+        if len(self.offsets) == 1 and not bool(self.offsets.any()):
+            return with_radius(obstacles, float(self.radii[0])).bind(dims)
+        attitude = attitude_of(self.attitude, d, dims)
+        offsets = self.offsets.to(dims.like).expand(dims.B, -1, -1).contiguous()
+        core = with_radius(obstacles, self.inscribed).bind(dims)
+        points = BodyPoints(offsets, attitude, dims.n, dims.position, core.knots)
+        own = replace(dims, n=d, position=slice(0, d))
+        balls = tuple(with_radius(obstacles, float(radius)).bind(own) for radius in self.radii)
+        return BoundBody(balls, core, points)
+
+
+def with_radius(obstacles: Any, radius: float) -> Any:
+    """The same obstacles of a vehicle that is a ball."""
+    if hasattr(obstacles, "vehicle_radius"):
+        return replace(obstacles, vehicle_radius=radius)
+    return replace(obstacles, boxes=replace(obstacles.boxes, vehicle_radius=radius))
+
+
+@dataclass(frozen=True)
+class BodyPoints(PerElement):
+    """The centers of a body's balls as functions of the state."""
+
+    offsets: Tensor  # (B, P, d), m
+    attitude: Attitude
+    n: int  # states of the model, with which those of a form of the problem begin
+    position: slice
+    knots: Any
+
+    batched: ClassVar[tuple[str, ...]] = ("offsets",)
+
+    def at(self, x: Tensor) -> Tensor:
+        """Centers (B, ..., P, d) of states (B, ..., n)."""
+        x = x[..., : self.n]
+        R = self.attitude(x)
+        offsets = self.offsets.view(len(self.offsets), *([1] * (x.dim() - 2)), *self.offsets.shape[1:])
+        return x[..., None, self.position] + (R.unsqueeze(-3) * offsets.unsqueeze(-2)).sum(-1)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        """The same at the knots, (B, K, P d), for X (B, N+1, n), as rows of a constraint."""
+        return self.at(X[:, self.knots]).flatten(-2)
+
+    def jacobian(self, X: Tensor) -> Tensor:
+        """Derivatives (B, K, P, d, n) of the centers at states X (B, K, n)."""
+        (slopes,) = jacobian(lambda x: self.at(x).flatten(-2), X)
+        return slopes.unflatten(-2, (self.offsets.shape[1], self.offsets.shape[2]))
+
+    def bulge(self, X: Tensor) -> Tensor:
+        """How far centers leave their chords where the vehicle turns evenly from each state of X (B, N+1, n) to the
+        next, and its position moves straight: |offset| (1 - cos(half the turn)), (B, N, P), m."""
+        half = (0.5 * self.attitude.turns(X[..., : self.n])).clamp(max=math.pi)
+        return (1.0 - half.cos()).unsqueeze(-1) * self.offsets.norm(dim=-1).unsqueeze(1)
+
+
+@dataclass(frozen=True)
+class BoundBody(Obstacles):
+    """Obstacles of one kind as each ball of a body meets them: rows of the first ball, then of the second, ..."""
+
+    balls: tuple[Obstacles, ...]  # the obstacles of each ball, whose states are its center alone
+    inner: Obstacles  # those of the ball about the position that the body holds
+    points: BodyPoints
+
+    batched: ClassVar[tuple[str, ...]] = ("balls", "inner", "points")
+
+    core = property(lambda self: self.inner)  # type: ignore[assignment]
+    knots = property(lambda self: self.inner.knots)  # type: ignore[assignment]
+    position = property(lambda self: self.inner.position)  # type: ignore[assignment]
+    dt = property(lambda self: self.inner.dt)  # type: ignore[assignment]
+    stops = property(lambda self: self.inner.stops)  # type: ignore[assignment]
+    vehicle_radius = property(lambda self: self.inner.vehicle_radius)  # type: ignore[assignment]
+    absent = property(lambda self: self._joined("absent"))  # type: ignore[assignment]
+    margins = property(lambda self: self._joined("margins"))  # type: ignore[assignment]
+    sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
+    moving = property(lambda self: self.inner.moving)  # type: ignore[assignment]
+    calls_function = property(lambda self: self.points.attitude.calls_function)
+
+    def __repr__(self) -> str:
+        return f"Body({len(self.balls)} balls among {self.inner!r})"
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return torch.cat([ball.value(P, U) for ball, P in self.each(X)], dim=-1)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return torch.cat([ball.at(P, k) for ball, P in self.each(x)], dim=-1)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n, one, d = self.points.n, X.shape[-1], self.points.offsets.shape[-1]
+        slopes, size = self.points.jacobian(X[..., :n]), g.shape[-1] // len(self.balls)
+        parts = zip(self.each(X), g.split(size, dim=-1), h.split(size, dim=-1), strict=True)
+        for i, ((ball, P), g_i, h_i) in enumerate(parts):
+            own = H.new_zeros(*X.shape[:2], d + 1, d + 1)
+            ball.accumulate(P, U[..., :0], g_i, h_i, own)
+            J = slopes[:, :, i]
+            gradient = (own[..., d : d + 1, :d] @ J).squeeze(-2)
+            H[..., :n, one] += gradient
+            H[..., one, :n] += gradient
+            H[..., :n, :n] += J.mT @ own[..., :d, :d] @ J
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Depth beneath the full surfaces, (B, K, P M), m."""
+        return torch.cat([ball.violation(P, U) for ball, P in self.each(X)], dim=-1)
+
+    def distances(self, X: Tensor) -> Tensor:
+        """Distances (B, K, P M), m, of the balls of states X (B, N+1, n) at the constraint's knots."""
+        parts = [ball.signed_distance(P[:, self.knots], ball.times(P)) for ball, P in self.each(X)]
+        return torch.cat(parts, dim=-1)
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        raise InputError("body", "states, whose `distances` are measured", "positions alone, which have no attitude")
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        raise InputError("body", "states, whose `chord_clearance` is measured", "positions alone")
+
+    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+        """As of all obstacles, of states that change evenly between the knots."""
+        part, X = self.finer(X)
+        found = [ball.chord_clearance(P, share) for ball, P in part.each(X)]
+        return (torch.stack(found, dim=-1) - part.points.bulge(X).amax(1)).amin(-1)
+
+    def finer(self, X: Tensor) -> tuple[BoundBody, Tensor]:
+        """The same obstacles for X (B, PIECES N + 1, n), with `PIECES` steps in place of each of X (B, N+1, n).
+
+        Between two knots the states change evenly.
+        """
+        share = torch.arange(PIECES, dtype=X.dtype, device=X.device).view(1, 1, -1, 1) / PIECES
+        within = torch.lerp(X[:, :-1].unsqueeze(2), X[:, 1:].unsqueeze(2), share).flatten(1, 2)
+
+        def slower(part: Any) -> Any:
+            if part.stops is not None:
+                part = part.stopping_at(PIECES * part.stops)
+            return replace(part, dt=part.dt / PIECES) if part.moving else part
+
+        return self._of_each(slower), torch.cat((within, X[:, -1:]), dim=1)
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        return torch.stack([ball.start_is_clear(P) for ball, P in self.each(x0)]).all(0)
+
+    def each(self, x: Tensor) -> list[tuple[Obstacles, Tensor]]:
+        """The obstacles of each ball, and its centers (B, ..., d) as the states that they read."""
+        centers = self.points.at(x)
+        return [(ball, centers[..., i, :]) for i, ball in enumerate(self.balls)]
+
+    def inflated(self) -> Solids | None:
+        """The obstacles that the inscribed ball meets: a search for paths takes the body for that."""
+        return self.inner.inflated()
+
+    def chosen(self, at: Tensor) -> Self:
+        """With the obstacles at places (B, M') alone, of all balls."""
+        return self._of_each(lambda part: part.chosen(at))
+
+    def grown(self, by: Tensor) -> Self:
+        return self._of_each(lambda part: part.grown(by))
+
+    def later(self, t: float) -> Self:
+        return self._of_each(lambda part: part.later(t))
+
+    def stopping_at(self, knots: Tensor) -> Self:
+        return self._of_each(lambda part: part.stopping_at(knots))
+
+    def _of_each(self, change: Callable[[Any], Any]) -> Self:
+        return replace(self, balls=tuple(map(change, self.balls)), inner=change(self.inner))
+
+    def _joined(self, name: str) -> Tensor:
+        return torch.cat([getattr(ball, name) for ball in self.balls], dim=-1)
