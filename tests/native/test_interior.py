@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tests.reference.interior import Array, Point, Program, begin, moved, newton_step
 from torchgco import (
+    Body,
     Boxes,
     ControlBounds,
     Field,
@@ -143,6 +144,29 @@ def maps(seed: int) -> Problem:
     return Problem(plain.dynamics, plain.cost, [field, plain.constraints[1]], plain.x0, plain.N)
 
 
+def bodies(seed: int) -> Problem:
+    """Discs of three sizes that turn with the velocity, among moving spheres, turned boxes and maps."""
+    plain, rng, random = obstacles(seed), np.random.default_rng(seed), draw(seed + 1)
+
+    def attitude(x: Tensor) -> Tensor:
+        angle = 0.7 * x[..., 2] + x[..., 3].sin()
+        cos, sin = angle.cos(), angle.sin()
+        return torch.stack((torch.stack((cos, -sin), dim=-1), torch.stack((sin, cos), dim=-1)), dim=-2)
+
+    body = Body([[-0.1, 0.02], [0.05, 0.0], [0.15, -0.05]], [0.08, 0.1, 0.06], attitude)
+    centers, radii = 0.9 * random(B, 3, 2) + torch.tensor([0.5, 0.0], dtype=D), 0.15 + 0.1 * random(B, 3).abs()
+    centers[::2, 2], radii[::2, 2] = torch.nan, torch.nan
+    cells = rng.random((B, 8, 8)) < 0.08
+    cells[1] = False
+    parts = [
+        Spheres(centers, radii, body, 0.2 * random(B, 3, 2)),
+        Boxes(random(B, 2, 2), 0.1 + 0.1 * random(B, 2, 2).abs(), body, random(B, 2)),
+        plain.constraints[1],
+        Field(OccupancyGrid(cells, plain.x0[:, :2].numpy() + np.array([0.1, -1.6]), 0.4), body),
+    ]
+    return Problem(plain.dynamics, plain.cost, parts, plain.x0, plain.N)
+
+
 def narrow(seed: int) -> Problem:
     """Bounds so close that a slack has less room than it is usually given."""
     problem = curved(seed)
@@ -167,10 +191,13 @@ def with_rows_without_room(seed: int) -> tuple[Problem, Problem]:
     return of(parts), of([*plain, equal])
 
 
-MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart, "maps": maps, "narrow": narrow}
+MAKERS = {
+    "curved": curved, "obstacles": obstacles, "bodies": bodies, "rates": rates, "apart": apart, "maps": maps,
+    "narrow": narrow,
+}  # fmt: skip
 
 
-USUAL = "curved", "obstacles", "narrow"  # the others are among the slow tests
+USUAL = "curved", "obstacles", "bodies", "narrow"  # the others are among the slow tests
 
 
 def guess(problem: Problem, seed: int) -> tuple[Tensor, Tensor]:

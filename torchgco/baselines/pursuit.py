@@ -17,6 +17,7 @@ from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_mo
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.maps.ways import Ways, length
 from torchgco.obstacles.base import ADMITTED
+from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.geometry import Scene
@@ -111,6 +112,7 @@ class PathPursuit(Solver):
             raise InputError("problem.dynamics", expected, type(own_model(problem.dynamics)).__name__)
         if problem.goal is None:
             raise InputError("problem.goal", "a Goal, to which path_pursuit seeks a way", "none")
+        check_no_body(problem, "vehicle_radius", "a number for path_pursuit, whose vehicle is a ball")
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         scene = scene_of(problem, rest)
         if scene is None and problem.obstacles:

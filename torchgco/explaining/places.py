@@ -16,6 +16,7 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.body import BoundBody
 from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
@@ -60,6 +61,8 @@ def caught_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None, depth:
     for i, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             deep = (constraint.violation(X, U)[0] > depth).cpu()
+            if isinstance(constraint, BoundBody):  # whichever ball it is
+                deep = deep.unflatten(-1, (len(constraint.balls), -1)).any(1)
             inside = torch.zeros(problem.N + 1, deep.shape[-1], dtype=torch.bool)
             inside[constraint.knots] = deep
             inside[0] = inside[-1] = False
@@ -99,6 +102,8 @@ def constraint_told(constraint: Constraint, i: int) -> str:
 
 def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
     """A row of a constraint: which obstacle, or which bound of which component, by its name where it has one."""
+    if isinstance(constraint, BoundBody):
+        return "ball {}, obstacle {}, ".format(*divmod(row, constraint.core.absent.shape[1]))
     if isinstance(constraint, Obstacles):
         return f"obstacle {row}, "
     if isinstance(constraint, ControlBounds | StateBounds):

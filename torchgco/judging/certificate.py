@@ -28,6 +28,7 @@ from torchgco.judging.maps import segment_distances
 from torchgco.judging.segments import segment_distance
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -176,7 +177,10 @@ def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     for obstacles in problem.obstacles:
         position = states[problem.position]
         if not bool(obstacles.absent.all()):
-            path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U, position).unsqueeze(-1)
+            if isinstance(obstacles, BoundBody):
+                path = _ball_chords(obstacles, X[0], _body_bulge(obstacles, problem, X, U))
+            else:
+                path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U, position).unsqueeze(-1)
             nearest = torch.minimum(nearest, path[:own, ~obstacles.absent[0]].amin())
     for apart in (constraint.bare for constraint in problem.constraints):
         if isinstance(apart, Separation):
@@ -218,6 +222,19 @@ def _field_chords(field: BoundField, X: Tensor) -> Tensor:
     return segment_distances(field, X[None, :, field.position])[0].unsqueeze(-1) - field.vehicle_radius
 
 
+def _body_chords(body: BoundBody, X: Tensor) -> Tensor:
+    """Less what the balls leave their chords by where the vehicle turns evenly from knot to knot."""
+    return _ball_chords(body, X, body.points.bulge(X.unsqueeze(0))[0])
+
+
+def _ball_chords(body: BoundBody, X: Tensor, bulge: Tensor) -> Tensor:
+    """Distances (N, P M) of the chords of all balls, less `bulge` (N, P)."""
+    centers, found = body.points.at(X.unsqueeze(0))[0], []
+    for i, ball in enumerate(body.balls):
+        found.append(by_kind(CHORDS, ball)(ball, centers[:, i]) - bulge[:, i : i + 1])
+    return torch.cat(found, dim=-1)
+
+
 # By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
 # bounds of them, which are close where they are below 0.
 CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
@@ -225,6 +242,7 @@ CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     BoundBoxes: _box_chords,
     BoundOscillatingBoxes: _oscillating_chords,
     BoundField: _field_chords,
+    BoundBody: _body_chords,
 }
 
 
@@ -237,6 +255,20 @@ def _bulge(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
     samples = torch.stack([_acceleration(problem, x, U, at) for x in (X[:, :-1], half, X[:, 1:])])  # (3, N, d)
     change = samples.diff(dim=0).norm(dim=-1).amax(0)
     return dynamics.dt**2 / 8.0 * (samples.norm(dim=-1).amax(0) + change)
+
+
+def _body_bulge(body: BoundBody, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The same of the centers of a body's balls, (N, P): along a known field, else where the states change evenly."""
+    dynamics = problem.along
+    if dynamics.integrator not in ("midpoint", "rk4"):
+        return body.points.bulge(X)[0]
+    field = lambda x: dynamics.field(x, U)
+    velocity = lambda x: torch.func.jvp(body.points.at, (x,), (field(x),))[1]
+    half = X[:, :-1] + 0.5 * dynamics.dt * field(X[:, :-1])
+    samples = [torch.func.jvp(velocity, (x,), (field(x),))[1][0] for x in (X[:, :-1], half, X[:, 1:])]
+    a = torch.stack(samples)  # (3, N, P, d)
+    change = a.diff(dim=0).norm(dim=-1).amax(0)
+    return (dynamics.dt**2 / 8.0 * torch.ones_like(X[0, :-1, :1])) * (a.norm(dim=-1).amax(0) + change)
 
 
 def _acceleration(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
@@ -352,7 +384,7 @@ def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tup
 def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
     """Slack of each row (1, K, p): m for obstacles, else in the units of c."""
     if isinstance(constraint, Obstacles):
-        return constraint.signed_distance(X[:, constraint.knots, constraint.position], constraint.times(X))
+        return constraint.distances(X)
     return -constraint.value(X, U)
 
 

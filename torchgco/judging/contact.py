@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,21 +15,32 @@ from torchgco.judging.judge import by_kind
 from torchgco.judging.maps import path_distances
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.body import BoundBody
 
 BETWEEN = 4  # pieces of a stage, each of which has a contact of its own or none
 ALIKE = 1e-9  # m: depths that differ less are one, as of a way through equal cells
 
 
-def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.ndarray:
+def contacts(
+    obstacles: Sequence[Obstacles], path: np.ndarray, dt: float, states: np.ndarray | None = None
+) -> np.ndarray:
     """Places (C, d) where a path (K, d), m, touches obstacles of a batch of one: the deepest of each contact.
 
     Bodies touch at CONTACT_FACTOR of their radii, as the judge has it; between the knots, `dt` seconds apart, the path
-    is straight.
+    is straight, and the states (K, n) change evenly, which the attitude of a `Body` depends on.
+
+    Raises:
+        InputError: a body without states.
     """
     places, _ = pieces(path)
     depth = np.full(max(len(places) - 1, 0), -np.inf)
     for part in obstacles if len(places) else ():
-        depth = np.maximum(depth, _depth(part, places, dt / BETWEEN if len(path) > 1 else 0.0))
+        along = None
+        if isinstance(part, BoundBody):
+            if states is None:
+                raise InputError("states", "those of a body's attitude", "none")
+            along = pieces(states)[0]
+        depth = np.maximum(depth, _depth(part, places, dt / BETWEEN if len(path) > 1 else 0.0, along))
     return deepest(places, depth)
 
 
@@ -60,11 +70,17 @@ def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return np.array(found).reshape(-1, places.shape[1])
 
 
-def _depth(part: Obstacles, places: np.ndarray, dt: float) -> np.ndarray:
-    """How deep (P,), m, the pieces between places (P+1, d), `dt` seconds apart, are in contact with a part."""
-    one = replace(part, dt=dt) if part.moving else part  # type: ignore[type-var]
+def _depth(part: Obstacles, places: np.ndarray, dt: float, states: np.ndarray | None = None) -> np.ndarray:
+    """How deep (P,), m, the pieces between places (P+1, d), `dt` seconds apart, are in contact with a part.
+
+    Args:
+        states: (P+1, n) there, of which the places are a part; None: only places are known.
+    """
+    one = part.with_step(dt) if part.moving else part
     X = torch.zeros(len(places), part.position.stop, dtype=torch.float64, device="cpu")
     X[:, part.position] = torch.from_numpy(places)
+    if states is not None:
+        X = torch.from_numpy(np.array(states, dtype=float))
     beneath = _beneath(one, X) - (1.0 - CONTACT_FACTOR) * part.margins[0].double().cpu()
     beneath = beneath.masked_fill(part.absent[0].cpu(), -torch.inf)
     return beneath.amax(-1).numpy() if beneath.shape[-1] else np.full(len(places) - 1, -np.inf)

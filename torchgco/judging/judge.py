@@ -24,6 +24,7 @@ from torchgco.judging.maps import segment_distances
 from torchgco.judging.segments import segment_distance
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import ADMITTED, Obstacles
+from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -333,12 +334,30 @@ def field_clearance(field: BoundField, X: Tensor) -> tuple[Tensor, Tensor]:
     return at_knots, torch.minimum(segment_distances(field, p).amin(-1) - contact, at_knots)
 
 
+def body_clearance(body: BoundBody, X: Tensor) -> tuple[Tensor, Tensor]:
+    """The same of all balls of a body, whose state changes evenly between the knots: there a lower bound.
+
+    Between them the balls' centers are taken from states a part of a step apart, and what they leave the chords of
+    these by where the vehicle turns evenly is subtracted.
+    """
+    fine, states = body.finer(X)
+    bulge = fine.points.bulge(states).amax(1)  # (B, P)
+    at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
+    whole, parts = body.points.at(X), fine.points.at(states)
+    for i, (ball, finer) in enumerate(zip(body.balls, fine.balls, strict=True)):
+        measure = by_kind(CLEARANCES, ball)
+        at_knots = torch.minimum(at_knots, measure(ball, whole[:, :, i])[0])
+        between = torch.minimum(between, measure(finer, parts[:, :, i])[1] - bulge[:, i])
+    return at_knots, torch.minimum(between, at_knots)
+
+
 # By kind of obstacles: smallest distances (B,) from X (B, N+1, n) to where bodies touch, at the knots and between them.
 CLEARANCES: dict[type[Constraint], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
     BoundSpheres: sphere_clearance,
     BoundBoxes: box_clearance,
     BoundOscillatingBoxes: oscillating_clearance,
     BoundField: field_clearance,
+    BoundBody: body_clearance,
     Separation: separation_clearance,
 }
 

@@ -35,6 +35,7 @@ from torchgco.missions.tracker import Reference, Tracker, Tracking
 from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import Explorer, SensorName, Unknown
 from torchgco.native.compiler import find_compiler
+from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
@@ -173,6 +174,7 @@ def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | Non
         raise InputError("goal.required", "False for a mission, whose plans may end before the goal", True)
     if has_gates(problem):
         raise InputError("constraints", "no Gates in a mission, whose plans begin again at their knot 0", "Gates")
+    check_no_body(problem, "vehicle_radius", "a number for a mission, whose vehicle is a ball")
     if problem.horizon is not None:
         raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
     mission.check(problem.dynamics)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import ClassVar, Self
 
@@ -131,6 +131,10 @@ class Obstacles(Constraint):
         """Distances (B, K, M), m, of points p (B, K, d), m, at times t (K,), s."""
         raise undefined(self, "signed_distance")
 
+    def distances(self, X: Tensor) -> Tensor:
+        """Distances (B, K, M), m, of states X (B, N+1, n) at the constraint's knots."""
+        return self.signed_distance(X[:, self.knots, self.position], self.times(X))
+
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         """Smallest distances (B, E, M), m, of the straight segments from a to b (B, E, d), from obstacles at t = 0.
 
@@ -170,6 +174,10 @@ class Obstacles(Constraint):
     def stopping_at(self, knots: Tensor) -> Self:
         """The same obstacles, which don't count, and don't move, after each problem's knot (B,)."""
         raise undefined(self, "stopping_at")
+
+    def with_step(self, dt: float) -> Self:
+        """The same obstacles, which move from knot to knot by what they do in dt, s."""
+        return replace(self, dt=dt)  # type: ignore[type-var]
 
     def times(self, X: Tensor) -> Tensor:
         """t = k dt (K,) at the constraint's knots, s."""

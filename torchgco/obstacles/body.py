@@ -98,6 +98,12 @@ class Body:
         return BoundBody(balls, core, points)
 
 
+def check_no_body(problem: Any, field: str, expected: str) -> None:
+    """Raise InputError naming `field` where a problem's vehicle is a body of several balls."""
+    if any(isinstance(part, BoundBody) for part in problem.obstacles):
+        raise InputError(field, expected, "a Body of several balls")
+
+
 def with_radius(obstacles: Any, radius: float) -> Any:
     """The same obstacles of a vehicle that is a ball."""
     if hasattr(obstacles, "vehicle_radius"):
@@ -155,7 +161,8 @@ class BoundBody(Obstacles):
     position = property(lambda self: self.inner.position)  # type: ignore[assignment]
     dt = property(lambda self: self.inner.dt)  # type: ignore[assignment]
     stops = property(lambda self: self.inner.stops)  # type: ignore[assignment]
-    vehicle_radius = property(lambda self: self.inner.vehicle_radius)  # type: ignore[assignment]
+    # Of the largest ball: a length that tells the vehicle's size.
+    vehicle_radius = property(lambda self: self._sized())  # type: ignore[assignment]
     absent = property(lambda self: self._joined("absent"))  # type: ignore[assignment]
     margins = property(lambda self: self._joined("margins"))  # type: ignore[assignment]
     sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
@@ -192,9 +199,7 @@ class BoundBody(Obstacles):
         return torch.cat([ball.violation(P, U) for ball, P in self.each(X)], dim=-1)
 
     def distances(self, X: Tensor) -> Tensor:
-        """Distances (B, K, P M), m, of the balls of states X (B, N+1, n) at the constraint's knots."""
-        parts = [ball.signed_distance(P[:, self.knots], ball.times(P)) for ball, P in self.each(X)]
-        return torch.cat(parts, dim=-1)
+        return torch.cat([ball.distances(P) for ball, P in self.each(X)], dim=-1)
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
         raise InputError("body", "states, whose `distances` are measured", "positions alone, which have no attitude")
@@ -219,7 +224,7 @@ class BoundBody(Obstacles):
         def slower(part: Any) -> Any:
             if part.stops is not None:
                 part = part.stopping_at(PIECES * part.stops)
-            return replace(part, dt=part.dt / PIECES) if part.moving else part
+            return part.with_step(part.dt / PIECES) if part.moving else part
 
         return self._of_each(slower), torch.cat((within, X[:, -1:]), dim=1)
 
@@ -248,8 +253,14 @@ class BoundBody(Obstacles):
     def stopping_at(self, knots: Tensor) -> Self:
         return self._of_each(lambda part: part.stopping_at(knots))
 
+    def with_step(self, dt: float) -> Self:
+        return self._of_each(lambda part: part.with_step(dt))
+
     def _of_each(self, change: Callable[[Any], Any]) -> Self:
         return replace(self, balls=tuple(map(change, self.balls)), inner=change(self.inner))
+
+    def _sized(self) -> Tensor:
+        return torch.stack([ball.vehicle_radius for ball in self.balls]).amax(0)
 
     def _joined(self, name: str) -> Tensor:
         return torch.cat([getattr(ball, name) for ball in self.balls], dim=-1)

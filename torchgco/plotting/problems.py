@@ -13,7 +13,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape
@@ -37,6 +37,7 @@ COLUMNS = 4  # of histories
 PANEL = 1.45  # inches, the height of a history
 TALLEST = 4.2  # inches, the height of a scene
 FEW = 6  # problems that are shown where none are named
+DRAWN = 9  # knots of a trajectory at which the balls of a body are drawn
 NEAR = 1.0  # spans of the data within which a limit is shown
 LIMIT = "#C62828"
 
@@ -129,7 +130,8 @@ def _positions(problem: Problem) -> list[list[int]]:
 def _is_shared(problem: Problem, courses: list[Course]) -> bool:
     """Whether one scene serves all: they have the same obstacles and goals."""
     rows = torch.tensor([course.b for course in courses], device=problem.x0.device)
-    parts = [getattr(part.take(rows), name) for part in problem.obstacles for name in part.batched]
+    cores = [part.core for part in problem.obstacles]  # all problems have the same body
+    parts = [getattr(part.take(rows), name) for part in cores for name in part.batched]
     parts += [] if problem.goal is None else [problem.goal.position[rows]]
     held = [part for part in parts if isinstance(part, torch.Tensor)]
     return all(torch.equal(part.nan_to_num(), part[:1].expand_as(part).nan_to_num()) for part in held)
@@ -151,6 +153,11 @@ class _Map:
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
         boxes = [view(scene, [0], kept, others) for scene in world.scenes]
         box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+        for course in courses:
+            centers, radii = world.balls(course.X[: len(flown(course.paths[0]))])
+            for i, radius in enumerate(radii if course.keeps else ()):
+                ends = centers[:, i].min(0) - radius, centers[:, i].max(0) + radius
+                box = np.stack([np.minimum(box[0], ends[0]), np.maximum(box[1], ends[1])])
         gates = outlines(problem, courses[0].b)
         for corners, radius in gates:
             box = np.stack([np.minimum(box[0], corners.min(0) - radius), np.maximum(box[1], corners.max(0) + radius)])
@@ -219,11 +226,22 @@ class _Map:
             if (away := leaving(self.box[:, plane], shown)) is not None:
                 ax.plot(*away[0][:, None], color=course.colour, zorder=6, clip_on=False, **marker("away", away[1]))
                 drawn.add("away")
-        touched = contacts(self.world.obstacles, flown(course.paths[0]), self.world.first.dt)
+        states = course.X[: len(flown(course.paths[0]))]
+        centers, radii = self.world.balls(states[_some(len(states))])
+        for place, radius in ((place, radius) for knot in centers for place, radius in zip(knot, radii, strict=True)):
+            ball: dict[str, Any] = {"facecolor": "none", "edgecolor": course.colour, "linewidth": 0.7, "alpha": 0.7}
+            ax.add_patch(Circle(tuple(place[list(plane)]), radius, zorder=2.8, **ball))
+            drawn.add("body")
+        touched = contacts(self.world.obstacles, flown(course.paths[0]), self.world.first.dt, states)
         if len(touched):
             ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **marker("contact"))
             drawn.add("contact")
         return drawn
+
+
+def _some(count: int) -> np.ndarray:
+    """Places of knots at which a body is drawn, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, DRAWN)).round().astype(int)) if count else np.zeros(0, int)
 
 
 def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
@@ -231,6 +249,7 @@ def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
     shapes: dict[str, Artist] = {
         "own": Patch(facecolor=STONE, label="obstacle"),
         "grown": Patch(facecolor="none", edgecolor=EDGE, label="plus the vehicle's radius"),
+        "body": Patch(facecolor="none", edgecolor=INK, label="the vehicle's body, at some knots"),
         "others": Patch(facecolor=STONE, label="obstacle, plus the vehicle's radius"),
     }
     points: list[Artist] = [

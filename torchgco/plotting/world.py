@@ -9,6 +9,7 @@ import torch
 
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -37,6 +38,19 @@ class World:
     def first(self) -> Scene:
         return self.scenes[0]
 
+    @property
+    def body(self) -> BoundBody | None:
+        """Obstacles whose vehicle is a body, the first ones; None where there are none."""
+        return next((part for part in self.obstacles if isinstance(part, BoundBody)), None)
+
+    def balls(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centers (K, P, d) and radii (P,) of the vehicle's balls in states X (K, n), m; none without a body."""
+        if (body := self.body) is None:
+            return np.zeros((len(X), 0, self.first.dimension)), np.zeros(0)
+        offsets = body.points.offsets
+        centers = body.points.at(torch.as_tensor(X, dtype=offsets.dtype, device=offsets.device).unsqueeze(0))[0]
+        return centers.cpu().numpy(), np.array([float(ball.vehicle_radius[0]) for ball in body.balls])
+
 
 def world_of(problem: Problem, b: int) -> World:
     """The obstacles, the start and the goal of problem b.
@@ -47,11 +61,13 @@ def world_of(problem: Problem, b: int) -> World:
     one = problem.take(torch.tensor([b], device=problem.x0.device))
     by_radius: dict[float, list[Body]] = {}
     others, maps = [], []
-    for part in one.obstacles:
+    for whole in one.obstacles:
+        part = whole.core
+        vehicle = 0.0 if isinstance(whole, BoundBody) else float(part.vehicle_radius[0])  # its balls are drawn instead
         if isinstance(part, BoundSpheres | BoundBoxes | BoundOscillatingBoxes):
-            by_radius.setdefault(float(part.vehicle_radius[0]), []).extend(_bodies(part))
+            by_radius.setdefault(vehicle, []).extend(_bodies(part))
         elif isinstance(part, BoundField):
-            maps.append((float(part.vehicle_radius[0]), part.field.single(int(part.which[0]))))
+            maps.append((vehicle, part.field.single(int(part.which[0]))))
         else:
             others.append(part)
     start = one.x0[:, one.position].cpu().numpy()

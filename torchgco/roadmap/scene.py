@@ -26,10 +26,11 @@ FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that 
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     """Start, goal and obstacles, and the cost of being at a point under the controls `rest` (B, N, m).
 
+    A body counts as the ball about its position that it holds: what bars the way of that, bars the body's.
     Obstacles that don't hold at the last knot are left out: only those that stay bar a path. None without a goal or
     obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
     """
-    lasting = [c for c in problem.geometric if c.holds_at(problem.N)]
+    lasting = [c.core if isinstance(c, Obstacles) else c for c in problem.geometric if c.holds_at(problem.N)]
     maps = tuple(c for c in lasting if isinstance(c, BoundField))
     parts = [c.inflated() if isinstance(c, Obstacles) else None for c in lasting if not isinstance(c, BoundField)]
     known, at = [part for part in parts if part is not None], problem.position

@@ -20,6 +20,7 @@ from torchgco.kernels import chord_clearance, kernels_of, measured
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.obstacles.base import Obstacles, Solids
+from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import gates_of
 from torchgco.solution import Solution
@@ -101,7 +102,7 @@ class Nearby:
 
 def without_obstacles(problem: Problem) -> Problem | None:
     """The problems with one absent obstacle of each kind, in the same native form; None for kinds that can't say."""
-    if any(type(part).chosen is Obstacles.chosen for part in problem.obstacles):
+    if any(type(part.core).chosen is Obstacles.chosen for part in problem.obstacles):
         return None
     none = torch.full((problem.B, 1), -1, dtype=torch.int64, device=problem.x0.device)
     return _among(problem, tuple(c.chosen(none) if isinstance(c, Obstacles) else c for c in problem.constraints))
@@ -130,9 +131,10 @@ def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:
 
 
 def _kept(part: Obstacles, near: Callable[[Obstacles, Solids], Tensor | None]) -> Tensor | None:
-    """Which obstacles (B, M) are near; None for a kind that can't say."""
+    """Which obstacles (B, M) are near; None for a kind that can't say, and for a body, which reaches beyond its core."""
     solids = part.inflated()
-    if type(part).chosen is Obstacles.chosen or solids is None or solids.absent.shape[1] == 0:
+    bars = isinstance(part, BoundBody) or type(part).chosen is Obstacles.chosen
+    if bars or solids is None or solids.absent.shape[1] == 0:
         return None
     return near(part, solids)
 

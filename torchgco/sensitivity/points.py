@@ -129,7 +129,7 @@ def clearance(problem: Problem, X: Tensor) -> Tensor:
     """The smallest distance (B,) at the knots from obstacles, m; infinite without any."""
     least = torch.full_like(X[:, 0, 0], torch.inf)
     for part in problem.obstacles:
-        apart = part.signed_distance(X[:, part.knots, part.position], part.times(X))
+        apart = part.distances(X)
         if apart[0].numel() > 0:
             least = torch.minimum(least, apart.flatten(1).amin(-1))
     return least

@@ -148,7 +148,7 @@ def flights_of(
         bad, which = knots.violation[b, at], knots.worst[b, at]
         if touching[b] and len(path):
             part = problem.take(torch.tensor([b], device=X.device))
-            places = contacts(part.obstacles, path, dt)
+            places = contacts(part.obstacles, path, dt, kept)
         told = [*rows[b], *worst_row(problem, bad, which)]
         found.append(Flight(solver, path, look.attitude(kept), results[b], told, bad, which, places))
     return found

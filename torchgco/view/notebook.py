@@ -8,6 +8,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
 from torchgco.obstacles.base import ADMITTED
+from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
@@ -32,6 +33,7 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         raise InputError("dynamics.position", "a position in the plane or in space", f"{dimension} states")
     if problem.B == 0:
         raise InputError("problem", "at least one problem to show", "an empty batch")
+    check_no_body(problem, "vehicle_radius", "a number for the page, which draws a ball: torchgco.plot draws bodies")
     look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
     flights = flights_of(problem, look, solution.X, solution.U, name, results, rows, ADMITTED, touching)
     t_of, dt = _times(problem, solution)
