@@ -14,7 +14,7 @@ from tests.native import users
 from tests.native.lanes import drawn
 from tests.native.test_engine import user_problem
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
-from torchgco import MPPI, ControlBounds, Problem, Spheres, kernels, presets
+from torchgco import MPPI, Body, Boxes, ControlBounds, Problem, Spheres, kernels, presets
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.eager import sampling
 from torchgco.guidance import mppi
@@ -37,6 +37,14 @@ def moving() -> tuple[Problem, Tensor]:
         centers, problem.constraints[0].inflated_radii - 0.3, 0.3, velocities=0.3 * torch.ones_like(centers)
     )
     return Problem(problem.dynamics, problem.cost, [spheres, *problem.constraints[1:]], problem.x0, problem.N), U
+
+
+def a_body() -> tuple[Problem, Tensor]:
+    problem, U = planar_batch(B=3, N=20)
+    body = Body([[-0.1, 0.0], [0.1, 0.02]], [0.06, 0.05])
+    spheres = Spheres([[-0.7, 0.05], [-0.3, 0.2]], [0.1, 0.1], body)
+    boxes = Boxes([[-0.5, -0.2]], [[0.1, 0.05]], body)
+    return Problem(problem.dynamics, problem.cost, [spheres, boxes, problem.constraints[1]], problem.x0, 20), U
 
 
 def given_as_functions() -> tuple[Problem, Tensor]:
@@ -73,6 +81,7 @@ PROBLEMS = {
     "dynamics by stage": partial(users_own, "dynamics by stage"),
     "bounds by knot": bounds_by_knot,
     "bounds of some knots": bounds_of_some_knots,
+    "a body": a_body,
 }
 SAMPLERS = {
     "as printed": MPPI(samples=30, covariance=0.5, temperature=50.0),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -14,7 +14,7 @@ from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement
-from torchgco.constraints.base import TOUCH
+from torchgco.constraints.base import CONTACT_FACTOR, TOUCH
 from torchgco.obstacles.attitude import Attitude, attitude_of
 from torchgco.obstacles.base import Obstacles, Solids
 
@@ -70,6 +70,34 @@ class Body:
             raise InputError("body.attitude", expected, shown(self.attitude))
         object.__setattr__(self, "offsets", offsets.clone())
         object.__setattr__(self, "radii", radii.clone())
+
+    @classmethod
+    def covering(
+        cls, lower: Any, upper: Any, cells: Sequence[int], attitude: str | Callable[[Tensor], Tensor] = "heading"
+    ) -> Body:
+        """Balls that cover a box, each one of equal cells: `covering([-0.7, -0.9], [3.3, 0.9], [6, 3])`.
+
+        They do so where bodies touch, at `CONTACT_FACTOR` of their radii: where `judge` finds the body clear, the box
+        is. The more cells, the less the body exceeds it: by a little over half a cell's diagonal less half its side.
+
+        Args:
+            lower, upper: corners of the box in the vehicle's frame, (d,), m.
+            cells: how many along each axis, d whole numbers.
+            attitude: as of the class.
+
+        Raises:
+            InputError: corners or counts of other shapes, a side that isn't above 0, a count below 1.
+        """
+        like = torch.empty(0, dtype=torch.float64)
+        low, high = (tensor(part, f"body.{name}", like) for part, name in ((lower, "lower"), (upper, "upper")))
+        check_shape(high, tuple(low.shape), "body.upper")
+        if low.dim() != 1 or len(low) not in (2, 3) or not bool((high > low).all()):
+            raise InputError("body.upper", "a corner (2,) or (3,) above `lower`", high.tolist())
+        if len(cells) != len(low) or any(not isinstance(n, int) or n < 1 for n in cells):
+            raise InputError("body.cells", f"{len(low)} whole numbers of at least 1", shown(cells))
+        size = (high - low) / torch.tensor(cells, dtype=torch.float64)
+        each = [low[a] + size[a] * (torch.arange(n, dtype=torch.float64) + 0.5) for a, n in enumerate(cells)]
+        return cls(torch.cartesian_prod(*each), float(0.5 * size.norm()) / CONTACT_FACTOR, attitude)
 
     @property
     def inscribed(self) -> float:

@@ -131,7 +131,7 @@ def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:
 
 
 def _kept(part: Obstacles, near: Callable[[Obstacles, Solids], Tensor | None]) -> Tensor | None:
-    """Which obstacles (B, M) are near; None for a kind that can't say, and for a body, which reaches beyond its core."""
+    """Which obstacles (B, M) are near; None for a kind that can't say, and for a body, which extends beyond."""
     solids = part.inflated()
     bars = isinstance(part, BoundBody) or type(part).chosen is Obstacles.chosen
     if bars or solids is None or solids.absent.shape[1] == 0:

@@ -195,7 +195,8 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
         name = f"tgco_{rows.key}"
         values.append(f"    case {i}: {name}_rows(x, u, p, w, c); break;")
         if i in lifted:
-            slopes.append(f"    case {i}: {name}_slopes(x, u, p, w, e); *columns = {name}_columns; return {name}_count;")
+            slopes.append(f"    case {i}: {name}_slopes(x, u, p, w, e);")
+            slopes.append(f"        *columns = {name}_columns; return {name}_count;")
         else:
             adds.append(f"    case {i}: {name}_add(x, u, p, w, by_c, by_cc, g, H); break;")
     return "\n".join(

@@ -1,0 +1,269 @@
+"""Bodies of several balls: places by hand, derivatives against autodiff, one ball, other forms, and bad input."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import planar_batch, quadrotor_batch, random_trajectory
+from torchgco import (
+    Body,
+    Boxes,
+    Capsules,
+    ControlBounds,
+    Field,
+    FreeTime,
+    FunctionDynamics,
+    Goal,
+    InputError,
+    OccupancyGrid,
+    OscillatingBoxes,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+    Spheres,
+    Unicycle,
+)
+from torchgco.explaining.places import row_told
+from torchgco.maps import PointCloud
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.body import BoundBody
+from torchgco.problem.horizons import for_solvers
+from torchgco.roadmap.scene import scene_of
+from torchgco.search.nearby import Nearby
+from torchgco.solvers.contracts import Call
+
+D = torch.float64
+ROD = Body([[-0.3, 0.0], [0.0, 0.05], [0.4, 0.0]], [0.1, 0.15, 0.08])
+FRAME = Body([[0.2, 0.0, 0.0], [-0.1, 0.2, 0.05], [0.0, 0.0, 0.0]], [0.1, 0.15, 0.2], "quaternion")
+B = 3
+
+
+def kinds(d: int, seed: int = 0) -> dict[str, Callable[[Any], Any]]:
+    """Obstacles of every kind around the starts of `planar_batch` or `quadrotor_batch`, by the vehicle's radius."""
+    rng = np.random.default_rng(seed)
+    middle = np.array([-0.8, 0.0]) if d == 2 else np.array([-0.8, 1.0, 0.0])
+    centers, radii = middle + rng.normal(0, 0.5, (B, 4, d)), rng.uniform(0.05, 0.2, (B, 4))
+    half = rng.uniform(0.05, 0.2, (B, 4, d))
+    for numbers in (centers, radii, half):
+        numbers[1, -1] = np.nan
+    swings = [rng.uniform(0.1, 0.5, (4, 2, d)) for _ in range(3)]
+    cells = rng.random((12,) * d) < 0.1
+    cloud = PointCloud(centers[0], 0.1)
+    return {
+        "spheres": lambda r: Spheres(centers, radii, r),
+        "moving": lambda r: Spheres(centers, radii, r, 0.3 * np.nan_to_num(half)),
+        "boxes": lambda r: Boxes(centers, half, r, radii[..., :] if d == 2 else None),
+        "capsules": lambda r: Capsules(centers, centers + 0.3, radii, r),
+        "oscillating": lambda r: OscillatingBoxes(Boxes(centers, half, r), *swings),
+        "map": lambda r: Field(OccupancyGrid(cells, middle - 1.2, 0.2), r),
+        "points": lambda r: Field(cloud, r),
+    }
+
+
+KINDS = list(kinds(2))
+
+
+def problem_of(d: int, make: Callable[[Any], Any], body: Any = None) -> tuple[Problem, Tensor, Tensor]:
+    """A problem among these obstacles, and a trajectory whose vehicle turns."""
+    plain, U = planar_batch(B, 8) if d == 2 else quadrotor_batch(B, 8)
+    body = (ROD if d == 2 else FRAME) if body is None else body
+    problem = Problem(plain.dynamics, plain.cost, [make(body)], plain.x0, 8)
+    X, U = random_trajectory(problem, 3, 0.4)
+    return problem, X, U
+
+
+def turned(d: int, x: np.ndarray) -> np.ndarray:
+    """The vehicle's frame in a state, by the textbook."""
+    if d == 2:
+        return np.array([[np.cos(x[2]), -np.sin(x[2])], [np.sin(x[2]), np.cos(x[2])]])
+    w, *v = x[6:10] / np.linalg.norm(x[6:10])
+    v, cross = np.array(v), np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross  # Rodrigues
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("d", [2, 3])
+def test_rows_are_those_of_each_ball(d: int, kind: str) -> None:
+    """Each ball's rows and depths are those of a point vehicle of its radius at its place, found by hand."""
+    make = kinds(d)[kind]
+    problem, X, U = problem_of(d, make)
+    body, (part,) = ROD if d == 2 else FRAME, problem.constraints
+    found, depths = part.value(X, U), part.violation(X, U)
+    point = FunctionDynamics(lambda x, u: u, d, d, problem.dynamics.dt, position=slice(0, d))
+    free = QuadraticCost([0.0] * d, [1.0] * d, [0.0] * d)
+    M = found.shape[-1] // 3
+    for i, (offset, radius) in enumerate(zip(body.offsets.numpy(), body.radii.tolist(), strict=True)):
+        P = np.stack([[x[:d] + turned(d, x) @ offset for x in one] for one in X.numpy()])
+        alone = Problem(point, free, [make(radius)], torch.tensor(P[:, 0]), 8).constraints[0]
+        mine = slice(i * M, i * M + M)
+        torch.testing.assert_close(found[..., mine], alone.value(torch.tensor(P), U[..., :0]), rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(depths[..., mine], alone.violation(torch.tensor(P), U), rtol=1e-9, atol=1e-10)
+        torch.testing.assert_close(part.at(X[:, 3:5], 4)[:, 1, mine], part.value(X, U)[:, 3, mine])
+    assert bool((depths > 0).any()) and bool((depths == 0).any())
+
+
+@pytest.mark.parametrize(("d", "kind"), [(2, "moving"), (2, "map"), (3, "boxes")])
+def test_expansions_are_those_of_autodiff(d: int, kind: str) -> None:
+    problem, X, U = problem_of(d, kinds(d)[kind])
+    (part,) = problem.constraints
+    c = part.value(X, U)
+    generator, n, s = torch.Generator().manual_seed(2), problem.n, problem.n + 1 + problem.m
+    g, h = (torch.rand(c.shape, generator=generator, dtype=D) for _ in range(2))
+    H = torch.zeros(B, 9, s, s, dtype=D)
+    part.accumulate(X, U, g, h, H)
+    for b in range(B):
+        one = part.take(slice(b, b + 1))
+        slopes = torch.autograd.functional.jacobian(lambda x, one=one: one.value(x, U[:1])[0], X[b : b + 1])
+        for k in range(1, 9):
+            J = slopes[k - 1, :, 0, k]
+            torch.testing.assert_close(H[b, k, :n, n], J.T @ g[b, k - 1])
+            torch.testing.assert_close(H[b, k, :n, :n], J.T @ torch.diag(h[b, k - 1]) @ J)
+            assert bool((J[:, 2 if d == 2 else slice(6, 10)] != 0).any())  # it turns
+
+
+def test_one_ball_at_the_position_is_a_number() -> None:
+    make = kinds(2)["boxes"]
+    one, number = (problem_of(2, make, body)[0].constraints[0] for body in (Body([[0.0, 0.0]], 0.2), 0.2))
+    assert type(one) is type(number) and torch.equal(one.depths, number.depths)
+    aside = problem_of(2, make, Body([[0.0, 0.1]], 0.2))[0].constraints[0]
+    assert isinstance(aside, BoundBody) and len(aside.balls) == 1
+
+
+def test_a_function_says_the_attitude() -> None:
+    """Turned by a function as by the heading; its slopes come from autodiff."""
+
+    def attitude(x: Tensor) -> Tensor:
+        cos, sin = x[..., 2].cos(), x[..., 2].sin()
+        return torch.stack((torch.stack((cos, -sin), dim=-1), torch.stack((sin, cos), dim=-1)), dim=-2)
+
+    make = kinds(2)["spheres"]
+    problem, X, U = problem_of(2, make)
+    other = problem_of(2, make, Body(ROD.offsets, ROD.radii, attitude))[0]
+    torch.testing.assert_close(other.constraints[0].value(X, U), problem.constraints[0].value(X, U))
+
+
+@pytest.mark.parametrize("kind", ["spheres", "moving", "boxes", "oscillating", "map"])
+def test_distances_between_knots(kind: str) -> None:
+    """A close lower bound of those at many states between, also of obstacles that move."""
+    problem, X, _ = problem_of(2, kinds(2)[kind])
+    part: Any = problem.constraints[0]
+    X[..., 2] = X[:, :1, 2] + torch.linspace(0, 3, 9, dtype=D)
+    pieces, dt = 100, problem.dynamics.dt
+    share = torch.linspace(0, 1, pieces + 1, dtype=D)[:-1].view(1, 1, -1, 1)
+    dense = torch.lerp(X[:, :-1, None], X[:, 1:, None], share).flatten(1, 2)
+    t = dt / pieces * torch.arange(dense.shape[1], dtype=D)
+    least = [ball.signed_distance(P, t) + 0.05 * ball.margins.unsqueeze(1) for ball, P in part.each(dense)]
+    exact = torch.cat(least, dim=-1).flatten(1).amin(-1)
+    found = part.chord_clearance(X)
+    loose = 0.15 if kind == "map" else 0.02  # a field's distances are lower bounds between its nodes
+    assert bool((found <= exact + 1e-3).all()) and bool((found >= exact - loose).all()), (found, exact)
+
+
+def test_parts_of_a_batch_have_the_bits_of_the_whole() -> None:
+    problem, X, U = problem_of(3, kinds(3)["moving"])
+    part: Any = problem.constraints[0]
+    c = part.value(X, U)
+    for rows in (torch.tensor([2, 0]), torch.tensor([1])):
+        some = part.take(rows)
+        assert torch.equal(some.value(X[rows], U[rows]), c[rows])
+        assert torch.equal(some.chord_clearance(X[rows]), part.chord_clearance(X)[rows])
+        size = problem.n + 1 + problem.m
+        whole, own = (torch.zeros(len(i), 9, size, size, dtype=D) for i in (X, rows))
+        part.accumulate(X, U, c.abs(), c.abs(), whole)
+        some.accumulate(X[rows], U[rows], c[rows].abs(), c[rows].abs(), own)
+        assert torch.equal(own, whole[rows])
+
+
+def test_other_forms_keep_the_rows() -> None:
+    """With the controls before, or the time, among the states; and of horizons that end before."""
+    plain, make = planar_batch(B, 8)[0], kinds(2)["spheres"]
+    parts = [make(ROD), ControlBounds([-1, -1], [1, 1])]
+    X, U = random_trajectory(plain, 3, 0.4)
+    want = Problem(plain.dynamics, plain.cost, parts, plain.x0, 8).constraints[0].value(X, U)
+    rates = for_solvers(Problem(plain.dynamics, plain.cost, [*parts, RateBounds(-1.0, 1.0)], plain.x0, 8))
+    timed = for_solvers(Problem(plain.dynamics, plain.cost, parts, plain.x0, 8, time=FreeTime(0.5, 2.0)))
+    for form in (rates, timed):
+        more = torch.cat((X, X.new_ones(B, 9, form.n - plain.n)), dim=-1)
+        (body,) = form.obstacles
+        torch.testing.assert_close(body.value(more, U.new_zeros(B, 8, form.m)), want)
+    short = for_solvers(Problem(plain.dynamics, plain.cost, parts, plain.x0, 8, horizon=torch.tensor([3, 8, 5])))
+    rows = short.obstacles[0].value(X, U)
+    assert torch.equal(rows[0, :3], want[0, :3]) and bool((rows[0, 3:] == -1).all()) and torch.equal(rows[1], want[1])
+
+
+def test_the_search_sees_the_ball_that_the_body_holds() -> None:
+    """Paths are sought for it, which the body's length doesn't bar; no obstacle that the body reaches is left out."""
+    body = Body([[-2.0, 0.0], [0.0, 0.0], [2.0, 0.0]], 0.5)
+    far = [[0.0, 0.0], [3.0, 2.1], [3.0, 30.0]]
+    x0, cost = torch.zeros(1, 4, dtype=D), QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4, x_ref=[6.0, 0, 0, 0])
+    problem = Problem(Unicycle(), cost, [Spheres(far, [0.1] * 3, body)], x0, 5, Goal([6.0, 0.0], 0.5))
+    assert body.inscribed == 0.5 and body.reach == 2.5
+    scene = scene_of(problem, torch.zeros(1, 5, 2, dtype=D))
+    assert scene is not None and scene.obstacles.spheres.radii.tolist() == [[0.6] * 3]
+    assert Nearby.of(Call.checked(problem, torch.zeros(1, 5, 2, dtype=D))) is None
+    assert not bool(problem.start_is_clear)
+    assert row_told(problem.constraints[0], 4, problem.dynamics).startswith("ball 1, obstacle 1")
+    assert "Body(3 balls among Spheres(3 each of 1 problems))" in repr(problem)
+
+
+def test_balls_cover_a_box() -> None:
+    car = Body.covering([-0.7, -0.9], [3.3, 0.9], [5, 3])
+    rng = np.random.default_rng(0)
+    inside = rng.uniform([-0.7, -0.9], [3.3, 0.9], (2000, 2))
+    apart = np.linalg.norm(inside[:, None] - car.offsets.numpy(), axis=-1) - 0.95 * car.radii.numpy()
+    assert len(car.radii) == 15 and apart.min(-1).max() <= 1e-12
+
+
+def test_bad_bodies_are_told() -> None:
+    cases = [
+        (lambda: Body([0.0, 1.0], 0.1), "body.offsets: expected shape (P, 2) or (P, 3)"),
+        (lambda: Body([[0.0, np.nan]], 0.1), "body.offsets: expected finite numbers"),
+        (lambda: Body([[0.0, 0.0]], [0.1, 0.2]), "body.radii: expected shape (1)"),
+        (lambda: Body([[0.0, 0.0]], -0.1), "body.radii: expected finite radii"),
+        (lambda: Body([[0.0, 0.0]], 0.1, "yaw"), "body.attitude: expected 'heading', 'quaternion', or a function"),
+        (lambda: Body.covering([0, 0], [1, 0], [2, 2]), "body.upper"),
+        (lambda: Body.covering([0, 0], [1, 1], [2, 0]), "body.cells"),
+        (lambda: problem_of(2, kinds(2)["spheres"], FRAME), "body.offsets: expected 2-D offsets"),
+        (lambda: problem_of(3, kinds(3)["map"], ROD), "body.offsets: expected 3-D offsets"),
+        (
+            lambda: problem_of(2, kinds(2)["map"], Body([[1.0, 0.0]], 1.0, "quaternion")),
+            "body.attitude: expected 'heading', or a function, in the plane",
+        ),
+        (
+            lambda: problem_of(2, kinds(2)["boxes"], Body([[1.0, 0.0]], 1.0, lambda x: x[..., :2])),
+            "body.attitude: expected rotation matrices (3, 2, 2)",
+        ),
+        (
+            lambda: problem_of(2, kinds(2)["boxes"], Body([[1.0, 0.0]], 1.0, twice)),
+            "body.attitude: expected rotation matrices R, with R R' = 1",
+        ),
+        (without_heading, "body.attitude: expected a model with states named heading"),
+    ]  # fmt: skip
+    for case, told in cases:
+        with pytest.raises(InputError, match=re.escape(told)):
+            case()
+
+
+def twice(x: Tensor) -> Tensor:
+    return 2 * torch.eye(2, dtype=D).expand(len(x), 2, 2)
+
+
+def without_heading() -> None:
+    point = FunctionDynamics(lambda x, u: u, 2, 2, 0.1, position=slice(0, 2))
+    cost = QuadraticCost([1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
+    Problem(point, cost, [Spheres([[5.0, 5.0]], [1.0], ROD)], torch.zeros(1, 2, dtype=D), 3)
+
+
+def test_positions_alone_are_refused() -> None:
+    part: Obstacles = problem_of(2, kinds(2)["spheres"])[0].constraints[0]  # type: ignore[assignment]
+    with pytest.raises(InputError, match="body"):
+        part.signed_distance(torch.zeros(B, 1, 2, dtype=D), torch.zeros(1, dtype=D))
+    with pytest.raises(InputError, match="body"):
+        part.segment_clearance(*torch.zeros(2, B, 1, 2, dtype=D))
