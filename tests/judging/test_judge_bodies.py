@@ -139,8 +139,9 @@ def test_a_frame_is_judged_in_space() -> None:
 
 def test_what_draws_or_flies_a_ball_refuses_a_body() -> None:
     problem, X, U = scene([[3.0, 3.0]], [0.1], TURN)
+    found = SimpleNamespace(X=X, U=U, detach=lambda: found)
     with pytest.raises(InputError, match="vehicle_radius: expected a number for the page"):
-        show(problem, SimpleNamespace(X=X, U=U))  # type: ignore[arg-type]
+        show(problem, found)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="vehicle_radius: expected a number for path_pursuit"):
         goal = Goal([5.0, 0.0], 0.5)
         PathPursuit().solve(Problem(problem.dynamics, problem.cost, problem.constraints, problem.x0, 2, goal), U)

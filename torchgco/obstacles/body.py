@@ -21,6 +21,8 @@ from torchgco.obstacles.base import Obstacles, Solids
 if TYPE_CHECKING:
     from torchgco.constraints.base import Constraint
 
+RAYS = 720  # along which the largest ball that a body holds is measured, and ...
+SURE = 0.97  # ... the share of it that counts: between two rays the body may be thinner
 PIECES = 4  # of a step, between which the balls move on straight lines
 
 
@@ -101,8 +103,21 @@ class Body:
 
     @property
     def inscribed(self) -> float:
-        """The radius of the largest ball about the position that one of the body's balls holds, m, or 0."""
-        return max(0.0, float((self.radii - self.offsets.norm(dim=-1)).max()))
+        """The radius of a ball about the position that the body holds, m, close to the largest; 0 if it holds none."""
+        alone = float((self.radii - self.offsets.norm(dim=-1)).max())
+        return max(0.0, alone, SURE * float(self._way_out(directions(self.offsets.shape[1])).min()))
+
+    def _way_out(self, along: Tensor) -> Tensor:
+        """How far rays from the position along unit vectors (R, d) stay in the body, (R,), m."""
+        middle = along @ self.offsets.mT  # (R, P)
+        square = self.radii.square() - self.offsets.square().sum(-1) + middle.square()
+        half = square.clamp(min=0.0).sqrt()
+        enter, leave = (torch.where(square >= 0, middle + sign * half, -math.inf) for sign in (-1.0, 1.0))
+        reached = torch.zeros_like(middle[:, 0])
+        for _ in range(len(self.radii)):  # from ball to ball, at most through all of them
+            further = torch.where(enter <= reached.unsqueeze(-1), leave, 0.0).amax(-1)
+            reached = torch.maximum(reached, further)
+        return reached
 
     @property
     def reach(self) -> float:
@@ -124,6 +139,17 @@ class Body:
         own = replace(dims, n=d, position=slice(0, d))
         balls = tuple(with_radius(obstacles, float(radius)).bind(own) for radius in self.radii)
         return BoundBody(balls, core, points)
+
+
+def directions(d: int) -> Tensor:
+    """Unit vectors (R, d) all around, in space a Fibonacci lattice."""
+    i = torch.arange(RAYS, dtype=torch.float64)
+    if d == 2:
+        angle = 2.0 * math.pi / RAYS * i
+        return torch.stack((angle.cos(), angle.sin()), dim=-1)
+    z, angle = 1.0 - (2.0 * i + 1.0) / RAYS, math.pi * (3.0 - math.sqrt(5.0)) * i
+    flat = (1.0 - z.square()).sqrt()
+    return torch.stack((flat * angle.cos(), flat * angle.sin(), z), dim=-1)
 
 
 def check_no_body(problem: Any, field: str, expected: str) -> None:
