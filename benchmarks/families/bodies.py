@@ -81,7 +81,7 @@ def corridor(count: int, seed: int, wide: float = 1.1, N: int = 120, dt: float =
 
 def rectangle_clearance(problem: Problem, X: Tensor) -> np.ndarray:
     """Smallest distance (B,), m, of the rectangle of the car from the boxes along the best axis; below 0: they meet."""
-    boxes = problem.obstacles[0].core
+    boxes = problem.obstacles[0].inscribed
     share = torch.linspace(0, 1, BETWEEN + 1, dtype=X.dtype)[:-1].view(1, 1, -1, 1)
     x = torch.lerp(X[:, :-1, None], X[:, 1:, None], share).flatten(1, 2).numpy()
     along = np.stack((np.cos(x[..., 2]), np.sin(x[..., 2])), axis=-1)

@@ -34,6 +34,7 @@ from torchgco.explaining.places import row_told
 from torchgco.maps import PointCloud
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
+from torchgco.plotting.world import world_of
 from torchgco.problem.horizons import for_solvers
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.nearby import Nearby
@@ -204,7 +205,7 @@ def test_the_search_sees_the_ball_that_the_body_holds() -> None:
     far = [[0.0, 0.0], [3.0, 2.1], [3.0, 30.0]]
     x0, cost = torch.zeros(1, 4, dtype=D), QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4, x_ref=[6.0, 0, 0, 0])
     problem = Problem(Unicycle(), cost, [Spheres(far, [0.1] * 3, body)], x0, 5, Goal([6.0, 0.0], 0.5))
-    assert body.inscribed == 0.5 and body.reach == 2.5
+    assert body.inscribed_radius == 0.5 and body.reach == 2.5
     scene = scene_of(problem, torch.zeros(1, 5, 2, dtype=D))
     assert scene is not None and scene.obstacles.spheres.radii.tolist() == [[0.6] * 3]
     assert Nearby.of(Call.checked(problem, torch.zeros(1, 5, 2, dtype=D))) is None
@@ -267,3 +268,23 @@ def test_positions_alone_are_refused() -> None:
         part.signed_distance(torch.zeros(B, 1, 2, dtype=D), torch.zeros(1, dtype=D))
     with pytest.raises(InputError, match="body"):
         part.segment_clearance(*torch.zeros(2, B, 1, 2, dtype=D))
+
+
+def test_bodies_among_no_obstacles() -> None:
+    problem, X, U = problem_of(2, lambda body: Spheres([], [], body))
+    (part,) = problem.constraints
+    H = torch.zeros(B, 9, 9, 9, dtype=D)
+    part.accumulate(X, U, part.value(X, U), part.value(X, U), H)
+    assert part.value(X, U).shape == (B, 8, 0) and not bool(H.any()) and bool(problem.start_is_clear.all())
+    assert part.chord_clearance(X).tolist() == [torch.inf] * B  # type: ignore[attr-defined]
+    assert part.worst(X, U).tolist() == [0.0] * B
+
+
+def test_pictures_show_the_balls() -> None:
+    """They stand for the vehicle: obstacles aren't grown by a radius, and contacts are those of the balls."""
+    problem, X, _ = problem_of(2, kinds(2)["boxes"])
+    world = world_of(problem, 1)
+    centers, radii = world.balls(X[1].numpy())
+    assert world.first.margin == 0.0 and radii.tolist() == ROD.radii.tolist() and centers.shape == (9, 3, 2)
+    x = X[1, 4].numpy()
+    np.testing.assert_allclose(centers[4, 2], x[:2] + turned(2, x) @ ROD.offsets[2].numpy(), atol=1e-12)

@@ -103,7 +103,7 @@ def constraint_told(constraint: Constraint, i: int) -> str:
 def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
     """A row of a constraint: which obstacle, or which bound of which component, by its name where it has one."""
     if isinstance(constraint, BoundBody):
-        return "ball {}, obstacle {}, ".format(*divmod(row, constraint.core.absent.shape[1]))
+        return "ball {}, obstacle {}, ".format(*divmod(row, constraint.inscribed.absent.shape[1]))
     if isinstance(constraint, Obstacles):
         return f"obstacle {row}, "
     if isinstance(constraint, ControlBounds | StateBounds):

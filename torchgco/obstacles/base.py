@@ -113,8 +113,8 @@ class Obstacles(Constraint):
         return False
 
     @property
-    def core(self) -> Obstacles:
-        """The obstacles as the vehicle's position meets them: themselves, or of a body the ball that it holds."""
+    def inscribed(self) -> Obstacles:
+        """The obstacles of a vehicle that is a ball: themselves, or of a body those of the ball that it holds."""
         return self
 
     @property

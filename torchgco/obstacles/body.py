@@ -102,7 +102,7 @@ class Body:
         return cls(torch.cartesian_prod(*each), float(0.5 * size.norm()) / CONTACT_FACTOR, attitude)
 
     @property
-    def inscribed(self) -> float:
+    def inscribed_radius(self) -> float:
         """The radius of a ball about the position that the body holds, m, close to the largest; 0 if it holds none."""
         alone = float((self.radii - self.offsets.norm(dim=-1)).max())
         return max(0.0, alone, SURE * float(self._way_out(directions(self.offsets.shape[1])).min()))
@@ -134,11 +134,11 @@ class Body:
             return with_radius(obstacles, float(self.radii[0])).bind(dims)
         attitude = attitude_of(self.attitude, d, dims)
         offsets = self.offsets.to(dims.like).expand(dims.B, -1, -1).contiguous()
-        core = with_radius(obstacles, self.inscribed).bind(dims)
-        points = BodyPoints(offsets, attitude, dims.n, dims.position, core.knots)
+        inner = with_radius(obstacles, self.inscribed_radius).bind(dims)
+        points = BodyPoints(offsets, attitude, dims.n, dims.position, inner.knots)
         own = replace(dims, n=d, position=slice(0, d))
         balls = tuple(with_radius(obstacles, float(radius)).bind(own) for radius in self.radii)
-        return BoundBody(balls, core, points)
+        return BoundBody(balls, inner, points)
 
 
 def directions(d: int) -> Tensor:
@@ -210,7 +210,7 @@ class BoundBody(Obstacles):
 
     batched: ClassVar[tuple[str, ...]] = ("balls", "inner", "points")
 
-    core = property(lambda self: self.inner)  # type: ignore[assignment]
+    inscribed = property(lambda self: self.inner)  # type: ignore[assignment]
     knots = property(lambda self: self.inner.knots)  # type: ignore[assignment]
     position = property(lambda self: self.inner.position)  # type: ignore[assignment]
     dt = property(lambda self: self.inner.dt)  # type: ignore[assignment]
@@ -237,11 +237,11 @@ class BoundBody(Obstacles):
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n, one, d = self.points.n, X.shape[-1], self.points.offsets.shape[-1]
-        slopes, size = self.points.jacobian(X[..., :n]), g.shape[-1] // len(self.balls)
-        parts = zip(self.each(X), g.split(size, dim=-1), h.split(size, dim=-1), strict=True)
-        for i, ((ball, P), g_i, h_i) in enumerate(parts):
+        slopes, P = self.points.jacobian(X[..., :n]), len(self.balls)
+        parts = zip(self.each(X), g.tensor_split(P, dim=-1), h.tensor_split(P, dim=-1), strict=True)
+        for i, ((ball, p), g_i, h_i) in enumerate(parts):
             own = H.new_zeros(*X.shape[:2], d + 1, d + 1)
-            ball.accumulate(P, U[..., :0], g_i, h_i, own)
+            ball.accumulate(p, U[..., :0], g_i, h_i, own)
             J = slopes[:, :, i]
             gradient = (own[..., d : d + 1, :d] @ J).squeeze(-2)
             H[..., :n, one] += gradient

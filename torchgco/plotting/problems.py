@@ -130,7 +130,7 @@ def _positions(problem: Problem) -> list[list[int]]:
 def _is_shared(problem: Problem, courses: list[Course]) -> bool:
     """Whether one scene serves all: they have the same obstacles and goals."""
     rows = torch.tensor([course.b for course in courses], device=problem.x0.device)
-    cores = [part.core for part in problem.obstacles]  # all problems have the same body
+    cores = [part.inscribed for part in problem.obstacles]  # all problems have the same body
     parts = [getattr(part.take(rows), name) for part in cores for name in part.batched]
     parts += [] if problem.goal is None else [problem.goal.position[rows]]
     held = [part for part in parts if isinstance(part, torch.Tensor)]

@@ -17,7 +17,7 @@ def covered_goals(problem: Problem) -> Tensor:
     for part in problem.obstacles:
         if part.holds_at(N) and part.absent.shape[1] > 0:
             t = N * (part.dt or 0.0) * torch.ones_like(center[0, :, 0])
-            part = part.core  # of a body, what is deep inside of an obstacle with the ball about the position
+            part = part.inscribed  # of a body, what is deep inside of an obstacle with the ball about the position
             deep = part.signed_distance(center, t)[:, 0] <= -goal.radius.unsqueeze(-1)
             covered |= (deep & ~part.absent).any(-1)
     return covered

@@ -252,8 +252,8 @@ def _obstacles(obstacles: Obstacles, problem: Problem, i: int) -> Obstacles:
         return obstacles
     if problem.N in late and not all(obstacles.holds_at(int(h)) for h in horizon.unique()):
         raise InputError("horizon", f"last knots at which constraints[{i}] holds", horizon.unique().tolist())
-    if not isinstance(obstacles.core, BoundSpheres | BoundBoxes | BoundField):
-        got = type(obstacles.core).__name__
+    if not isinstance(obstacles.inscribed, BoundSpheres | BoundBoxes | BoundField):
+        got = type(obstacles.inscribed).__name__
         raise InputError("horizon", "obstacles that are Spheres, Boxes, Capsules or a Field", got)
     return obstacles.stopping_at(horizon)
 

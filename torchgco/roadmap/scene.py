@@ -30,7 +30,7 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     Obstacles that don't hold at the last knot are left out: only those that stay bar a path. None without a goal or
     obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
     """
-    lasting = [c.core if isinstance(c, Obstacles) else c for c in problem.geometric if c.holds_at(problem.N)]
+    lasting = [c.inscribed if isinstance(c, Obstacles) else c for c in problem.geometric if c.holds_at(problem.N)]
     maps = tuple(c for c in lasting if isinstance(c, BoundField))
     parts = [c.inflated() if isinstance(c, Obstacles) else None for c in lasting if not isinstance(c, BoundField)]
     known, at = [part for part in parts if part is not None], problem.position

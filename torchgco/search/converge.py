@@ -130,7 +130,7 @@ class Converge(Row):
 
 def mapped(problem: Problem) -> bool:
     """Whether there are maps among the obstacles."""
-    return any(isinstance(part.core, BoundField) for part in problem.obstacles)
+    return any(isinstance(part.inscribed, BoundField) for part in problem.obstacles)
 
 
 def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:

@@ -102,7 +102,7 @@ class Nearby:
 
 def without_obstacles(problem: Problem) -> Problem | None:
     """The problems with one absent obstacle of each kind, in the same native form; None for kinds that can't say."""
-    if any(type(part.core).chosen is Obstacles.chosen for part in problem.obstacles):
+    if any(type(part.inscribed).chosen is Obstacles.chosen for part in problem.obstacles):
         return None
     none = torch.full((problem.B, 1), -1, dtype=torch.int64, device=problem.x0.device)
     return _among(problem, tuple(c.chosen(none) if isinstance(c, Obstacles) else c for c in problem.constraints))
