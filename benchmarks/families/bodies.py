@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ def car(x: Tensor, u: Tensor) -> Tensor:
     return torch.stack((speed * heading.cos(), speed * heading.sin(), turning, u[..., 0], u[..., 1]), dim=-1)
 
 
-def limits(fastest: float) -> list:
+def limits(fastest: float) -> list[Any]:
     """Bounds on controls, speed (m/s) and steering (rad)."""
     return [*LIMITS, StateBounds([-FAR, -FAR, -FAR, -2.0, -0.6], [FAR, FAR, FAR, fastest, 0.6])]
 
@@ -81,7 +82,7 @@ def corridor(count: int, seed: int, wide: float = 1.1, N: int = 120, dt: float =
 
 def rectangle_clearance(problem: Problem, X: Tensor) -> np.ndarray:
     """Smallest distance (B,), m, of the rectangle of the car from the boxes along the best axis; below 0: they meet."""
-    boxes = problem.obstacles[0].inscribed
+    boxes: Any = problem.obstacles[0].inscribed
     share = torch.linspace(0, 1, BETWEEN + 1, dtype=X.dtype)[:-1].view(1, 1, -1, 1)
     x = torch.lerp(X[:, :-1, None], X[:, 1:, None], share).flatten(1, 2).numpy()
     along = np.stack((np.cos(x[..., 2]), np.sin(x[..., 2])), axis=-1)

@@ -35,7 +35,7 @@ ROD = Body([[0.2 * i, 0.0] for i in range(-4, 5)], RADIUS)  # 1.8 m long
 QUARTER = math.pi / 2
 
 
-def scene(centers: Any, radii: Any, controls: Any, vehicle: Any = ROD, integrator: str = "euler", **more: Any) -> Any:
+def scene(centers: Any, radii: Any, controls: Any, vehicle: Any = ROD, integrator: Any = "euler", **more: Any) -> Any:
     """A unicycle that starts at the origin along x, by its controls (N, 2), with steps of a second."""
     U = torch.tensor([controls], dtype=D)
     cost = QuadraticCost([0.0] * 4, [1.0] * 2, [0.0] * 4)

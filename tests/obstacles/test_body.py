@@ -121,7 +121,7 @@ def test_expansions_are_those_of_autodiff(d: int, kind: str) -> None:
     part.accumulate(X, U, g, h, H)
     for b in range(B):
         one = part.take(slice(b, b + 1))
-        slopes = torch.autograd.functional.jacobian(lambda x, one=one: one.value(x, U[:1])[0], X[b : b + 1])
+        slopes: Any = torch.autograd.functional.jacobian(lambda x, one=one: one.value(x, U[:1])[0], X[b : b + 1])
         for k in range(1, 9):
             J = slopes[k - 1, :, 0, k]
             torch.testing.assert_close(H[b, k, :n, n], J.T @ g[b, k - 1])
@@ -131,7 +131,8 @@ def test_expansions_are_those_of_autodiff(d: int, kind: str) -> None:
 
 def test_one_ball_at_the_position_is_a_number() -> None:
     make = kinds(2)["boxes"]
-    one, number = (problem_of(2, make, body)[0].constraints[0] for body in (Body([[0.0, 0.0]], 0.2), 0.2))
+    parts: list[Any] = [problem_of(2, make, body)[0].constraints[0] for body in (Body([[0.0, 0.0]], 0.2), 0.2)]
+    one, number = parts
     assert type(one) is type(number) and torch.equal(one.depths, number.depths)
     aside = problem_of(2, make, Body([[0.0, 0.1]], 0.2))[0].constraints[0]
     assert isinstance(aside, BoundBody) and len(aside.balls) == 1

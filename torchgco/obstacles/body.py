@@ -134,6 +134,7 @@ class Body:
             return with_radius(obstacles, float(self.radii[0])).bind(dims)
         attitude = attitude_of(self.attitude, d, dims)
         offsets = self.offsets.to(dims.like).expand(dims.B, -1, -1).contiguous()
+        assert dims.position is not None  # as space has d dimensions
         inner = with_radius(obstacles, self.inscribed_radius).bind(dims)
         points = BodyPoints(offsets, attitude, dims.n, dims.position, inner.knots)
         own = replace(dims, n=d, position=slice(0, d))

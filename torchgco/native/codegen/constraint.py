@@ -37,7 +37,7 @@ def rows_numbers(problem: Problem, i: int, source: KnotSource, shared: Tensor) -
 
 def traced_part(problem: Problem, i: int) -> Any:
     """What is traced of constraint i: itself, or what places the balls of a body, whose rows C knows."""
-    part = problem.constraints[i]
+    part: Any = problem.constraints[i]
     return part.points if is_lifted(part) else part
 
 
