@@ -79,19 +79,20 @@ def numbers_of(constraint: Constraint, numbers: Tensor | None, problem: Problem)
     if isinstance(parts[0], SOLIDS) and parts[0].stops is not None:
         own["stops"] = array(parts[0].stops.unsqueeze(-1), knots=False)
     if isinstance(constraint, BoundBody):
-        own |= {"lift": array(numbers, knots=True), "balls": len(parts)}
+        own |= {"lift": array(numbers, knots=True), "balls": len(parts), "kind_of_balls": KINDS[type(parts[0])]}
     return own
 
 
 def kind_of(constraint: Constraint) -> Kind:
-    """How C computes a constraint's rows; those of a body as the rows of its balls, where it `is_lifted`."""
-    part = constraint.balls[0] if isinstance(constraint, BoundBody) else constraint
-    return KINDS.get(type(part), Kind.FUNCTION)
+    """How C computes a constraint's rows; a body is a FUNCTION where its balls are of no other kind."""
+    if isinstance(constraint, BoundBody):
+        return Kind.BODY if type(constraint.balls[0]) in KINDS else Kind.FUNCTION
+    return KINDS.get(type(constraint), Kind.FUNCTION)
 
 
 def is_lifted(constraint: Constraint) -> bool:
     """Whether C traces where the balls of a body are, and computes their rows itself."""
-    return isinstance(constraint, BoundBody) and kind_of(constraint) is not Kind.FUNCTION
+    return kind_of(constraint) is Kind.BODY
 
 
 def guide_of(guide: Penalty | None) -> dict[str, Any]:

@@ -23,8 +23,9 @@ CONSTANTS = {
 }  # fmt: skip
 
 
-# How a constraint's rows are computed, FUNCTION: by traced code; the penalty of guidance, if any.
-Kind = IntEnum("Kind", "BOUNDS SPHERES FUNCTION BOXES FIELD", start=0)
+# How a constraint's rows are computed, FUNCTION: by traced code, BODY: as rows of the kind of its balls; the penalty of
+# guidance, if any.
+Kind = IntEnum("Kind", "BOUNDS SPHERES FUNCTION BOXES FIELD BODY", start=0)
 Guide = IntEnum("Guide", "NO_GUIDE REGION PATH", start=0)
 # How an inner solve is marked that ended, for a reason that `converged` and `refused` say. Others have a `Status`:
 # RUNNING, or the one with which they failed.
@@ -68,9 +69,9 @@ class Constraint(Structure):
         ("const int64_t *", "map_of"),  # FIELD: (E)
         ("int64_t", "map_x map_y map_z"),
         ("int32_t", "smooth"),  # FIELD: three nodes per axis, or two
-        # SPHERES, BOXES, FIELD of a body: of how many balls, each with an equal share of rows and numbers; else 0. The
-        # function that places them is traced, with p as of a FUNCTION (E, knots, ...).
-        ("int32_t", "balls"),
+        # BODY: its balls, each with an equal share of rows and numbers, and the kind that all of them are; the function
+        # that places them is traced, with p as of a FUNCTION (E, knots, ...).
+        ("int32_t", "balls kind_of_balls"),
         (Array, "lift"),
     )
     _fields_ = fields(declared)

@@ -14,7 +14,7 @@ static inline void ball_centers(const Lanes *s, int64_t i, int64_t k, const V *x
 static inline void ball_at(const Constraint *con, const Rows *rows, int b, int64_t k, const V *v, Ball *ball) {
     int64_t each = con->rows / con->balls;
     ball->con = *con; ball->rows = *rows;
-    ball->con.rows = (int32_t)each;
+    ball->con.rows = (int32_t)each; ball->con.kind = con->kind_of_balls;
     ball->rows.lam += con->place[k] * (con->rows - each) + b * each;
     ball->rows.bound += b * (con->bound.size / con->balls);
     ball->rows.squares += b * (con->squares.size / con->balls);

@@ -34,10 +34,10 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) c[j] = bound(con, rows, j, k, x, u);
 #if DIM > 0
-    } else if (con->balls > 0) {
-        body_at(s, i, k, x, c);
-    } else if (con->kind != FUNCTION) {
+    } else if (con->kind != FUNCTION && con->kind != BODY) {
         solids_at(con, rows, k, x, c);
+    } else if (con->kind == BODY) {
+        body_at(s, i, k, x, c);
 #endif
     } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
 }
@@ -191,7 +191,7 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
     const Rows *rows = t->lanes.rows + i;
     if (con->kind == BOUNDS) { add_bounds(t, i, k); return; }
 #if DIM > 0
-    if (con->balls > 0) { add_body(t, i, k, x); return; }
+    if (con->kind == BODY) { add_body(t, i, k, x); return; }
     if (con->kind != FUNCTION) {
         Into to = {.H = t->H + k * S * S};
         for (int part = 0; part < PARTS; part++) to.g[part] = t->g[part] + k * S;
@@ -250,10 +250,10 @@ static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, con
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) out[j] = SET(con->sign[j]) * z[con->variable[j]];
 #if DIM > 0
-    } else if (con->balls > 0) {
-        body_along(&t->lanes, i, k, x, u, z, out);
-    } else if (con->kind != FUNCTION) {
+    } else if (con->kind != FUNCTION && con->kind != BODY) {
         solids_along(con, rows, k, x, z + POSITION, out);
+    } else if (con->kind == BODY) {
+        body_along(&t->lanes, i, k, x, u, z, out);
 #endif
     } else model_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, z, out);
 }

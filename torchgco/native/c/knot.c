@@ -41,8 +41,8 @@ __attribute__((noinline)) static V body_value(const Lanes *s, int64_t i, int64_t
     ball_centers(s, i, k, x, centers);
     for (int b = 0; b < con->balls; b++) {
         ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
-        if (con->kind == SPHERES) total = spheres_value(s, &ball.con, &ball.rows, k, ball.x, total);
-        else if (con->kind == BOXES) total = boxes_value(s, &ball.con, &ball.rows, k, ball.x, total);
+        if (ball.con.kind == SPHERES) total = spheres_value(s, &ball.con, &ball.rows, k, ball.x, total);
+        else if (ball.con.kind == BOXES) total = boxes_value(s, &ball.con, &ball.rows, k, ball.x, total);
         else total = field_value(s, &ball.con, &ball.rows, k, ball.x, total);
     }
     return total;
@@ -61,8 +61,8 @@ __attribute__((noinline)) static void body_expand(const Lanes *s, int64_t i, int
             own[a] = SET(0.0);
             for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
         }
-        if (con->kind == SPHERES) spheres_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
-        else if (con->kind == BOXES) boxes_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
+        if (ball.con.kind == SPHERES) spheres_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
+        else if (ball.con.kind == BOXES) boxes_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
         else field_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
         if (adds_nothing(own + POSITION, square + POSITION * S)) continue;
         if (count < 0)
@@ -101,14 +101,14 @@ static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, con
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) total += worth(s, 0, bound(con, rows, j, k, x, u), lam[j]);
 #if DIM > 0
-    } else if (con->balls > 0) {
-        total = body_value(s, i, k, x, total);
     } else if (con->kind == SPHERES) {
         total = spheres_value(s, con, rows, k, x, total);
     } else if (con->kind == BOXES) {
         total = boxes_value(s, con, rows, k, x, total);
     } else if (con->kind == FIELD) {
         total = field_value(s, con, rows, k, x, total);
+    } else if (con->kind == BODY) {
+        total = body_value(s, i, k, x, total);
 #endif
     } else total = traced_value(s, i, k, x, u, lam, total);
     return total;
@@ -126,14 +126,14 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
             H[v * S + v] += rho;
         }
 #if DIM > 0
-    } else if (con->balls > 0) {
-        body_expand(s, i, k, x, g, H);
     } else if (con->kind == SPHERES) {
         spheres_expand(s, con, rows, k, x, g, H);
     } else if (con->kind == BOXES) {
         boxes_expand(s, con, rows, k, x, g, H);
     } else if (con->kind == FIELD) {
         field_expand(s, con, rows, k, x, g, H);
+    } else if (con->kind == BODY) {
+        body_expand(s, i, k, x, g, H);
 #endif
     } else traced_expand(s, i, k, x, u, lam, g, H);
 }

@@ -49,7 +49,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
         const Constraint *con = p->constraint + i;
         if (!q->of->geometric[i] || con->place[k] == NOWHERE) continue;
 #if DIM > 0
-        if (con->balls > 0) {
+        if (con->kind == BODY) {
             V centers[con->balls * DIM];
             Ball ball;
             ball_centers(&q->s, i, k, x, centers);

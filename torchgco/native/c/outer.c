@@ -73,7 +73,9 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
             note(s, con, c, tgco_choose(c < zero, zero, c), lam + j, &pushed, sweep);
         }
 #if DIM > 0
-    } else if (con->balls > 0) {
+    } else if (con->kind != FUNCTION && con->kind != BODY) {
+        note_solids(s, con, rows, k, x, &pushed, sweep);
+    } else if (con->kind == BODY) {
         V centers[con->balls * DIM];
         Ball ball;
         ball_centers(s, i, k, x, centers);
@@ -81,8 +83,6 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
             ball_at(con, rows, b, k, centers + b * DIM, &ball);
             note_solids(s, &ball.con, &ball.rows, k, ball.x, &pushed, sweep);
         }
-    } else if (con->kind != FUNCTION) {
-        note_solids(s, con, rows, k, x, &pushed, sweep);
 #endif
     } else {
         V c[MAX_ROWS];
@@ -312,7 +312,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
             const Rows *rows = s->rows + i;
-            if (con->kind != SPHERES || con->balls > 0) continue;
+            if (con->kind != SPHERES) continue;
             for (int j = 0; j < con->rows; j++) {
                 V radius = SET(p->gain) * tgco_sqrt(rows->squares[j]), a[DIM], b[DIM], along[DIM], nearest = least;
                 I here = rows->squares[j] >= SET(0.0);
