@@ -19,6 +19,7 @@ from torchgco import (
     ILQR,
     MPPI,
     AugmentedLagrangian,
+    Body,
     Boxes,
     Capsules,
     ControlBounds,
@@ -59,6 +60,7 @@ def constraints(kind: str, device: Any) -> list[Any]:
         "spheres": lambda: Spheres(center, put([0.15]), R, velocities=put([[0.05, 0.0]])),
         "boxes": lambda: Boxes(center, half, R, rotations=put([0.3])),
         "capsules": lambda: Capsules(center, center + half, put([0.1]), R),
+        "body": lambda: Spheres(center, put([0.15]), Body([[-0.1, 0.0], [0.1, 0.0]], R)),
         "oscillating": lambda: OscillatingBoxes(Boxes(center, half, R), *[put([[[0.05, 0.05]]])] * 3),
         "map": lambda: Field(OccupancyGrid(WALL, [-1.7, -2.0], 0.15), vehicle_radius=R),
         "states": lambda: StateBounds(put([-9.0, -9, -9, -1, -1, -9]), put([9.0, 9, 9, 1, 1, 9])),
@@ -115,7 +117,7 @@ def test_what_solve_checks_before_and_after_stays_on_the_device(kind: str) -> No
     on_both(work, kind)
 
 
-OTHERS = ("spheres", "boxes", "capsules", "oscillating", "function")
+OTHERS = ("spheres", "boxes", "capsules", "body", "oscillating", "function")
 SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS]
 
 

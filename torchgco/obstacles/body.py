@@ -55,9 +55,8 @@ class Body:
     attitude: str | Callable[[Tensor], Tensor] = "heading"
 
     def __post_init__(self) -> None:
-        like = torch.empty(0, dtype=torch.float64)
-        offsets = tensor(self.offsets, "body.offsets", like)
-        radii = tensor(self.radii, "body.radii", like)
+        offsets = numbers(self.offsets, "body.offsets")
+        radii = numbers(self.radii, "body.radii")
         if offsets.dim() != 2 or offsets.shape[0] < 1 or offsets.shape[1] not in (2, 3):
             raise InputError("body.offsets", "shape (P, 2) or (P, 3) of at least one ball", tuple(offsets.shape))
         if radii.dim() == 0:
@@ -90,15 +89,14 @@ class Body:
         Raises:
             InputError: corners or counts of other shapes, a side that isn't above 0, a count below 1.
         """
-        like = torch.empty(0, dtype=torch.float64)
-        low, high = (tensor(part, f"body.{name}", like) for part, name in ((lower, "lower"), (upper, "upper")))
+        low, high = (numbers(part, f"body.{name}") for part, name in ((lower, "lower"), (upper, "upper")))
         check_shape(high, tuple(low.shape), "body.upper")
         if low.dim() != 1 or len(low) not in (2, 3) or not bool((high > low).all()):
             raise InputError("body.upper", "a corner (2,) or (3,) above `lower`", high.tolist())
         if len(cells) != len(low) or any(not isinstance(n, int) or n < 1 for n in cells):
             raise InputError("body.cells", f"{len(low)} whole numbers of at least 1", shown(cells))
-        size = (high - low) / torch.tensor(cells, dtype=torch.float64)
-        each = [low[a] + size[a] * (torch.arange(n, dtype=torch.float64) + 0.5) for a, n in enumerate(cells)]
+        size = (high - low) / low.new_tensor(cells)
+        each = [low[a] + size[a] * (torch.arange(n, dtype=low.dtype, device="cpu") + 0.5) for a, n in enumerate(cells)]
         return cls(torch.cartesian_prod(*each), float(0.5 * size.norm()) / CONTACT_FACTOR, attitude)
 
     @property
@@ -142,9 +140,16 @@ class Body:
         return BoundBody(balls, inner, points)
 
 
+def numbers(value: Any, field: str) -> Tensor:
+    """A body's own numbers, float64 on the CPU, whatever the problems' type and device are."""
+    if isinstance(value, Tensor) and (value.is_floating_point() or value.dtype == torch.int64):
+        value = value.to("cpu", torch.float64)
+    return tensor(value, field, torch.empty(0, dtype=torch.float64, device="cpu"))
+
+
 def directions(d: int) -> Tensor:
     """Unit vectors (R, d) all around, in space a Fibonacci lattice."""
-    i = torch.arange(RAYS, dtype=torch.float64)
+    i = torch.arange(RAYS, dtype=torch.float64, device="cpu")
     if d == 2:
         angle = 2.0 * math.pi / RAYS * i
         return torch.stack((angle.cos(), angle.sin()), dim=-1)
