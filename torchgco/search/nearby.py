@@ -51,7 +51,7 @@ class Nearby:
 
     @classmethod
     def of(cls, call: Call) -> Nearby | None:
-        """None where every problem keeps all obstacles: none is far, or can be told far.
+        """None where every problem keeps all obstacles: none is far, or is known to be far.
 
         A single far one counts: points all over the scene, and with them paths, would spread to it.
         """

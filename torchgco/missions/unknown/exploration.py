@@ -2,7 +2,7 @@
 
 In every control period the map takes what the sensor has seen, a search over its cells finds the cheapest path to the
 goal through all that isn't known to be occupied, and plans follow the part of this path that is known to be free. Every
-plan comes to rest within it. Where no new plan does, the former one is flown on.
+plan comes to rest within it. Where no new plan does, the previous one is flown on.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ class Exploration:
         return np.where(out, np.minimum(low, x[:3] - 1.0), low), np.where(out, np.maximum(high, x[:3] + 1.0), high)
 
     def _clear_part(self, former: Tensor) -> Tensor:
-        """Positions (B, N, 3) of former plans; where one has become blocked, it waits some knots before that."""
+        """Positions (B, N, 3) of previous plans; where one has become blocked, it waits some knots before that."""
         former = former.clone()
         for b, scout in enumerate(self.scouts):
             least = CONTACT_FACTOR * scout.radius + SPARE

@@ -149,7 +149,7 @@ class Scout:
     def slow_down(self, came_through: bool) -> None:
         """Make the reference of a vehicle in one place slow, where no plan comes through that follows it.
 
-        Plans within the former one's corridor do, but may lead nowhere: each of them may begin by hovering.
+        Plans within the previous one's corridor do, but may lead nowhere: each of them may begin by hovering.
         """
         self.slow = max(0, self.slow - 1)
         if not came_through and self.slow == 0 and self.waited * self.dt >= PAUSE:
