@@ -55,7 +55,7 @@ class Plan:
     def continued(self, problem: Problem) -> Multipliers:
         """The multipliers one stage later; where a group of obstacles ends, a knot takes those of the next group.
 
-        What one period raises the penalty by doesn't stay: over a mission it would grow beyond all measure.
+        The penalty is reset in every period; over a mission it would otherwise grow without bound.
         """
         held, parts = self.multipliers.lam, problem.constraints
         lam = [shifted(own) for own in held]
@@ -337,10 +337,9 @@ class _Solve:
 
 
 def _penalty(multipliers: Multipliers, allowed: Tensor) -> Tensor:
-    """mu (B,) with which multipliers that are wrong by as much as they are large leave the allowed violation (B,).
+    """The penalty mu (B,) at which a multiplier error of 100 % causes the allowed violation (B,).
 
-    The mu of a solve's end is none to continue from: AL-iLQR raises it to where solves are stiff, and the interior
-    point has none.
+    The final penalty of a solve isn't used: AL-iLQR raises it until solves are stiff, and the interior point has none.
     """
     largest = torch.zeros_like(multipliers.mu)
     for lam in multipliers.lam:
