@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 from torchgco.base.errors import InputError, shown
 from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI, PathPursuit
@@ -208,7 +209,13 @@ def named(name: str, space: Space) -> Solver:
     """The solver of a preset by its name; InputError where there is none."""
     if name not in PRESETS:
         raise InputError("solver", f"one of {', '.join(PRESETS)}, or a solver", shown(name))
-    return PRESETS[name](space)
+    return _made(PRESETS[name], 2 if _in_the_plane(space) else 3)
+
+
+@cache
+def _made(preset: Callable[[Space], Solver], dimension: int) -> Solver:
+    """Solvers are immutable, and depend on the dimension alone: making one takes a millisecond."""
+    return preset(dimension)
 
 
 def _paths(space: Space) -> Paths:

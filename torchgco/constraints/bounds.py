@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, tensor
-from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.constraints.base import Constraint, count_of, resolve_knots
 
 LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
 
@@ -117,6 +117,10 @@ class _Bounds(Constraint):
         if bool(bad.any()):
             raise InputError(name, f"numbers or {-refused}", float(bound[bad][0]))
         return bound
+
+    def row_shape(self, N: int) -> tuple[int, int]:
+        size = self.upper.shape[-1]
+        return count_of(self.knots, N + 1), count_of(self.above, size) + count_of(self.below, size)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         z = self._bounded(X, U)

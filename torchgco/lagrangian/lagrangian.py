@@ -62,9 +62,9 @@ class Multipliers:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
         if not isinstance(self.lam, tuple) or not all(isinstance(part, Tensor) for part in (*self.lam, self.mu)):
             raise InputError("warm", "multipliers that are tensors", type(self.lam).__name__)
-        want = Multipliers.zero(problem, 0.0)
-        for mine, theirs in ((self.lam, want.lam), ((self.mu,), (want.mu,))):
-            got, expected = ([tuple(t.shape) for t in tensors] for tensors in (mine, theirs))
+        want = [(problem.B, *shape) for shape in problem.row_shapes]
+        for mine, expected in ((self.lam, want), ((self.mu,), [(problem.B,)])):
+            got = [tuple(part.shape) for part in mine]
             if got != expected:
                 raise InputError("warm", f"multipliers of shapes {expected}", got)
         for part in (*self.lam, self.mu):

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
-from torchgco.base.tree import Rows, cast
+from torchgco.base.tree import Rows, cast, is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -202,14 +202,14 @@ class Problem:
     @property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
         """Knots and rows of every constraint; the same for all problems of a form."""
-        shapes = self.known.row_shapes
-        if shapes is None:
+        if self.known.row_shapes is None:
+            stated = [None if is_users(part) else part.row_shape(self.N) for part in self.constraints]
             # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
-            one = self.take(slice(0, 1))
+            one = self.take(slice(0, 1)) if None in stated else self
             X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-            found = [c.value(X, U).shape for c in one.constraints]
-            shapes = self.known.row_shapes = tuple((knots, rows) for _, knots, rows in found)
-        return shapes
+            parts = zip(stated, one.constraints, strict=True)
+            self.known.row_shapes = tuple(shape or tuple(part.value(X, U).shape[1:]) for shape, part in parts)
+        return self.known.row_shapes
 
     @property
     def cost_unit(self) -> Tensor:

@@ -98,7 +98,8 @@ class InteriorPoint(Solver):
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         session, admitted = Session(call, RAW), self.admitted(call.problem)
-        end = self.no_worse(session.call, self.solved(session.call))
+        guess = guessed(session.call)
+        end = self.no_worse(session.call, guess, self.solved(session.call, guess=guess))
         return session.finished(least_violated(session.call, end, admitted), admitted)
 
     def admitted(self, problem: Problem) -> float:
@@ -139,24 +140,25 @@ class InteriorPoint(Solver):
         check_tensor(X0, "X0", problem.x0)
         return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
 
-    def solved(self, call: Call, X0: Tensor | None = None) -> SolveEnd:
+    def solved(self, call: Call, X0: Tensor | None = None, guess: Iterate | None = None) -> SolveEnd:
         """The solve without its verdict, in the units of the call.
 
         Args:
             X0: states to begin with, (B, N+1, n), of the first those components that are free; None: the call's, else
                 the rollout of its controls; the start held where these are not finite.
+            guess: `guessed` of the call, where it is known.
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         kernels = interior_of(problem)
-        rollout = open_loop(problem, call.U0)
+        guess = guess or guessed(call)
+        rollout = guess.X
         X = rollout if X0 is None else torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
         status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
         X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
         end = SolveEnd.blank(problem, call.U0)
         end.best.X[:] = rollout  # where a solve never begins
-        end.best.cost[:] = problem.cost.total(rollout, call.U0)
-        end.best.violation[:] = measured(problem, rollout, call.U0)
+        end.best.cost[:], end.best.violation[:] = guess.cost, guess.violation
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
         for part in rows.split(AT_ONCE):
@@ -169,11 +171,10 @@ class InteriorPoint(Solver):
                 call.callback(Progress(1, call.rows[part], done, problem.B))
         return end
 
-    def no_worse(self, call: Call, end: SolveEnd) -> SolveEnd:
+    def no_worse(self, call: Call, guess: Iterate, end: SolveEnd) -> SolveEnd:
         """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
         problem, found = call.problem, end.best
-        X = open_loop(problem, call.U0)
-        cost, worst = problem.cost.total(X, call.U0), measured(problem, X, call.U0)
+        X, cost, worst = guess.X, guess.cost, guess.violation
         lost = ~(torch.isfinite(found.cost) & torch.isfinite(found.violation))
         worse = is_better(cost, worst, found.cost, found.violation, self.admitted(problem)) | lost
         rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
@@ -212,6 +213,14 @@ class InteriorPoint(Solver):
         sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
         end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]
+
+
+def guessed(call: Call) -> Iterate:
+    """The trajectory that a call's controls lead to, without multipliers."""
+    problem, U = call.problem, call.U0
+    X = open_loop(problem, U)
+    none = Multipliers.none(problem, U.new_zeros(problem.B))
+    return Iterate(X, U, none, problem.cost.total(X, U), measured(problem, X, U))
 
 
 def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor, Tensor]:
