@@ -158,6 +158,11 @@ def test_every_link_leads_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
+def test_the_manual_lists_its_pages() -> None:
+    contents = ROOT / "docs" / "README.md"
+    assert {page.name for page in contents.parent.glob("*.md")} - {contents.name} <= set(links(contents))
+
+
 MANUAL = [page for page in PAGES if page.parent != ROOT / "benchmarks" / "results" and page.name != "CHANGELOG.md"]
 
 

@@ -109,8 +109,8 @@ def gco_max(space: Space) -> Restarts:
 def gco_exact(space: Space) -> Restarts:
     """`gco` with its last steps taken to a violation and KKT residual of 1e-8; in float64.
 
-    The tolerance of the interior point is smaller: it counts in units of the cost's steepest slope or curvature, while
-    a residual is a share of the terms that cancel in a control's slope, which may be far smaller.
+    The tolerance of the interior point is smaller, since it is measured after the cost's gradient has been scaled to 1.
+    The certified residual is relative to the terms that cancel in a control's gradient, which may be far smaller.
     """
     return replace(gco(space), interior=InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9))
 

@@ -39,7 +39,7 @@ class Constraint(PerElement):
 
     @property
     def bare(self) -> Constraint:
-        """The constraint that a solver's form of it stands for; itself where it is none."""
+        """The user's constraint behind a solver's wrapper; itself if it isn't wrapped."""
         return self
 
     @property

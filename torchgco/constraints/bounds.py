@@ -183,7 +183,7 @@ class RateBounds(_Bounds):
 
     Bounds are of the change from one stage to the next, in the units of u: an actuator's limit per second times dt.
     Solvers see the bounded controls of the stage before as further states, last in x: so does a callback, and a solver
-    of one's own. Solutions have the problem's own states. A problem has one RateBounds at most.
+    of your own. Solutions have the problem's own states. A problem has one RateBounds at most.
 
     Args:
         lower, upper: as for other bounds; without a lower one, say, controls may fall at any rate.

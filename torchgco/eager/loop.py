@@ -255,7 +255,7 @@ class _Loop:
     def _recover(self, failed: Tensor) -> Tensor:
         """Problems whose line search failed look for feasibility alone: steps of least length that close residuals.
 
-        Where there is nothing to close, they start anew with new multipliers and a shift. Returns those that give up.
+        Where there is nothing to close, they start again with new multipliers and a shift. Returns those that give up.
         """
         t, how = self.t, self.kinds.how
         if not bool(failed.any()):

@@ -172,7 +172,7 @@ def remeasure(kinds: Kinds, t: State) -> None:
 
 
 def renew(kinds: Kinds, model: Model, t: State) -> None:
-    """Multipliers anew: those of the central path, none of equalities, and costates that fit them."""
+    """New multipliers: those of the central path, none of equalities, and costates that fit them."""
     t.z = torch.where(kinds.inside(t), column(t.mu) / t.s, 0.0)
     adjoin(kinds, model.slopes(t.X, t.U), t)
 
@@ -228,7 +228,7 @@ def complementarity(kinds: Kinds, t: State, mu: Tensor) -> Tensor:
 
 
 def lower_barrier(kinds: Kinds, t: State, test: Errors, running: Tensor) -> None:
-    """The next mu where the barrier problem is solved well enough; the filter begins anew there."""
+    """The next mu where the barrier problem is solved well enough; the filter begins again there."""
     how = kinds.how
     base, usual = torch.maximum(test.dual, test.primal), how.tolerance * how.barrier_floor
     smallest = torch.where(t.presses, how.barrier_least, torch.full_like(t.mu, usual))

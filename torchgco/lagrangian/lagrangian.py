@@ -111,7 +111,7 @@ def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool)
 def binding(sense: Sense, c: Tensor, lam: Tensor) -> Tensor:
     """The multipliers (B, K, p) of rows c that bind, 0 elsewhere: at a slack that exceeds them.
 
-    An interior point's multipliers are above 0 on all inequalities; lam times slack is tiny, and the larger one tells.
+    An interior point's multipliers are above 0 on all inequalities: a row binds if its multiplier exceeds its slack.
     """
     return lam if sense == "equality" else torch.where(lam > -c, lam, 0.0)
 

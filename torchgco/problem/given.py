@@ -1,4 +1,4 @@
-"""A problem's parts as the user gave them, from which it is bound anew where their numbers have changed since.
+"""A problem's parts as the user gave them, from which it is bound again where their numbers have changed since.
 
 A problem holds numbers alone: solvers, pictures and judges never meet a gradient. Where tensors that it was given ask
 for gradients, its parts are bound once more, with gradients recorded, when a solution is to be differentiated.
@@ -70,7 +70,7 @@ class Given:
         return Given.of({**self.fields, **fields})
 
     def current(self, problem: Any) -> Any:
-        """`problem`, which is of these parts; bound anew where their numbers have changed since."""
+        """`problem`, which is of these parts; bound again where their numbers have changed since."""
         facts = tuple(_facts(self.fields))
         if facts == self.facts:
             return problem
@@ -111,7 +111,7 @@ def replaced(parts: Sequence[Any], old: Sequence[Any], new: Sequence[Any]) -> li
 
 @dataclass(frozen=True, eq=False)
 class _Itself:
-    """An object that is equal to itself alone; what it holds is looked at elsewhere, or read anew."""
+    """An object that is equal to itself alone; what it holds is looked at elsewhere, or read again."""
 
     held: Any
 

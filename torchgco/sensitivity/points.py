@@ -136,7 +136,7 @@ def clearance(problem: Problem, X: Tensor) -> Tensor:
 
 
 def rows_that_hold(problem: Problem, solution: Solution) -> tuple[Tensor, Tensor]:
-    """Which rows hold as equalities, and of which inequalities that isn't told, (B, R) bool."""
+    """Which rows hold as equalities, and of which inequalities that isn't known, (B, R) bool."""
     unit, none = cost_unit(problem).view(-1, 1, 1), torch.zeros_like(solution.status, dtype=torch.bool)[:, None][:, :0]
     hold, untold = [none], [none]
     for part, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):

@@ -39,7 +39,7 @@ from torchgco.solvers.timing import Chooser
 AT_ONCE = 256  # problems between two reports of progress
 ROUGH, FEW = 1e-2, 60  # tolerance, and iterations, of a trajectory whose time is to be freed next
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
-# Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
+# In brackets: the names of Waechter and Biegler (2006). Constants without such a name are not in the paper.
 FILTER: dict[str, Any] = {
     "push": 1e-2,  # least slack at the start, and how far guesses are moved inside of their bounds (kappa_1)
     "boundary": 0.99, "closest": 1.0 - 1e-12,  # share of the way to where a slack is 0 (tau_min), and at most: above 0
