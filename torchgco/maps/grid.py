@@ -90,6 +90,27 @@ class OccupancyGrid:
         return cls(cells.T, origin, resolution)
 
     @classmethod
+    def from_esdf(cls, distances: Any, origin: Any, resolution: Any) -> OccupancyGrid:
+        """The grid of a distance field of another program, whose values stand for the centres of cells.
+
+        Cells are occupied where the distance is at most 0, NaN is unknown. A `DistanceField` of the grid has exact
+        distances from these cells; others' are often approximate, or end at a largest one.
+
+        Args:
+            distances: (X, Y[, Z]), or (B, ...), m; negative inside, or 0 in occupied cells.
+            origin, resolution: as of the grid.
+
+        Raises:
+            InputError: no floating numbers, or none that is positive.
+        """
+        held = np.asarray(distances)
+        if held.dtype.kind != "f" or not (held > 0).any():
+            got = f"{held.dtype} of shape {held.shape}" if held.dtype.kind != "f" else "none above 0"
+            raise InputError("grid.distances", "floating numbers, m, above 0 in free cells", got)
+        cells = np.where(np.isnan(held), np.float32("nan"), (held <= 0).astype(np.float32))
+        return cls(cells, origin, resolution)
+
+    @classmethod
     def from_ros(cls, message: Any) -> OccupancyGrid:
         """The grid of a message nav_msgs/OccupancyGrid: percent as probabilities, -1 unknown.
 

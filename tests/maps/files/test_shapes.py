@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.maps.files import samples
 from torchgco import InputError
-from torchgco.maps import OccupancyGrid, PointCloud, read
+from torchgco.maps import DistanceField, OccupancyGrid, PointCloud, read
 
 WORLD = """<?xml version="1.0"?>
 <sdf version="1.7"><world name="yard">
@@ -233,3 +233,16 @@ def test_costmaps_and_messages_of_ros() -> None:
         OccupancyGrid.from_ros(message)
     with pytest.raises(InputError, match="with info and data"):
         OccupancyGrid.from_ros(costs)
+
+
+def test_a_distance_field_of_another_program() -> None:
+    x, y = np.meshgrid(0.1 * (np.arange(40) + 0.5), 0.1 * (np.arange(30) + 0.5), indexing="ij")
+    distances = np.hypot(x - 2.0, y - 1.5) - 0.6
+    distances[0] = np.nan
+    grid = OccupancyGrid.from_esdf(distances, [0.0, 0.0], 0.1)
+    assert grid.is_unknown.sum() == 30 and np.array_equal(grid.is_occupied, distances <= 0)
+    found = DistanceField.of(grid, unknown="free").distance(np.array([[1.0, 1.5], [3.5, 1.5]]))
+    assert np.abs(found.numpy() - [0.4, 0.9]).max() < 0.1
+    for wrong in (np.ones((3, 3), int), -np.ones((3, 3))):
+        with pytest.raises(InputError, match="above 0 in free cells"):
+            OccupancyGrid.from_esdf(wrong, [0.0, 0.0], 0.1)
