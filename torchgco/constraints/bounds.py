@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -119,6 +121,7 @@ class _Bounds(Constraint):
         return bound
 
     def row_shape(self, N: int) -> tuple[int, int]:
+        assert self.above is not None and self.below is not None
         size = self.upper.shape[-1]
         return count_of(self.knots, N + 1), count_of(self.above, size) + count_of(self.below, size)
 
@@ -165,6 +168,21 @@ class ControlBounds(_Bounds):
 
     of: ClassVar[Literal["x", "u"]] = "u"
     label: ClassVar[str] = "control_bounds"
+
+
+def joined_bounds(parts: Sequence[ControlBounds], N: int) -> ControlBounds | None:
+    """The bounds of several parts, once bound, as one; the only part as it is, and None of none.
+
+    Where they leave a control no value, its upper bound counts alone: the problem is infeasible.
+    """
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    lower, upper = zip(*(part.over(N) for part in parts), strict=True)
+    upper = reduce(torch.minimum, upper)
+    lower = torch.minimum(reduce(torch.maximum, lower), upper)
+    above, below = (torch.isfinite(bound).flatten(0, -2).any(dim=0).nonzero().flatten() for bound in (upper, lower))
+    ends = {"above": _range(above), "below": _range(below)}
+    return replace(parts[0], lower=lower.contiguous(), upper=upper.contiguous(), knots=slice(0, N), **ends)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast, is_users
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds
+from torchgco.constraints.bounds import ControlBounds, RateBounds, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
@@ -161,8 +161,8 @@ class Problem:
 
     @property
     def control_bounds(self) -> ControlBounds | None:
-        """The first bounds on controls; None where there are none."""
-        return next((c for c in self.constraints if isinstance(c, ControlBounds)), None)
+        """The bounds on controls, those of several parts as one; None where there are none."""
+        return joined_bounds([c for c in self.constraints if isinstance(c, ControlBounds)], self.N)
 
     @cached_property
     def start_is_clear(self) -> Tensor:
@@ -240,10 +240,12 @@ class Problem:
         return {f.name: getattr(self.current(), f.name) for f in fields(self)} | {"known": Known()}
 
     def take(self, index: Rows) -> Self:
-        """The problems in `index` (int64, (B',), or a slice); a row may occur more than once.
+        """The problems in `index` (int64, (B',), or a list or slice); a row may occur more than once.
 
         All of them in their order are this problem itself, with what is known of it.
         """
+        if isinstance(index, list):
+            index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
         if _is_whole(index, self.B):
             return self
         parts = {
