@@ -27,6 +27,7 @@ class System:
     U: Tensor  # (B, N, m)
     multipliers: tuple[Tensor, ...]
     active: Tensor  # (B, R) bool
+    give: Tensor | None = None  # (B, R)
 
     def solve(self, x: Tensor, u: Tensor, gaps: Tensor | None, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """-K^-1 of right hand sides x (C, B, N+1, n), u (C, B, N, m), gaps (C, B, N, n), rows (C, B, R); as these."""
@@ -34,7 +35,8 @@ class System:
             n, gaps = self.problem.n, torch.zeros_like(x[:, :, 1:]) if gaps is None else gaps
             a = torch.cat((x, torch.nn.functional.pad(u, (0, 0, 0, 1))), dim=-1)
             right = RightSides(a, gaps, rows)
-            found = interior_of(self.problem).kkt(self.problem, self.X, self.U, self.multipliers, self.active, right)
+            point = self.X, self.U, self.multipliers, self.active
+            found = interior_of(self.problem).kkt(self.problem, *point, right, self.give)
         return found.z[..., :n], found.z[:, :, :-1, n:], found.y, found.v
 
 

@@ -51,6 +51,8 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
     before = problem if problem is not None else solution.account and solution.account.problem
     if before is None:
         raise InputError("problem", "the problem that was solved", "a solution that no longer knows it")
+    if solution.account is not None and solution.account.smoothing:
+        raise InputError("solution", "one without smoothing", "one with it")
     if current_problem(before) is not before:
         expected = "another problem: numbers of the one that was solved have been changed in place"
         raise InputError("changed", expected, "the changed one itself")
