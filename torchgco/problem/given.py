@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.base.gradients import leaves, recording, without_gradients
+from torchgco.base.gradients import asking, leaves, recording, without_gradients
 from torchgco.base.shapes import as_states, check_untransformed
 from torchgco.problem.free_start import moved_inside
 from torchgco.problem.goal import with_goal, without_goal
@@ -48,7 +48,7 @@ class Given:
     def of(cls, fields: Mapping[str, Any]) -> Given:
         """That of a problem's fields; InputError within a transform of torch.func or torch.compile."""
         check_untransformed("Problem")
-        asks = any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves([fields[name] for name in PARTS]))
+        asks = bool(asking([fields[name] for name in PARTS]))
         return cls(dict(fields), tuple(_facts(fields)), asks)
 
     @property

@@ -8,11 +8,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.errors import InputError
-from torchgco.base.gradients import recording
+from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users
@@ -30,14 +29,13 @@ SERVED = "a problem in float64 with one horizon, a fixed time, a given start and
 
 
 def asks_for_gradients(problem: Problem) -> bool:
-    """Whether gradients are recorded, and a tensor asks for them in the problem, or one that its functions capture.
+    """Whether gradients are recorded, and a tensor asks for them in the problem, or one that its functions capture; or
+    one of these has a tangent of forward mode.
 
     Raises:
         InputError: they can't be served.
     """
-    if forward_ad._current_level >= 0:
-        raise InputError("solve", "a call outside of forward_ad.dual_level: derivatives are reverse", "one inside")
-    if not torch.is_grad_enabled() or torch.is_inference_mode_enabled() or problem.B == 0:
+    if not (torch.is_grad_enabled() or is_forward()) or torch.is_inference_mode_enabled() or problem.B == 0:
         return False
     if not (problem.given is not None and problem.given.asks) and not _captures(problem):
         return False
@@ -81,7 +79,7 @@ def _captures(problem: Problem) -> bool:
         *((part, lambda part=part: part.value(X, U)) for part in one.constraints),
     ]
     with computing_on(one.x0.device), recording():  # a user's function may make tensors, too
-        return any(is_users(part) and value().requires_grad for part, value in uses)
+        return any(is_users(part) and asks(value()) for part, value in uses)
 
 
 def attached(
@@ -136,7 +134,7 @@ def _live(problem: Problem, at: Points, rows: Tensor) -> Problem:
 def _step_left(at: Points, of: Residual) -> Tensor:
     """The step (B,) from the points to where the conditions hold to first order, as a share of 1 + the largest state or
     control; infinite where it isn't a number."""
-    with torch.no_grad():
+    with not_recording():
         c = of.rows if at.gap is None else of.rows + at.gap
         x, u, _, _ = _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None])
         size = 1.0 + torch.maximum(at.solution.X.abs().flatten(1).amax(-1), at.solution.U.abs().flatten(1).amax(-1))
