@@ -18,7 +18,6 @@ from torchgco import (
     InputError,
     Problem,
     QuadraticCost,
-    RateBounds,
     Solution,
 )
 
@@ -119,9 +118,6 @@ def test_solutions_with_gradients_serve_as_others_do(tmp_path) -> None:
     ("field", "make"),
     [
         ("problem", lambda x: Problem(MODEL, COST, [ControlBounds(-3, 3)], x.float().detach().requires_grad_(), 10)),
-        ("problem", lambda x: Problem(MODEL, COST, [ControlBounds(-3, 3)], x, 10, horizon=[7])),
-        ("problem", lambda x: Problem(MODEL, COST, [ControlBounds(-3, 3)], x, 10, free_start=[True, False])),
-        ("problem", lambda x: Problem(MODEL, COST, [RateBounds(-1, 1)], x, 10)),
         ("goal.radius", lambda x: Problem(FunctionDynamics(lambda x, u: u, 1, 1, 0.1, position=slice(0, 1)),
             QuadraticCost([1.0], [1.0], [1.0]), [], x[:, :1].detach(), 10, Goal([1.0], x[0, 0]))),
     ],

@@ -15,17 +15,17 @@ from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users
-from torchgco.constraints.bounds import RateBounds
-from torchgco.kernels import current
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
+from torchgco.sensitivity.form import for_systems, for_user
 from torchgco.sensitivity.function import Solved, System
 from torchgco.sensitivity.points import Points, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
 NEAR = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
-SERVED = "a problem in float64 with one horizon, a fixed time, a given start and no RateBounds"
+SERVED = "a problem in float64"
 
 
 def asks_for_gradients(problem: Problem) -> bool:
@@ -58,13 +58,7 @@ def check_smoothing(problem: Problem, smoothing: Any) -> float:
 
 def refuse_forms(problem: Problem, what: str) -> None:
     """Raise InputError for forms of problems that have no derivatives here, of which `what` asks for them."""
-    for got, refused in (
-        (problem.x0.dtype, problem.x0.dtype != torch.float64),
-        ("horizons per problem", problem.horizon is not None),
-        ("a free start", problem.free_start is not None and bool(problem.free_start.any())),
-        ("a free time", problem.time is not None),
-        ("RateBounds", any(isinstance(part, RateBounds) for part in problem.constraints)),
-    ):
+    for got, refused in ((problem.x0.dtype, problem.x0.dtype != torch.float64),):
         if refused:
             raise InputError("problem", f"{SERVED}, for {what}", got)
 
@@ -96,13 +90,13 @@ def attached(
         records: whether anything asks for gradients; else all are numbers.
     """
     with computing_on(problem.x0.device):
-        points = points_of(current(problem), solution, smoothing)
+        points = points_of(*for_systems(problem, solution), smoothing)
     account = solution.account.smoothed(smoothing) if solution.account is not None and smoothing else solution.account
     known = {"trace": solution.trace, "search": solution.search, "account": account, "reason": points.reason}
     found = replace(points.solution, **known)
     rows = (points.reason == Why.DIFFERENTIABLE).nonzero().flatten()
     if rows.numel() == 0:
-        return _constant(found) if records else found
+        return for_user(problem, _constant(found) if records else found, solution.K)
     with recording():
         at = points.take(rows)
         live = _live(asked, at, rows)
@@ -112,9 +106,10 @@ def attached(
             points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
             rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)
             live = live.take(near.nonzero().flatten())
-        if not records:
-            return found
-        return _with_values(found, rows, _values(live, at, found_at)) if rows.numel() > 0 else _constant(found)
+        if records:
+            live_at = rows.numel() > 0
+            found = _with_values(found, rows, _values(live, at, found_at)) if live_at else _constant(found)
+        return for_user(problem, found, solution.K)
 
 
 def _constant(found: Solution) -> Solution:
@@ -127,7 +122,7 @@ def _constant(found: Solution) -> Solution:
 
 def _live(problem: Problem, at: Points, rows: Tensor) -> Problem:
     """The problems `rows` with gradients recorded, and obstacles grown as at their points."""
-    live = problem.recorded().take(rows)
+    live = for_solvers(problem.recorded().take(rows))
     return live.grown(at.growth) if bool((at.growth > 0).any()) else live
 
 
@@ -153,7 +148,8 @@ def _values(live: Problem, at: Points, of: Residual) -> tuple[Tensor, ...]:
     flat = torch.cat([found.X.new_zeros(len(found), 0), *(lam.flatten(1) for lam in multipliers)], dim=1)
     values = found.X, found.U, flat, found.cost
     X, U, lam, cost = Solved.apply(_system(at), values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
-    X = torch.cat((of.start.unsqueeze(1), X[:, 1:]), dim=1)
+    start = of.start if live.free_start is None else torch.where(live.free_start, X[:, 0], of.start)
+    X = torch.cat((start.unsqueeze(1), X[:, 1:]), dim=1)
     return X, U, lam, cost if at.give is None else live.cost.total(X, U)  # no minimum of the cost, so no envelope
 
 
