@@ -185,6 +185,16 @@ def test_refused(smoothing: object) -> None:
         brake(torch.tensor([-4.0], dtype=D), smoothing)  # type: ignore[arg-type]
 
 
+def test_without_problems_and_in_inference_mode() -> None:
+    one = Problem(MODEL, COST, [ControlBounds(-4.0, 5.0)], torch.zeros(1, 2, dtype=D), N)
+    none = one.take(torch.zeros(0, dtype=torch.int64))
+    assert len(torchgco.solve(none, smoothing=1e-4, verbose=False)) == 0
+    low = torch.tensor([-4.0], dtype=D)
+    with torch.inference_mode():
+        found = brake(low, 1e-4)
+    assert torch.equal(found.U, brake(low, 1e-4).U) and found.differentiable.all()
+
+
 def test_predictions_of_smoothed_solutions_are_refused() -> None:
     x0 = torch.tensor([[1.0, 0.0]], dtype=D)
     problem = Problem(MODEL, COST, [ControlBounds(-4.0, 5.0)], x0, N)

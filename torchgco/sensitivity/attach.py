@@ -53,7 +53,7 @@ def check_smoothing(problem: Problem, smoothing: Any) -> float:
         return 0.0
     value = check_value(smoothing, Positive, "smoothing")
     refuse_forms(problem, "smoothing")
-    return value
+    return value if problem.B > 0 else 0.0
 
 
 def refuse_forms(problem: Problem, what: str) -> None:
@@ -91,11 +91,12 @@ def attached(
     """
     with computing_on(problem.x0.device):
         points = points_of(*for_systems(problem, solution), smoothing)
+    checks = not torch.is_inference_mode_enabled()  # where nothing can be recorded, to know the step that is left
     account = solution.account.smoothed(smoothing) if solution.account is not None and smoothing else solution.account
     known = {"trace": solution.trace, "search": solution.search, "account": account, "reason": points.reason}
     found = replace(points.solution, **known)
     rows = (points.reason == Why.DIFFERENTIABLE).nonzero().flatten()
-    if rows.numel() == 0:
+    if rows.numel() == 0 or not checks:
         return for_user(problem, _constant(found) if records else found, solution.K)
     with recording():
         at = points.take(rows)
