@@ -61,6 +61,7 @@ FILTER: dict[str, Any] = {
     "soft_growth": 100.0, "soft_decay": 0.1,
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,
+    "smoothing": 0.0,  # mu, in units of the cost, at which the barrier stays
     "rounding": 1e-10, "idle": 3,  # an error below this that doesn't fall by half for so long is due to rounding
 }  # fmt: skip
 
@@ -140,13 +141,16 @@ class InteriorPoint(Solver):
         check_tensor(X0, "X0", problem.x0)
         return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
 
-    def solved(self, call: Call, X0: Tensor | None = None, guess: Iterate | None = None) -> SolveEnd:
+    def solved(
+        self, call: Call, X0: Tensor | None = None, guess: Iterate | None = None, smoothing: float = 0.0
+    ) -> SolveEnd:
         """The solve without its verdict, in the units of the call.
 
         Args:
             X0: states to begin with, (B, N+1, n), of the first those components that are free; None: the call's, else
                 the rollout of its controls; the start held where these are not finite.
             guess: `guessed` of the call, where it is known.
+            smoothing: mu in units of the cost: J_var - mu times the logarithms of all slacks is minimised; 0: J_var.
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         kernels = interior_of(problem)
@@ -165,7 +169,7 @@ class InteriorPoint(Solver):
             if call.late:
                 end.status[part] = Status.TIME_LIMIT
                 continue
-            self._some(kernels, call.take(part), X[part], part, end)
+            self._some(kernels, call.take(part), X[part], part, end, smoothing)
             if call.callback is not None:
                 done = int((end.status != Status.RUNNING).sum())
                 call.callback(Progress(1, call.rows[part], done, problem.B))
@@ -184,7 +188,9 @@ class InteriorPoint(Solver):
             put(found, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
         return end
 
-    def _some(self, kernels: InteriorKernels, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
+    def _some(
+        self, kernels: InteriorKernels, call: Call, X: Tensor, rows: Tensor, end: SolveEnd, smoothing: float
+    ) -> None:
         """Solves problems, and puts how they ended into `end` at `rows`."""
         problem, warm = call.problem, call.warm
         if warm is None:
@@ -192,6 +198,7 @@ class InteriorPoint(Solver):
         else:
             mu, how = self.warm_barrier, FILTER | {"push": self.warm_barrier}
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
+        how = how | {"smoothing": smoothing}
         X, U = inside(problem, X, call.U0, how["push"])
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
         fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
