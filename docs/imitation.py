@@ -1,6 +1,6 @@
 """A small policy that imitates the planner in forests: `python docs/imitation.py`, one to two minutes on one core.
 
-The planner flies 32 missions, and a network learns its actions from what it sees; then the network flies, while the
+The planner flies 24 missions, and a network learns its actions from what it sees; then the network flies, while the
 planner says what it would have done there, and the network learns from both (DAgger, Ross et al. 2011). In the end both
 fly the same forests, which neither has seen.
 """
@@ -90,8 +90,8 @@ def rate(pilot: Any, env: MissionVectorEnv, layouts: int) -> tuple[int, float]:
 def main() -> None:
     """Train, fly, and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--envs", type=int, default=32)
-    parser.add_argument("--steps", type=int, default=120, help="control periods of a round")
+    parser.add_argument("--envs", type=int, default=24)
+    parser.add_argument("--steps", type=int, default=100, help="control periods of a round")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--epochs", type=int, default=40)
     parser.add_argument("--layouts", type=int, default=64, help="forests in which the two are compared")
@@ -108,6 +108,7 @@ def main() -> None:
         seen, action = torch.cat((seen, more[0])), torch.cat((action, more[1]))
         policy = learn(seen, action, options.epochs)
         print(f"round {k}: {len(seen)} actions of the planner")
+    print(f"trained in {time.process_time():.0f} s of processor time")
     for name, pilot in (("planner", PlannerPolicy(unseen)), ("policy", policy)):
         reached, milliseconds = rate(pilot, unseen, options.layouts)
         print(f"{name}: {reached} of {options.layouts} reached, {milliseconds:.3f} ms of processor time an action")
