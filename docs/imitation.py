@@ -74,17 +74,16 @@ def learn(seen: Tensor, action: Tensor, epochs: int) -> Policy:
 
 
 def rate(pilot: Any, env: MissionVectorEnv, layouts: int) -> tuple[int, float]:
-    """How many of the first missions of so many environments reach their goal, and milliseconds of an action."""
-    seen, ended, spent = env.reset(seed=0)[0], np.full(layouts, -1), list[float]()
-    env.episodes.begin(*[torch.arange(layouts)] * 2, [0] * layouts, range(layouts))  # forest i in environment i
-    seen = env._observed()
-    while (ended == -1).any():
-        began, flying = time.process_time(), (ended == -1).sum()
+    """How many of so many missions reach their goal, one in each environment, and milliseconds of an action."""
+    seen, _ = env.reset(seed=0, options={"layout": np.arange(layouts)})
+    spent, outcome = list[float](), np.full(layouts, -1)
+    while (flying := (outcome == -1).sum()) > 0:
+        began = time.process_time()
         action = pilot(seen)
         spent.append((time.process_time() - began) / flying)
         seen, _, _, _, info = env.step(action)
-        ended = np.where(ended == -1, info["outcome"], ended)
-    return int((ended == Outcome.REACHED).sum()), 1e3 * float(np.median(spent))
+        outcome = info["outcome"]
+    return int((outcome == Outcome.REACHED).sum()), 1e3 * float(np.median(spent))
 
 
 def main() -> None:
@@ -98,7 +97,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.manual_seed(0)
     env = MissionVectorEnv(options.envs, forests(512, TRAINED))
-    unseen = MissionVectorEnv(options.layouts, forests(options.layouts, UNSEEN))
+    unseen = MissionVectorEnv(options.layouts, forests(options.layouts, UNSEEN), autoreset_mode="Disabled")
     # What the network leads to may have no feasible plan; the teacher says its best, and doesn't search for long.
     teacher = PlannerPolicy(env, replace(env.episodes.mission.planner, tolerance=math.inf))
     seen, action = fly(env, teacher, teacher, options.steps, seed=0)

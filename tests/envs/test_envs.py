@@ -77,9 +77,8 @@ def test_the_loop_is_the_missions(plant: RotorPlant) -> None:
     """Bit by bit as a flight along plans of two knots, with wind and noise."""
     problem, flown = varied(2), mission(duration=0.4, plant=plant, disturbance=Disturbance(wind=1.0, rate_noise=0.01))
     env = MissionVectorEnv(6, problem, flown, ids=range(4, 10))
-    env.reset(seed=8)
-    episodes = env.episodes
-    rows = torch.tensor([episodes.layout.tolist().index(0), episodes.layout.tolist().index(1)])  # one of each problem
+    env.reset(seed=8, options={"layout": np.array([1, 0, 1, 1, 1, 0])})
+    episodes, rows = env.episodes, torch.tensor([1, 3])  # one of each problem
     seeds = torch.Generator().manual_seed(0)
     episodes._noise[rows], episodes._force[rows] = (torch.randn(2, 9, n, generator=seeds).double() for n in (13, 3))
     episodes._noise *= 0.01
@@ -101,8 +100,7 @@ def test_episodes_end_as_missions_are_judged() -> None:
     centers = torch.tensor([[[0.0, 0, 0.7]], [[9.0, 0, 9]], [[9.0, 0, 9]], [[9.0, 0, 9]]], dtype=torch.float64)
     problem = scene(centers, goal=0.5, N=10)
     env = MissionVectorEnv(4, problem, mission(duration=0.6, goal_radius=0.3), ids=range(4))
-    env.reset(seed=0)
-    env.episodes.begin(torch.arange(4), torch.arange(4), [0] * 4, [0] * 4)
+    env.reset(seed=0, options={"layout": np.arange(4)})
     env.episodes.x[1, 3] = 5.0  # m/s, towards the goal
     ended, rewards = np.full(4, -1), np.zeros(4)
     for k in range(12):
@@ -114,6 +112,22 @@ def test_episodes_end_as_missions_are_judged() -> None:
         ended, rewards = np.where(flying, info["outcome"], ended), rewards + np.where(flying, reward, 0)
     assert ended.tolist() == [Outcome.COLLISION, Outcome.REACHED, Outcome.TIMEOUT, Outcome.DIVERGED]
     assert rewards == pytest.approx([-10, 10.3, 0, -10], abs=0.35)
+
+
+def test_without_autoreset_what_has_ended_rests() -> None:
+    """It repeats how it has ended, until it is reset; the others fly on."""
+    env = MissionVectorEnv(2, far(2), mission(duration=0.2, goal_radius=0.3), autoreset_mode="Disabled")
+    env.reset(seed=0)
+    env.episodes.x[0, 0] = 1.9  # m, in the goal
+    results = [env.step(np.tile(REST, (2, 1))) for _ in range(6)]
+    assert [terminated.tolist() for _, _, terminated, _, _ in results] == [[True, False]] * 6
+    assert [truncated.tolist() for _, _, _, truncated, _ in results] == [[False, k >= 3] for k in range(6)]
+    assert results[5][4]["outcome"].tolist() == [Outcome.REACHED, Outcome.TIMEOUT]
+    assert results[5][1].tolist() == [0, 0] and np.array_equal(results[5][0], results[3][0])
+    _, info = env.reset(options={"reset_mask": np.array([True, False])})
+    assert info["_outcome"].tolist() == [True, False] and info["outcome"][0] == -1
+    *_, terminated, truncated, _ = env.step(np.tile(REST, (2, 1)))
+    assert (terminated.tolist(), truncated.tolist()) == ([False, False], [False, True])
 
 
 def test_the_vehicle_as_it_is_observed() -> None:
@@ -164,8 +178,7 @@ def test_the_planner_is_a_policy() -> None:
     problem, flown = varied(3), mission(duration=0.3)
     env = MissionVectorEnv(3, problem, flown, autoreset_mode="Disabled")
     policy = PlannerPolicy(env)
-    env.reset(seed=2)
-    env.episodes.begin(torch.arange(3), torch.arange(3), [0] * 3, [0] * 3)
+    env.reset(seed=2, options={"layout": np.arange(3)})
     plan = Flight(flown, problem).step().plan
     action = policy()
     np.testing.assert_allclose(action, plan.X[:, 1, 10:14], rtol=1e-6)
@@ -174,8 +187,7 @@ def test_the_planner_is_a_policy() -> None:
         *_, info = env.step(action)
         action = policy()
     assert (info["distance"] < away - 1e-3).all() and not env.waiting.any()
-    env.reset(options={"reset_mask": np.array([False, True, False])})
-    env.episodes.begin(torch.tensor([1]), torch.tensor([1]), [0], [0])
+    env.reset(options={"reset_mask": np.array([False, True, False]), "layout": np.arange(3)})
     again = policy()
     np.testing.assert_allclose(again[1], plan.X[1, 1, 10:14], rtol=1e-6)
     assert not np.allclose(again[0], plan.X[0, 1, 10:14])
@@ -185,6 +197,9 @@ def test_seeds() -> None:
     """Missions are drawn from (seed, id): in any vector the same, and others for other ids and seeds."""
     options: dict[str, Any] = {"problem": far(50), "mission": mission()}
     whole, part = MissionVectorEnv(6, **options), MissionVectorEnv(2, ids=[4, 1], **options)
+    single = MissionEnv(4, **options)
+    assert single.reset(seed=0)[1]["layout"] == whole.reset(seed=0)[1]["layout"][4]
+    assert single.reset(options={"layout": 7})[1]["layout"] == 7
     layouts = [[env.reset(seed=seed)[1]["layout"].tolist() for seed in (0, 1)] for env in (whole, part)]
     assert [[found[4], found[1]] for found in layouts[0]] == layouts[1]
     assert len(set(layouts[0][0])) > 3 and layouts[0][0] != layouts[0][1]
@@ -208,12 +223,6 @@ def _stepped(**options: Any) -> MissionVectorEnv:
     return env
 
 
-def _ended() -> None:
-    env = _stepped(autoreset_mode="Disabled")
-    env.waiting[1] = True
-    env.step(np.tile(REST, (2, 1)))
-
-
 @pytest.mark.parametrize(
     ("wrong", "field"),
     [
@@ -230,7 +239,8 @@ def _ended() -> None:
         (lambda: _stepped().step(np.full((2, 4), np.nan)), "actions"),
         (lambda: _stepped().reset(seed=[1]), "seed"),
         (lambda: _stepped().reset(options={"reset_mask": np.zeros(2, bool)}), "options.reset_mask"),
-        (_ended, "step"),
+        (lambda: _stepped().reset(options={"layout": np.array([0, 2])}), "options.layout"),
+        (lambda: _stepped().reset(options={"layout": np.array([0.0, 1.0])}), "options.layout"),
         (lambda: PlannerPolicy(_stepped(control="rotors")), "env"),
         (lambda: PlannerPolicy(MissionVectorEnv(2, problem=far(), mission=mission()))(), "env"),
     ],

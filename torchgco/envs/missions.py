@@ -65,7 +65,8 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
         nearest: how many obstacles are observed, up to `sight` m away.
         max_rate: bound of the body rates, rad/s.
         ids: of the environments, at least 0; None: 0 to B-1.
-        autoreset_mode: as Gymnasium defines it.
+        autoreset_mode: as Gymnasium defines it; with "Disabled" an environment that has ended rests until it is reset,
+            and repeats how it has ended.
 
     Raises:
         InputError: what can't be flown: see `Episodes`; a field out of its range.
@@ -99,6 +100,7 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             self.episodes = Episodes(mission, problem, num_envs, control)
         self._spaces(control, max_rate)
         self.waiting = np.zeros(num_envs, bool)  # has ended, and begins anew with the next step or reset
+        self._ended = np.full(num_envs, FLYING)  # how it has
         self._streams: list[np.random.Generator] = []
 
     def _spaces(self, control: Control, max_rate: float) -> None:
@@ -120,14 +122,17 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode in every environment, or in those of `options["reset_mask"]`, (B,) bool.
+        """Begin an episode in every environment.
 
         Args:
             seed: of all environments, or one for each; None: each goes on with its own draws, at first with some of the
                 system.
+            options: `reset_mask`, (B,) bool: the environments to begin anew; `layout`, (B,) whole numbers: the rows of
+                the problems that they fly then. None: all, and those that are drawn.
 
         Raises:
-            InputError: as many seeds or as long a mask as there aren't environments.
+            InputError: seeds, masks or layouts of another number than there are environments, layouts that can't be
+                flown.
         """
         seeds = list(seed) if isinstance(seed, Sequence) else [seed] * self.num_envs
         if len(seeds) != self.num_envs:
@@ -139,6 +144,7 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
                 raise InputError("options.reset_mask", f"({self.num_envs},) bool, at least one True", mask)
             rows = mask.nonzero()[0]
+        layouts = self._layouts_of(options)
         entropy = None if self._streams else np.random.SeedSequence().entropy
         streams = self._streams or [stream(entropy, number) for number in self.ids]
         for row in rows:
@@ -148,15 +154,14 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             rows = np.arange(self.num_envs)  # all have to be somewhere
         self._streams = streams
         with computing_on(CPU):
-            self._begin(rows)
-            return self._observed(), self._info(self._outcomes(np.full(self.num_envs, FLYING)), rows)
+            self._begin(rows, layouts)
+            return self._observed(), self._info(np.full(self.num_envs, FLYING), rows)
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly a control period; see the class.
 
         Raises:
-            InputError: before the first `reset`, actions of another shape or that aren't finite, with "Disabled" an
-                environment that has ended.
+            InputError: before the first `reset`, actions of another shape or that aren't finite.
         """
         waiting = self.waiting.copy()
         with computing_on(CPU):
@@ -164,26 +169,26 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             before = self.episodes.distance()
             outcome = self.episodes.fly(action, torch.from_numpy(waiting)).numpy()
             after = self.episodes.distance()
-            reward = (before - after).numpy() + BONUS * _bonus(outcome)
-            terminated = outcome != FLYING
-            truncated = ~terminated & ~waiting & (self.episodes.step >= self.episodes.steps).numpy()
-            done, info = terminated | truncated, dict[str, Any]()
-            outcomes = self._outcomes(outcome, truncated)
-            self.waiting = done.copy()
-            anew = waiting
-            if self.autoreset_mode is AutoresetMode.SAME_STEP and done.any():
-                info, anew = self._final(done, outcomes), done
+            reward = np.where(waiting, 0.0, (before - after).numpy() + BONUS * _bonus(outcome))
+            over = (self.episodes.step >= self.episodes.steps).numpy() & (outcome == FLYING)
+            outcome = np.where(over, int(Outcome.TIMEOUT), outcome)
+            anew, info = waiting, dict[str, Any]()
+            if self.autoreset_mode is AutoresetMode.DISABLED:
+                anew, outcome = np.zeros_like(waiting), np.where(waiting, self._ended, outcome)
+            elif self.autoreset_mode is AutoresetMode.NEXT_STEP:
+                outcome = np.where(waiting, FLYING, outcome)
+            terminated, truncated = (outcome != FLYING) & (outcome != Outcome.TIMEOUT), outcome == Outcome.TIMEOUT
+            self.waiting, self._ended = outcome != FLYING, outcome
+            if self.autoreset_mode is AutoresetMode.SAME_STEP and self.waiting.any():
+                info, anew = self._final(self.waiting, outcome), self.waiting.copy()
             if anew.any():
                 self._begin(anew.nonzero()[0])
-                reward, outcomes = np.where(waiting, 0.0, reward), np.where(anew, FLYING, outcomes)
-            return self._observed(), reward, terminated, truncated, self._info(outcomes) | info
+            return self._observed(), reward, terminated, truncated, self._info(np.where(anew, FLYING, outcome)) | info
 
     def _checked(self, actions: Any) -> Tensor:
         """Actions (B, 4) within their bounds."""
         if not self._streams:
             raise InputError("step", "a reset before", "none")
-        if self.waiting.any() and self.autoreset_mode is AutoresetMode.DISABLED:
-            raise InputError("step", "a reset of environments that have ended", self.waiting.nonzero()[0].tolist())
         values = np.asarray(actions, np.float64)
         if values.shape != (self.num_envs, 4):
             raise InputError("actions", f"numbers of shape ({self.num_envs}, 4)", values.shape)
@@ -191,10 +196,21 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             raise InputError("actions", "finite numbers", "NaN or infinity")
         return torch.from_numpy(values).clamp(*self._bounds)
 
-    def _begin(self, rows: np.ndarray) -> None:
-        """Another episode for the environments `rows` (b,)."""
+    def _layouts_of(self, options: dict[str, Any] | None) -> np.ndarray | None:
+        """The rows of the problems (B,) that are asked for."""
+        if options is None or "layout" not in options:
+            return None
+        layouts = np.asarray(options["layout"])
+        known = layouts.shape == (self.num_envs,) and layouts.dtype.kind in "iu"
+        if not known or not np.isin(layouts, self.episodes.layouts.numpy()).all():
+            raise InputError("options.layout", f"({self.num_envs},) rows of problems with a free start", layouts)
+        return layouts.astype(np.int64)
+
+    def _begin(self, rows: np.ndarray, layouts: np.ndarray | None = None) -> None:
+        """Another episode for the environments `rows` (b,), of `layouts` (B,) or drawn ones."""
         draws = [self._streams[row].integers((len(self.episodes.layouts), 2**62)) for row in rows]
         at = self.episodes.layouts[torch.tensor([int(first) for first, _ in draws])]
+        at = at if layouts is None else torch.from_numpy(layouts[rows])
         seeds, ids = [int(seed) for _, seed in draws], [self.ids[row] for row in rows]
         self.episodes.begin(torch.from_numpy(rows), at, seeds, ids)
         self.waiting[rows] = False
@@ -205,10 +221,6 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             flying.measured(), flying.goal, flying.contact.obstacles, flying.airframe, self.nearest, self.sight
         )
         return seen.to(torch.float32).numpy()
-
-    @staticmethod
-    def _outcomes(outcome: np.ndarray, truncated: np.ndarray | None = None) -> np.ndarray:
-        return outcome if truncated is None else np.where(truncated, int(Outcome.TIMEOUT), outcome)
 
     def _info(self, outcome: np.ndarray, rows: np.ndarray | None = None) -> dict[str, Any]:
         """Outcome, layout and distance, and for which environments they are given: all, or `rows`."""
@@ -261,13 +273,18 @@ class MissionEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """See `MissionVectorEnv.reset`."""
         super().reset(seed=seed)
-        seen, info = self.vector.reset(seed=seed)
+        seen, info = self.vector.reset(seed=seed, options=_batched(options))
         return seen[0], _only(info)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """See `MissionVectorEnv.step`."""
         seen, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
         return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), _only(info)
+
+
+def _batched(options: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The options of a single environment as a vector's."""
+    return None if options is None or "layout" not in options else {"layout": np.asarray(options["layout"])[None]}
 
 
 def _only(info: dict[str, Any]) -> dict[str, Any]:
