@@ -11,6 +11,7 @@ import argparse
 import math
 import time
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,14 +31,15 @@ class Policy(nn.Module):
     def __init__(self, seen: Tensor, action: Tensor, width: int = 128) -> None:
         super().__init__()
         sizes = [seen.shape[1], width, width, action.shape[1]]
-        layers = [part for a, b in zip(sizes, sizes[1:], strict=False) for part in (nn.Linear(a, b), nn.Tanh())]
+        layers = [part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), nn.Tanh())]
         self.net = nn.Sequential(*layers[:-1])
         for name, values in (("seen", seen), ("action", action)):
             self.register_buffer(f"{name}_mean", values.mean(0))
             self.register_buffer(f"{name}_spread", values.std(0).clamp(min=1e-3))
 
     def forward(self, seen: Tensor) -> Tensor:
-        return self.net(((seen - self.seen_mean) / self.seen_spread).clamp(-5, 5)) * self.action_spread + self.action_mean
+        scaled = ((seen - self.seen_mean) / self.seen_spread).clamp(-5, 5)
+        return self.net(scaled) * self.action_spread + self.action_mean
 
     def __call__(self, seen: Any) -> Any:
         if isinstance(seen, Tensor):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import socket
 import struct
+from contextlib import suppress
 
 import numpy as np
 
@@ -69,7 +70,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with suppress(KeyboardInterrupt):
         main()
-    except KeyboardInterrupt:
-        pass

@@ -1,4 +1,4 @@
-"""A plant over UDP: the documented message, the example's simulator, and a simulator that is gone or talks otherwise."""
+"""A plant over UDP: the documented message, the example's simulator, one that is gone or talks otherwise."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_vehicles_keep_their_numbers() -> None:
 
 def test_the_examples_simulator() -> None:
     """A process of its own, which imports nothing of ours, flies as the paper's quadrotor does."""
-    assert "torchgco" not in {line.split()[1].partition(".")[0] for line in SIMULATOR.read_text().splitlines() if line.startswith(("import ", "from "))}
+    assert "import torchgco" not in SIMULATOR.read_text() and "from torchgco" not in SIMULATOR.read_text()
     process = subprocess.Popen([sys.executable, str(SIMULATOR), "--port", "0"], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -110,7 +110,7 @@ def test_nobody_answers() -> None:
             mission(plant=RemotePlant(port=port, timeout=0.1)).fly(varied(1))
     assert str(error.value) == f"plant: expected an answer of a simulator at 127.0.0.1:{port} within 0.1 s, got none"
     assert time.monotonic() - began < 30
-    with pytest.raises(InputError, match="plant: expected an answer of a simulator at 127.0.0.1:"):  # closed by now
+    with pytest.raises(InputError, match="plant: expected an answer of a simulator at"):  # closed by now
         RemotePlant(port=port, timeout=0.1).advance(*random_states(1))
 
 

@@ -24,8 +24,8 @@ class PlannerPolicy:
         policy = PlannerPolicy(env)
         action = policy(observation)
 
-    It knows the whole state and all obstacles: of the observation it reads nothing. Its draws depend on how often it has
-    been called.
+    It knows the whole state and all obstacles: it reads nothing of the observation. Its draws depend on how often it
+    has been called.
 
     Args:
         env: whose missions it plans, with control "rates"; wrapped ones, too.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco import presets
 from torchgco.base.errors import InputError
-from torchgco.base.options import Above, AtLeast, AtMost, Count, Meters, NonNegative, check_value
+from torchgco.base.options import Above, AtLeast, AtMost, Count, Meters, check_value
 from torchgco.base.shapes import computing_on
 from torchgco.dynamics.quadrotor import ROTORS, Airframe
 from torchgco.envs import observation
@@ -30,7 +30,6 @@ from torchgco.scenarios.vehicle import Vehicle
 FORESTS = 1024  # layouts of the paper's mission that are flown where no problems are given
 BONUS = 10.0
 MAX_RATE = 5.0  # rad/s, of the paper's plans
-WORDS = tuple[str, ...]
 
 
 def forests(count: int = FORESTS, seed: int = 0) -> Problem:
@@ -106,7 +105,10 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
     def _spaces(self, control: Control, max_rate: float) -> None:
         """The spaces, and the names and units of their components."""
         frame, n = self.episodes.airframe, len(observation.names(self.nearest))
-        self.observation_names, self.observation_units = observation.names(self.nearest), observation.units(self.nearest)
+        self.observation_names, self.observation_units = (
+            observation.names(self.nearest),
+            observation.units(self.nearest),
+        )
         if control == "rates":
             self.action_names, self.action_units = ("wx", "wy", "wz", "a"), (*["rad/s"] * 3, "m/s^2")
             low, high = ([*[sign * max_rate] * 3, a] for sign, a in zip((-1, 1), frame.accelerations, strict=True))
@@ -226,7 +228,11 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
         """Outcome, layout and distance, and for which environments they are given: all, or `rows`."""
         given = np.zeros(self.num_envs, bool)
         given[slice(None) if rows is None else rows] = True
-        values = {"outcome": outcome, "layout": self.episodes.layout.numpy(), "distance": self.episodes.distance().numpy()}
+        values = {
+            "outcome": outcome,
+            "layout": self.episodes.layout.numpy(),
+            "distance": self.episodes.distance().numpy(),
+        }
         found = dict[str, Any]()
         for name, value in values.items():
             found[name], found[f"_{name}"] = np.where(given, value, np.zeros_like(value)), given.copy()
@@ -263,7 +269,7 @@ class MissionEnv(gymnasium.Env):
         InputError: as `MissionVectorEnv`.
     """
 
-    metadata = {"render_modes": []}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
     def __init__(self, env_id: int = 0, **options: Any) -> None:
         self.vector = MissionVectorEnv(1, ids=[env_id], autoreset_mode=AutoresetMode.DISABLED, **options)

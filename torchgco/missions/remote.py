@@ -12,8 +12,8 @@ A message is one datagram, little-endian: a head of 24 bytes and a row of float6
 
 A row that is sent has 25 numbers: the vehicle's number among the mission's; its state of 17, position (m), velocity
 (m/s), quaternion from the body's axes to the world's (scalar first), body rates (rad/s), thrusts of the rotors (N); the
-commanded rotor speeds (4, rpm); the force of the wind (3, N, in the world's axes). A row of the answer has the 17 of the
-state a time step later.
+commanded rotor speeds (4, rpm); the force of the wind (3, N, in the world's axes). A row of the answer has the 17 of
+the state a time step later.
 """
 
 from __future__ import annotations

@@ -52,7 +52,11 @@ def write_bag(place: Path, columns: Mapping[str, np.ndarray], position: Sequence
     store = get_typestore(Stores.ROS2_HUMBLE)
     made = _Messages(store.types, columns, position)
     with Writer(place, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag:
-        for topic, messages in (("/path", made.path()), ("/trajectory", made.trajectory()), ("/odometry", made.odometry())):
+        for topic, messages in (
+            ("/path", made.path()),
+            ("/trajectory", made.trajectory()),
+            ("/odometry", made.odometry()),
+        ):
             connection = bag.add_connection(topic, messages[0][1].__msgtype__, typestore=store)
             for nanoseconds, message in messages:
                 bag.write(connection, nanoseconds, store.serialize_cdr(message, message.__msgtype__))
@@ -88,7 +92,9 @@ class _Messages:
         return self._of("geometry_msgs/msg/Quaternion", x, y, z, w)
 
     def _pose(self, k: int) -> Any:
-        return self._of("geometry_msgs/msg/Pose", self._of("geometry_msgs/msg/Point", *self.p[k].tolist()), self._attitude(k))
+        return self._of(
+            "geometry_msgs/msg/Pose", self._of("geometry_msgs/msg/Point", *self.p[k].tolist()), self._attitude(k)
+        )
 
     def _twist(self, linear: np.ndarray, angular: np.ndarray) -> Any:
         return self._of("geometry_msgs/msg/Twist", self._vector(linear), self._vector(angular))
@@ -126,7 +132,9 @@ def _stacked(columns: Mapping[str, np.ndarray], labels: Sequence[str]) -> np.nda
     return np.stack([*found, *[np.zeros_like(found[0])] * (3 - len(found))], axis=1)
 
 
-def _or_slope(columns: Mapping[str, np.ndarray], labels: Sequence[str], values: np.ndarray, t: np.ndarray) -> np.ndarray:
+def _or_slope(
+    columns: Mapping[str, np.ndarray], labels: Sequence[str], values: np.ndarray, t: np.ndarray
+) -> np.ndarray:
     """The columns that are there, (T, 3); without the first one, how `values` change."""
     known = [label for label in labels if label in columns]
     return _stacked(columns, known) if labels[0] in known else _slope(values, t)

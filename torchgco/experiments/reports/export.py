@@ -1,4 +1,4 @@
-"""`torchgco-export RUN`: the trajectories of a finished study as CSV files with names and units, or as bags of ROS 2."""
+"""`torchgco-export RUN`: the trajectories of a finished study, as CSV with names and units or as bags of ROS 2."""
 
 from __future__ import annotations
 
