@@ -16,10 +16,15 @@ from torchgco.envs.missions import MissionVectorEnv
 from torchgco.missions.mission import CPU
 from torchgco.missions.pilot import SEED_STEP
 from torchgco.missions.planner import OTHERS, TRAJECTORY, Plan, Planner
+from torchgco.missions.tracker import RATES
+
+AHEAD = 2  # the knot of a plan that is asked for
 
 
 class PlannerPolicy:
-    """Plans from the measured state in every period, and asks for what the plan has a period later.
+    """Plans from the measured state in every period, and asks for what the plan has two periods later.
+
+    At a plan's second knot the body rates are those that the rotors lead to in any case, see `FirstStepRates`.
 
         policy = PlannerPolicy(env)
         action = policy(observation)
@@ -62,7 +67,7 @@ class PlannerPolicy:
             for rows, anew in ((begun, True), (~begun & ~waiting, False)):
                 at = rows.nonzero().flatten()
                 if len(at) > 0:
-                    action[at] = self._planned(x, at, anew).X[:, 1, 10:14]
+                    action[at] = _asked(self._planned(x, at, anew).X)
             self._number, self._step = torch.where(waiting, self._number, flying.number), self._step + 1
             return action.clamp(*self.env._bounds).to(torch.float32).numpy()
 
@@ -81,6 +86,11 @@ class PlannerPolicy:
             put(getattr(self._plan, name), rows, getattr(plan, name))
         self._plan = replace(self._plan, model=flying.problem.dynamics.take(flying.layout), step=plan.step)
         return plan
+
+
+def _asked(X: Tensor) -> Tensor:
+    """Body rates and thrust accelerations (b, 4) of plans X (b, N+1, 14)."""
+    return X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
 
 
 def _room(plan: Plan, B: int) -> Plan:

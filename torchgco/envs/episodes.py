@@ -99,8 +99,8 @@ class Episodes:
         """Fly a control period; returns how vehicles have ended in it, (B,) int64, `FLYING` for those that haven't.
 
         Args:
-            action: (B, 4): body rates, rad/s, and thrust acceleration, m/s^2, to be reached at the end of the period;
-                or with `control` "rotors" the rotors' speeds, rpm, that are held.
+            action: (B, 4), held for the period: body rates, rad/s, and thrust acceleration, m/s^2, which the tracker
+                follows; or with `control` "rotors" the rotors' speeds, rpm.
             waiting: those that stay as they are, (B,) bool.
         """
         seen, force = self.measured(), self._now(self._force)
@@ -115,7 +115,7 @@ class Episodes:
 
     def _reference(self, seen: Tensor, action: Tensor) -> Reference:
         X = planning_state(seen, self.airframe).unsqueeze(1).repeat(1, 2, 1)
-        X[:, 1, RATES.start :] = action
+        X[..., RATES.start :] = action.unsqueeze(1)
         return Reference(X, self.period, self.airframe)
 
     def _tracked(self, seen: Tensor, reference: Reference, offset: float) -> Tensor:

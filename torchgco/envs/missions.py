@@ -46,9 +46,9 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
     CPU in double precision.
 
     Observations are float32, of `observation_names` with `observation_units`; see `observation.names`. Actions are
-    float32 with `action_names`, `action_units`, cut off to the space's bounds: with control "rates" the body rates and
-    the thrust acceleration to be reached at the end of the period, which the mission's tracker makes rotor speeds of;
-    with "rotors" rotor speeds that are held. The reward is the way towards the goal in m, plus 10 at the goal, minus
+    float32 with `action_names`, `action_units`, cut off to the space's bounds, and held for the period: with control
+    "rates" body rates and thrust acceleration, which the mission's tracker makes rotor speeds of; with "rotors" the
+    rotor speeds. The reward is the way towards the goal in m, plus 10 at the goal, minus
     10 in contact or lost.
 
     `info` has for each environment its `layout` (row of the problems), `distance` from the goal in m, and `outcome`: an
