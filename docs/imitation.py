@@ -92,10 +92,10 @@ def main() -> None:
     """Train, fly, and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--envs", type=int, default=24)
-    parser.add_argument("--steps", type=int, default=100, help="control periods of a round")
+    parser.add_argument("--steps", type=int, default=80, help="control periods of a round")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--epochs", type=int, default=40)
-    parser.add_argument("--layouts", type=int, default=64, help="forests in which the two are compared")
+    parser.add_argument("--epochs", type=int, default=200)
+    parser.add_argument("--layouts", type=int, default=32, help="forests in which the two are compared")
     options = parser.parse_args()
     torch.manual_seed(0)
     env = MissionVectorEnv(options.envs, forests(512, TRAINED))
