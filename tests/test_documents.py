@@ -245,6 +245,8 @@ def registries() -> Iterator[None]:
 def test_every_python_block_runs(page: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if page.name == "receding.md" and find_compiler() is None:
         pytest.skip("no C compiler: its loops are of compiled problems")
+    if page.name == "gym.md":
+        pytest.importorskip("gymnasium")
     monkeypatch.chdir(tmp_path)  # where a page may write
     with warnings.catch_warnings():
         if find_compiler() is not None:
