@@ -2,7 +2,8 @@
 
 import pytest
 
-LONG = ("maps.ipynb", "missions.ipynb")  # 20 s of processor time each; what they show is tested elsewhere, too
+# 20 to 40 s of processor time each; what they show is tested elsewhere, too
+LONG = ("learning.ipynb", "maps.ipynb", "missions.ipynb")
 
 
 @pytest.hookimpl(tryfirst=True)

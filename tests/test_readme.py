@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import pytest
 import torch
 
 from torchgco import Problem, Solution, Status, judge
@@ -11,7 +12,8 @@ ROOT = Path(__file__).resolve().parents[1]
 README, WORDS = (ROOT / "README.md").read_text(), (ROOT / "docs" / "words.md").read_text()
 
 
-def test_the_python_example() -> None:
+def test_the_python_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # it writes a picture
     (code,) = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
     names: dict[str, object] = {}
     exec(code, names)

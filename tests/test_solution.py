@@ -153,9 +153,9 @@ def test_torch_saves_and_loads_a_solution_without_running_code(tmp_path) -> None
 def test_transforms_of_pytorch_are_refused_by_name() -> None:
     problem, U0 = planar_batch(B=2, N=8)
     twice = torch.stack((U0, U0))
-    with pytest.raises(InputError, match=r"solve: expected a call outside of torch\.func\.vmap"):
+    with pytest.raises(InputError, match=r"solve: expected a call outside of torch\.func:"):
         torch.func.vmap(lambda U: torchgco.solve(problem, U, solver="hold").cost)(twice)
-    with pytest.raises(InputError, match=r"Problem: expected a call outside of torch\.func\.vmap"):
+    with pytest.raises(InputError, match=r"Problem: expected a call outside of torch\.func:"):
         torch.func.vmap(lambda x: Problem(problem.dynamics, problem.cost, [], x, 8).x0)(problem.x0[None])
     compiled = torch.compile(lambda U: torchgco.solve(problem, U, solver="hold").cost)
     with pytest.raises(InputError, match=r"solve: expected a call outside of torch\.compile") as refused:

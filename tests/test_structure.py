@@ -29,7 +29,7 @@ LAYERS = [
     ["view"],
     ["baselines"],
     ["presets"],
-    ["api", "experiments"],
+    ["api", "envs", "experiments"],
     ["compiled"],
 ]
 MODULES = sorted(

@@ -27,7 +27,7 @@ from torchgco.problem.in_time import at_times, guessing_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
-from torchgco.sensitivity import asks_for_gradients, attached
+from torchgco.sensitivity import asks_for_gradients, attached, check_smoothing
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.watching import Watcher
@@ -53,6 +53,7 @@ def solve(
     X0: Tensor | None = None,
     record: bool = False,
     verbose: bool | None = None,
+    smoothing: float | None = None,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -77,22 +78,22 @@ def solve(
             says more. The results are the same.
         verbose: True: a line on stdout for every row of the solver's table that worked on some problem, and one at the
             end. None: in a terminal and in a notebook a bar on stderr, once it takes 2 s; False: nothing.
+        smoothing: mu > 0 in units of the cost: the minimum of J_var - mu sum log(-c) over all rows c <= 0 near the
+            solver's, FEASIBLE, whose gradients are smooth; `solution.reason` where none is found. None: the solver's.
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
             states X0, or an argument is of another kind or out of its range.
     """
     check_untransformed("solve")
-    problem = current_problem(problem)
+    asked = problem = current_problem(problem)
     warm = _checked(warm)
-    asked = problem
-    differentiates = asks_for_gradients(problem)
+    differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
     solver = "gco" if solver is None else solver
     name = solver if isinstance(solver, str) else None
     X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
-    problem, U0 = _start(problem, warm, solver, U0)
-    multipliers = None if warm is None else warm.multipliers
+    (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
     if warm is None and (told := short_horizons(problem)) is not None:
         warnings.warn(told, HorizonWarning, stacklevel=2)
@@ -106,7 +107,7 @@ def solve(
     if found.account is not None:
         found = replace(found, account=found.account.asked(asked, name))
     found = _warned_of_contact(problem, found)
-    return attached(asked, problem, found) if differentiates else found
+    return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
 def compare(

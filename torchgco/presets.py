@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 from torchgco.base.errors import InputError, shown
 from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI, PathPursuit
@@ -108,8 +109,8 @@ def gco_max(space: Space) -> Restarts:
 def gco_exact(space: Space) -> Restarts:
     """`gco` with its last steps taken to a violation and KKT residual of 1e-8; in float64.
 
-    The tolerance of the interior point is smaller: it counts in units of the cost's steepest slope or curvature, while
-    a residual is a share of the terms that cancel in a control's slope, which may be far smaller.
+    The tolerance of the interior point is smaller, since it is measured after the cost's gradient has been scaled to 1.
+    The certified residual is relative to the terms that cancel in a control's gradient, which may be far smaller.
     """
     return replace(gco(space), interior=InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9))
 
@@ -208,7 +209,13 @@ def named(name: str, space: Space) -> Solver:
     """The solver of a preset by its name; InputError where there is none."""
     if name not in PRESETS:
         raise InputError("solver", f"one of {', '.join(PRESETS)}, or a solver", shown(name))
-    return PRESETS[name](space)
+    return _made(PRESETS[name], 2 if _in_the_plane(space) else 3)
+
+
+@cache
+def _made(preset: Callable[[Space], Solver], dimension: int) -> Solver:
+    """Solvers are immutable, and depend on the dimension alone: making one takes a millisecond."""
+    return preset(dimension)
 
 
 def _paths(space: Space) -> Paths:

@@ -141,7 +141,8 @@ class Solution:
 
     def detach(self) -> Solution:
         """The same numbers without gradients; itself where it has none."""
-        live = {"X": self.X, "U": self.U, "cost": self.cost, "multipliers": self.multipliers}
+        live = {"X": self.X, "U": self.U, "cost": self.cost, "multipliers": self.multipliers,
+                "times": self.times}  # fmt: skip
         parts = {name: without_gradients(part) for name, part in live.items()}
         return self if all(parts[name] is part for name, part in live.items()) else replace(self, **parts)
 
@@ -246,12 +247,13 @@ class Solution:
         if self.horizon is not None:
             columns["horizon"] = self.horizon.cpu().numpy()
         if self.times is not None:
-            columns["duration"] = self.duration.cpu().numpy()
+            columns["duration"] = self.duration.detach().cpu().numpy()
         if self.account is not None and self.account.kernels is not None:
             columns["kernels"] = self.account.kernels
         if problem is not None:
             start = None if problem.free_start is None else self.X[:, 0].detach()
-            columns |= judged(problem, self.U.detach(), start, self.times if problem.time is not None else None)
+            times = self.detach().times if problem.time is not None else None
+            columns |= judged(problem, self.U.detach(), start, times)
         return pd.DataFrame(columns).rename_axis("element")
 
     def trajectories(self, rate: float | None = None, problem: Problem | None = None) -> pd.DataFrame:
@@ -275,7 +277,7 @@ class Solution:
         own = problem if problem is not None else None if self.account is None else self.account.problem
         if own is not None:
             check_shape(self.X, (own.B, own.N + 1, own.n), "problem: solution.X")
-        t, frames = self.t if problem is None or self.times is not None else times(problem), []
+        t, frames = self.detach().t if problem is None or self.times is not None else times(problem), []
         for b in range(len(self)):
             last = self.U.shape[1] if self.horizon is None else int(self.horizon[b])
             X, U = self.X[b, : last + 1].detach(), self.U[b, :last].detach()
@@ -308,7 +310,7 @@ class Solution:
 
         check_shape(self.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
         check_shape(self.U, (problem.B, problem.N, problem.m), "problem: solution.U")
-        rows = worst_rows(problem, self.X.detach(), self.U.detach(), self.times)
+        rows = worst_rows(problem, self.X.detach(), self.U.detach(), self.detach().times)
         return pd.DataFrame(rows).rename_axis("element")
 
     if TYPE_CHECKING:  # pages and derivatives know solutions: `torchgco` adds these methods
@@ -324,9 +326,9 @@ class Solution:
         if self.horizon is not None:
             arrays["horizon"] = self.horizon.cpu().numpy()
         with suppress(InputError):  # dynamics without a time step
-            arrays["t"] = self.t.cpu().numpy()
+            arrays["t"] = self.t.detach().cpu().numpy()
         if self.times is not None:
-            arrays["times"] = self.times.cpu().numpy()
+            arrays["times"] = self.times.detach().cpu().numpy()
         if self.account is not None and self.account.kernels is not None:
             arrays["kernels"] = np.array(self.account.kernels)
         for i, lam in enumerate(self.multipliers.lam):

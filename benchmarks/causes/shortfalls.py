@@ -46,7 +46,7 @@ CAUSES = {
     "no path sought": "a candidate does, but the first solve was never caught, so that `gco` sought no path",
     "a later path": "a candidate does, but its path comes after those that `gco` sought",
     "dropped as tracked": "its path was sought, but cheaper tracked candidates were relaxed in its place",
-    "dropped as relaxed": "it was relaxed, but was then unsound, or dearer than those taken",
+    "dropped as relaxed": "it was relaxed, but was then unsound, or more expensive than those taken",
     "lost in the solve": "it was compared or chosen, and the solve ended elsewhere",
 }
 FATES = ("dropped as tracked", "dropped as relaxed", "lost in the solve")  # of a sought candidate

@@ -16,12 +16,14 @@ import torch
 from torch import Tensor
 
 import torchgco
+from benchmarks.families.gradient_peers import Found, table
 from benchmarks.lib import DATA
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import markdown, share
 from torchgco import (
     ControlBounds,
     FunctionDynamics,
+    Goal,
     InteriorPoint,
     Layouts,
     Problem,
@@ -43,6 +45,7 @@ RELATIVE = (
     "vehicle radius",
     "rate constant",
     "thrust constant",
+    "goal radius",
 )  # moved by a share of themselves
 TIGHT = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8)
 
@@ -56,10 +59,12 @@ class Set:
     make: Callable[[Numbers], Problem]
     numbers: dict[str, Tensor]
     U0: Tensor | None
+    smoothing: float | None = None
+    kinds: tuple[str, ...] | None = None  # that are moved; None: all
 
 
-def flown(family: str, model: str, scenario: str, count: int, seed: int | None) -> Set:
-    """Layouts of a family: the public ones, or drawn with a seed."""
+def flown(family: str, model: str, scenario: str, count: int, seed: int | None, required: bool = False) -> Set:
+    """Layouts of a family: the public ones, or drawn with a seed; with a goal that is stated, or `required`."""
     setup = compose([f"model={model}", f"scenario={scenario}"])
     public = Layouts.load(DATA / f"{family}.npz") if seed is None else None
     task = setup.vehicle.task(setup.scenario.draw(list(range(count)), seed) if public is None else public)
@@ -72,6 +77,8 @@ def flown(family: str, model: str, scenario: str, count: int, seed: int | None) 
         "Qf": each(cost.Qf, whole.n), "x_ref": each(cost.xf_ref, whole.n), "u_ref": each(cost.u_ref[:, 0], whole.m),
         "lower bound": each(bounds.lower, whole.m), "upper bound": each(bounds.upper, whole.m),
     }  # fmt: skip
+    if required:
+        numbers |= {"goal": whole.goal.position, "goal radius": whole.goal.radius}
     if isinstance(whole.dynamics, QuadrotorPlanning):
         numbers |= {name: torch.full((B,), 1.5, dtype=D) for name in ("rate constant", "thrust constant")}
 
@@ -83,7 +90,8 @@ def flown(family: str, model: str, scenario: str, count: int, seed: int | None) 
         cost = QuadraticCost(*weights, x_ref=th["x_ref"].unsqueeze(1), u_ref=th["u_ref"].unsqueeze(1))
         around = Spheres(th["centres"], th["radii"], th["vehicle radius"])
         limits = ControlBounds(th["lower bound"], th["upper bound"])
-        return Problem(model, cost, [around, limits], th["x0"], whole.N, whole.goal)
+        goal = Goal(th["goal"], th["goal radius"], required=True) if required else whole.goal
+        return Problem(model, cost, [around, limits], th["x0"], whole.N, goal)
 
     return Set(make, {name: part.clone() for name, part in numbers.items()}, task.U0)
 
@@ -126,7 +134,7 @@ def measured(of: Set, aim: tuple[Tensor, Tensor]) -> Measured:
         problem = of.make(leaves)
         began = time.process_time()
         with torch.set_grad_enabled(gradients):
-            solution = torchgco.solve(problem, of.U0, verbose=False)
+            solution = torchgco.solve(problem, of.U0, smoothing=of.smoothing, verbose=False)
         times.append(time.process_time() - began)
     total, values = along(solution, aim).sum(), list(leaves.values())
     began = time.process_time()
@@ -149,7 +157,10 @@ def errors(of: Set, found: Measured, aim: tuple[Tensor, Tensor], name: str) -> T
         ends = []
         for sign in (1, -1):
             problem = of.make({**of.numbers, name: numbers + sign * h * direction})
-            ends.append(TIGHT.solve(problem, start.U, warm=start.multipliers, X0=start.X))
+            if of.smoothing is None:
+                ends.append(TIGHT.solve(problem, start.U, warm=start.multipliers, X0=start.X))
+            else:
+                ends.append(torchgco.solve(problem, solver=TIGHT, warm=start, smoothing=of.smoothing, verbose=False))
         change = (along(ends[0], aim) - along(ends[1], aim)) / (2 * h)
         size = ((ends[0].X - ends[1].X) / (2 * h)).flatten(1).norm(dim=1)
         error = (change - mine).abs() / torch.maximum(mine.abs(), 0.01 * size).clamp(min=1e-3)
@@ -164,12 +175,33 @@ def unit(*shape: int) -> Tensor:
     return drawn / drawn.flatten(1).norm(dim=1).view(-1, 1, 1)
 
 
+def differentiated(th: Numbers, aim: Tensor) -> Found:
+    """Gradients of controls by starts and offsets of the bounded problems, and seconds."""
+    leaves = {name: part.clone().requires_grad_() for name, part in th.items()}
+    problem = bounded_lq(len(th["x0"])).make(leaves)
+    began = time.process_time()
+    U = torchgco.solve(problem, verbose=False).U
+    forward, middle = time.process_time() - began, time.process_time()
+    slopes = torch.autograd.grad((aim * U).sum(), [leaves["x0"], leaves["b"]])
+    return slopes, forward, time.process_time() - middle
+
+
 def text(count: int, seed: int) -> str:
     """The tables."""
+    forest, lq = flown("forest30", "quadrotor", "forest", count, seed), bounded_lq()
+    trap = flown("planar_trap", "planar", "planar_trap", 32, None)
+    required = flown("forest30", "quadrotor", "forest", count, seed, True)
+    few, cost = ("x0", "centres", "Q", "upper bound"), 12_500.0  # its median
+    soft = {
+        f"forest30, smoothing {mu:.0e} of the cost": replace(forest, smoothing=mu * cost, kinds=few)
+        for mu in (1e-8, 1e-6)
+    }
     sets = {
-        f"forest30, {count} drawn": flown("forest30", "quadrotor", "forest", count, seed),
-        "planar_trap, public": flown("planar_trap", "planar", "planar_trap", 32, None),
-        "bounded LQ, (N, n, m) = (20, 8, 4)": bounded_lq(),
+        f"forest30, {count} drawn": forest,
+        "the same, the goal required": replace(required, kinds=("goal", "goal radius", "x0", "centres", "Q")),
+        "planar_trap, public": trap,
+        "bounded LQ, (N, n, m) = (20, 8, 4)": lq,
+        **soft,
     }
     shares, kinds, costs = [], [], []
     for title, of in sets.items():
@@ -184,7 +216,7 @@ def text(count: int, seed: int) -> str:
         costs.append(
             [title, f"{1e3 * f:.0f}", f"{1e3 * r:.0f}", f"{1e3 * b:.0f}", f"{b / f:.1%}", f"{(r + b) / f:.1%}"]
         )
-        for name in of.numbers:
+        for name in of.kinds or of.numbers:
             one = errors(of, found, aim, name)[told]
             below = [int((one < limit).sum()) for limit in (1e-6, 1e-4)]
             kinds.append([title, name, f"{one.median():.0e}", f"{one.max():.0e}", *below, len(one)])
@@ -192,6 +224,7 @@ def text(count: int, seed: int) -> str:
         markdown(["problems", "differentiable", "others"], shares),
         markdown(["problems", "by", "median error", "largest", "below 1e-6", "below 1e-4", "of"], kinds),
         markdown(["problems", "solve, ms", "more, ms", "backward, ms", "backward / solve", "all / solve"], costs),
+        table(differentiated, lq.numbers, 20, 4),
     ])  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """python -m benchmarks.outside.barn_lidar: the worlds of the BARN challenge, seen through a planar lidar while driving.
 
 Nothing is known at first. Every 0.1 s a scan is taken among the true cylinders and marks cells of a map, and a plan to
-the goal is made among the cells that are marked: the former plan, solved on, or a new search by `gco_fast`, then by
+the goal is made among the cells that are marked: the previous plan, solved on, or a new search by `gco_fast`, then by
 `gco`, where that doesn't come through. It holds from the next period on. Where no plan keeps clear on the way that
 braking takes, the robot brakes. The controls are driven in steps of 1 ms, as by `benchmarks.outside.barn`. With --write
 the table goes into benchmarks/results/maps.md.
@@ -144,7 +144,7 @@ class Robot:
         return np.linalg.norm(away, axis=-1).min(axis=1, initial=np.inf)
 
     def step(self, number: int, seed: int) -> bool:
-        """One period: a scan, a plan for the next one, and a stage of the former plan. Returns whether it goes on."""
+        """One period: a scan, a plan for the next one, and a stage of the previous plan. Returns whether it goes on."""
         self.sense(number, seed)
         began = time.process_time()
         u = self.plan[0]

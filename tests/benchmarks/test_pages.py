@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -37,6 +38,16 @@ def test_a_table_replaces_the_one_between_the_marks_of_its_page(tmp_path: Path, 
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     with pytest.raises(ValueError, match="no part between"):
         page.put(file, "barn", "")
+
+
+@pytest.mark.parametrize("file", sorted(command.RESULTS.glob("*.md")), ids=lambda file: file.stem)
+def test_a_page_is_a_question_whose_answer_is_of_the_tables_below(file: Path) -> None:
+    """After a run whose tables replace these, read the answer again and name the new commit in it."""
+    title, answer, *rest = file.read_text().split("\n\n")
+    tables = re.findall(r"^<!-- (.*?) -->$(.*?)^<!-- end \1 -->$", "\n\n".join(rest), re.MULTILINE | re.DOTALL)
+    assert title.startswith("# ") and title.endswith("?") and not answer.startswith(("Generated", "<!--"))
+    named, flown = re.findall(r"\bcommit (\w{7})\b", answer), re.findall(r"\bcommit (\w{7})\b", str(tables))
+    assert set(named) & set(flown), f"the answer is of {named}, the tables are of {flown}"
 
 
 def test_numbers_are_shown_with_their_intervals() -> None:

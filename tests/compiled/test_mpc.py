@@ -14,6 +14,7 @@ import torchgco
 from tests.compiled.test_compiled import CAR, DT, N, bicycle, path
 from torchgco import (
     MPC,
+    MPPI,
     ControlBounds,
     Dynamics,
     FunctionDynamics,
@@ -237,3 +238,17 @@ def test_a_long_loop_calls_no_compiler_and_keeps_its_memory(steps: int, monkeypa
         x = rk4(x, u.numpy(), DT) + 0.02 * random.standard_normal(4) * [0.1, 0.1, 0.05, 0.3]
         before = resident() if k == steps // 3 else before
     assert resident() - before < 2**20
+
+
+def test_a_plan_that_is_held_keeps_the_bounds_of_all_parts() -> None:
+    inf = float("inf")
+    parts = [ControlBounds([-1.0, -inf], [1.0, inf]), ControlBounds([-inf, -0.5], [inf, 0.5])]
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.2, position=slice(0, 2))
+    problem = Problem(model, QuadraticCost([1.0] * 4, [0.1] * 2, [20.0] * 4), parts, [[1.0, 1.0, 0.0, 0.0]], 12)
+    mpc = torchgco.MPC(problem, "interior_point")
+    mpc.step([1.0, 1.0, 0.0, 0.0])
+    u = mpc.step([1.5, 3.0, 0.0, 0.0], max_seconds=1e-9)
+    assert bool(mpc.held.all()) and u.tolist() == [-1.0, -0.5]
+    sampled = torchgco.MPPIController(problem, MPPI(samples=300, covariance=[0.5, 0.5], temperature=0.1))
+    u = sampled.command([1.0, 3.0, 0.0, 0.0])
+    assert bool((torch.as_tensor(u).abs() <= torch.tensor([1.0, 0.5])).all())

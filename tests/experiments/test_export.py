@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+
 import numpy as np
 import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.experiments.commands import HOLD
 from tests.experiments.test_view import MISSION
-from torchgco.experiments.reports import export
+from torchgco.base.errors import InputError
+from torchgco.experiments.reports import bags, export
 from torchgco.missions.tables import STATES
 
 
@@ -49,6 +54,58 @@ def test_missions_as_they_were_flown(run, tmp_path) -> None:
     np.testing.assert_allclose(np.diff(coarse["t [s]"]), 0.025, atol=1e-12)
     q = coarse[["qw", "qx", "qy", "qz"]].to_numpy()
     np.testing.assert_allclose((q**2).sum(1), 1.0, atol=1e-12)
+
+
+def test_bags_of_missions(run, tmp_path) -> None:
+    """Read back: the path and the trajectory are the columns of the CSV, in ROS's order and axes."""
+    store = pytest.importorskip("rosbags.typesys").get_typestore(import_module("rosbags.typesys").Stores.ROS2_HUMBLE)
+    code, _, err = run(*MISSION)
+    assert code == 0, err
+    for kind in ("sqlite3", "mcap"):  # the second takes the place of the first
+        assert export.main([str(tmp_path / "flown"), "--bag", kind, "--layout", "1", "--rate", "50"]) == 0
+    assert export.main([str(tmp_path / "flown"), "--layout", "1", "--rate", "50"]) == 0
+    table = pd.read_csv(tmp_path / "flown" / "export" / "hold-1.csv")
+    with import_module("rosbags.rosbag2").Reader(tmp_path / "flown" / "export" / "hold-1") as bag:
+        read = [(c.topic, at, store.deserialize_cdr(raw, c.msgtype)) for c, at, raw in bag.messages()]
+    found = {topic: [message for name, _, message in read if name == topic] for topic, *_ in read}
+    assert [at for topic, at, _ in read if topic == "/odometry"] == [20_000_000 * k for k in range(len(table))]
+    (path,), (trajectory,) = found["/path"], found["/trajectory"]
+    p = np.array([[pose.pose.position.x, pose.pose.position.y, pose.pose.position.z] for pose in path.poses])
+    np.testing.assert_allclose(p, table[["x [m]", "y [m]", "z [m]"]], atol=1e-12)
+    point, row = trajectory.points[7], table.iloc[7]
+    turn = Rotation.from_quat(row[["qx", "qy", "qz", "qw"]].to_numpy(float))
+    assert Rotation.from_quat([getattr(point.transforms[0].rotation, axis) for axis in "xyzw"]).approx_equal(turn, 1e-9)
+    assert path.header.frame_id == "map" and point.time_from_start.nanosec == 140_000_000
+    body = found["/odometry"][7].twist.twist
+    for vector, heads, by in (
+        (point.velocities[0].linear, ["vx [m/s]", "vy [m/s]", "vz [m/s]"], None),
+        (point.accelerations[0].linear, ["ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]"], None),
+        (point.velocities[0].angular, ["wx [rad/s]", "wy [rad/s]", "wz [rad/s]"], turn),
+        (body.linear, ["vx [m/s]", "vy [m/s]", "vz [m/s]"], turn.inv()),
+        (body.angular, ["wx [rad/s]", "wy [rad/s]", "wz [rad/s]"], None),
+    ):
+        wanted = row[heads].to_numpy(float, copy=True)
+        wanted = wanted if by is None else by.apply(wanted)
+        np.testing.assert_allclose([vector.x, vector.y, vector.z], wanted, atol=1e-9)
+
+
+def test_a_bag_of_a_vehicle_in_the_plane(tmp_path) -> None:
+    """It stays at z = 0 and turns by its heading; in the body's axes it drives ahead. No other folder is replaced."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    t = np.linspace(0.0, 1.0, 101)
+    columns = {"t [s]": t, "x [m]": np.sin(t), "y [m]": 1 - np.cos(t), "heading [rad]": t}
+    bags.write_bag(tmp_path / "bag", columns, ["x [m]", "y [m]"], "mcap")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with import_module("rosbags.rosbag2").Reader(tmp_path / "bag") as bag:
+        read = [store.deserialize_cdr(raw, c.msgtype) for c, _, raw in bag.messages() if c.topic == "/odometry"]
+    twist, pose = read[50].twist.twist, read[50].pose.pose
+    np.testing.assert_allclose([twist.linear.x, twist.linear.y, twist.angular.z], [1, 0, 1], atol=1e-3)
+    assert (pose.position.z, pose.orientation.z) == (0.0, pytest.approx(np.sin(0.25)))
+    (tmp_path / "other").mkdir()
+    with pytest.raises(InputError, match="--output: expected a folder whose bags are rosbags"):
+        bags.write_bag(tmp_path / "other", columns, ["x [m]"], "mcap")
+    with pytest.raises(InputError, match="--bag: expected a vehicle with a position"):
+        bags.write_bag(tmp_path / "none", columns, [], "mcap")
 
 
 def test_a_mistake_gets_one_line(run, tmp_path, capsys) -> None:

@@ -98,3 +98,31 @@ def test_a_wrong_cloud_is_refused(arguments: Any, field: str) -> None:
     with pytest.raises(InputError) as error:
         PointCloud(*arguments)
     assert error.value.field == field
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("side", [0.07, 0.3])
+def test_the_cells_of_a_cloud(d: int, side: float) -> None:
+    """A cell is occupied where the nearest point of its box lies in a ball: by hand, cell by cell."""
+    points = np.random.default_rng(d).uniform(-0.4, 0.5, (6, d))
+    points[2] = np.nan
+    grid = PointCloud(points, 0.15).rasterised(side)
+    wanted = np.zeros(grid.shape, bool)
+    for cell in np.ndindex(*grid.shape):
+        low = grid.origin + side * np.array(cell)
+        nearest = np.minimum(np.maximum(points, low), low + side)
+        wanted[cell] = (np.linalg.norm(nearest - points, axis=1) <= 0.15).any()
+    assert np.array_equal(grid.occupied, wanted) and wanted.any() and not wanted.all()
+    assert (grid.origin <= np.nanmin(points, 0) - 0.15).all() and (grid.upper >= np.nanmax(points, 0) + 0.15).all()
+
+
+def test_cells_of_clouds_that_have_none() -> None:
+    assert not PointCloud(np.full((3, 2), np.nan), 0.1).rasterised(0.1).occupied.any()
+    for cloud, resolution, field in (
+        (PointCloud([[0.0, 0.0]], 0.1), 0.0, "resolution"),
+        (PointCloud([[0.0, 0.0], [1e6, 1e6]], 0.1), 0.01, "resolution"),
+        (PointCloud([[[0.0, 0.0]], [[1.0, 1.0]]], 0.1), 0.1, "cloud.points"),
+    ):
+        with pytest.raises(InputError) as error:
+            cloud.rasterised(resolution)
+        assert error.value.field == field

@@ -45,7 +45,7 @@ def straight(count: int = 3, knots: int = 5, n: int = 6, goal: Any = (1.0, 1.0))
 
 
 def shapes(ax: Axes, dotted: bool = False, filled: bool | None = None) -> list[np.ndarray]:
-    """Outlines of the obstacles of a panel: the filled ones, those around them, or the dotted ones."""
+    """Outlines of the obstacles of a panel: the filled ones, those around them, or the dotted and dashed ones."""
     found = []
     for held in ax.collections:
         if isinstance(held, PolyCollection) and (held.get_linestyle()[0][1] is not None) == dotted:
@@ -192,9 +192,11 @@ def test_moving_obstacles_are_drawn_when_they_are_passed() -> None:
     t = 0.5 * np.arange(9)
     path, ball = straight(1, knots=9)[0, :, :2], np.stack([np.full(9, 0.5), 1.2 - 0.4 * t], axis=-1)
     k = int(np.linalg.norm(path - ball, axis=1).argmin())
-    assert 0 < k < 8 and ax.texts[0].get_text() == f"{t[k]:.1f}"
-    for shape in shapes(ax):
-        assert shape[:-1].mean(axis=0) == pytest.approx(ball[k])
+    assert 0 < k < 8 and ax.texts[0].get_text() == f"{t[k]:.1f} s"
+    found = [(shape[:-1].mean(axis=0), np.ptp(shape[:, 0])) for shape in shapes(ax, dotted=True) + shapes(ax)]
+    margin = float(layouts["vehicle_radius"])
+    for (at, wide), (wanted, radius) in zip(found, ((ball[k], 0.1), (path[k], margin)), strict=True):
+        assert at == pytest.approx(wanted) and wide == pytest.approx(2 * radius), "the obstacle, and the vehicle then"
     trail = next(line for line in ax.lines if len(line.get_xdata()) == 2)
     assert trail.get_xydata() == pytest.approx(np.array([ball[k - 2], ball[k]])), "its last second"
     assert any("last second" in word for word in words(figure))
@@ -229,9 +231,9 @@ def test_a_moving_obstacle_that_stays_far_is_left_out() -> None:
         plane(1, centers=np.array([[[0.5, y]]]), radii=np.array([[0.1]]), velocities=np.array([[[0.01, 0.0]]]))
         for y in (0.6, 1.3)
     )
-    for layouts, count in ((near, 2), (far, 0)):
+    for layouts, count in ((near, 1), (far, 0)):
         (ax,) = layout_grid(layouts, {"gco": straight(1)}, ENDS).axes
-        assert len(shapes(ax)) == count and len(ax.texts) == count / 2
+        assert len(shapes(ax)) == len(shapes(ax, dotted=True)) == len(ax.texts) == count
 
 
 def test_in_space_what_is_far_from_the_flight_is_left_out() -> None:

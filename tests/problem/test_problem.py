@@ -21,6 +21,7 @@ from torchgco import (
     Problem,
     QuadraticCost,
     QuadrotorPlanning,
+    RateBounds,
     Spheres,
     StateBounds,
 )
@@ -190,3 +191,21 @@ def test_solve_takes_sensible_defaults() -> None:
 def test_starts_may_be_lists_arrays_and_single_states(x0) -> None:
     problem = planar(x0=x0)
     assert problem.x0.dtype == torch.float64 and tuple(problem.x0.shape) == (1, 6)
+
+
+def test_shapes_that_parts_state_are_those_of_their_rows() -> None:
+    knots = torch.tensor([1, 3, 4])
+    parts = [
+        ControlBounds([-1.0, -inf], [inf, 2.0]),
+        ControlBounds([-1.0, -1.0], [1.0, inf], knots=[0, 2]),
+        StateBounds([-inf, -3.0, -inf, -1.0], [inf, 3.0, 2.0, inf]),
+        StateBounds(torch.full((1, 3, 4), -5.0), torch.full((1, 3, 4), 5.0), knots=knots),
+        RateBounds([-1.0, -inf], [1.0, 1.0]),
+        Spheres([[5.0, 5.0], [7.0, 7.0], [9.0, 9.0]], [1.0, 1.0, 0.5], 0.1),
+        Spheres([[5.0, 5.0]], [1.0], 0.1, velocities=[[0.1, 0.0]]),
+    ]
+    dynamics = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, position=slice(0, 2))
+    problem = Problem(dynamics, QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4), parts, torch.zeros(2, 4), 5)
+    X, U = torch.zeros(2, 6, 4), torch.zeros(2, 5, 2)
+    for part, shape in zip(problem.constraints, problem.row_shapes, strict=True):
+        assert part.row_shape(problem.N) == shape == tuple(part.value(X, U).shape[1:])

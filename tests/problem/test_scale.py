@@ -159,3 +159,40 @@ def test_constants_hide_nothing_in_small_units_either(s: float, constant: float)
     assert found.statuses == [Status.CONVERGED] * 16
     own = made(0.0).cost.total(found.X, found.U)
     torch.testing.assert_close(own, due.cost, rtol=5e-3, atol=0)
+
+
+@pytest.mark.parametrize("size", [1e6, 1e9, 1e10])
+@pytest.mark.parametrize("solver", ["gco", "interior_point", "gco_exact"])
+def test_equality_rows_in_small_units_claim_no_minimum_that_they_miss(solver: str, size: float) -> None:
+    """A fund in dollars: purchases sum to 0, costs are relative to the same fund in shares of its wealth."""
+
+    def fund(wealth: float) -> Problem:
+        weights = [[w / wealth**2] * 3 for w in (1.0, 5.0, 10.0)]
+        cost = QuadraticCost(*weights, x_ref=[0.3 * wealth, 0.5 * wealth, 0.2 * wealth])
+        parts = [
+            FunctionConstraint(lambda u: u.sum(-1, keepdim=True), "equality", of="u"),
+            ControlBounds(-0.2 * wealth, 0.2 * wealth),
+        ]
+        model = FunctionDynamics(lambda x, u: x + u, 3, 3, 1.0, "none")
+        return Problem(model, cost, parts, torch.tensor([[wealth, 0.0, 0.0]], dtype=torch.float64), 10)
+
+    expected = torchgco.solve(fund(1.0), solver="interior_point").cost
+    found = torchgco.solve(fund(size), solver=solver)
+    right = bool((found.cost - expected).abs() < 1e-3 * expected)
+    assert right if size < 1e7 else right or found.statuses != [Status.CONVERGED]
+
+
+def test_constants_hide_no_cost_where_one_control_is_in_small_units() -> None:
+    def problem(size: list[float], constant: float) -> Problem:
+        units = torch.tensor(size, dtype=torch.float64)
+        states = torch.cat((units, units))
+        goal, weights = (torch.tensor(z, dtype=torch.float64) for z in ([1, 0.5, 0, 0], [1, 1, 0.1, 0.1]))
+        stage = lambda x, u: constant + 0.1 * (u / units).square().sum(-1)
+        last = lambda x: 20 * ((x / states - goal).square() * weights).sum(-1)
+        model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.2)
+        return Problem(model, FunctionCost(stage, last), [ControlBounds(-0.6 * units, 0.6 * units)], [[0.0] * 4], 10)
+
+    expected = torchgco.solve(problem([1.0, 1.0], 0.0), solver="gco_exact").cost
+    found = torchgco.solve(problem([1e-3, 1.0], 1e4))
+    assert found.statuses == [Status.CONVERGED]
+    assert bool((found.cost - 1e5 - expected).abs() < 1e-3 * expected)

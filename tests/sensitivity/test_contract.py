@@ -18,7 +18,6 @@ from torchgco import (
     InputError,
     Problem,
     QuadraticCost,
-    RateBounds,
     Solution,
 )
 
@@ -72,24 +71,6 @@ def test_gradcheck() -> None:
     assert torch.autograd.gradcheck(values, leaves, eps=1e-5, atol=1e-6, rtol=1e-6)
 
 
-def test_jacobians_of_all_outputs_at_once_are_those_one_by_one() -> None:
-    x0 = torch.tensor([[1.0, 0.0], [-1.5, 1.0]], dtype=D, requires_grad=True)
-    found = small(x0)
-    U = torch.cat((found.U[:, :4].flatten(), found.cost))
-    slope = lambda v: torch.autograd.grad(U, x0, v, retain_graph=True)[0]
-    basis = torch.eye(len(U)).to(D)
-    one, many = torch.stack([slope(v) for v in basis]), torch.func.vmap(slope)(basis)
-    assert torch.equal(one, many) and float(one.abs().amax(dim=(1, 2)).min()) > 1e-3
-    with pytest.raises(RuntimeError, match=r"torch\.func\.vmap over"):
-        torch.autograd.grad(U, x0, basis, is_grads_batched=True)
-
-
-def test_forward_mode_is_refused() -> None:
-    x0 = torch.tensor([[1.0, 0.0]], dtype=D)
-    with torch.autograd.forward_ad.dual_level(), pytest.raises(InputError, match="dual_level"):
-        small(torch.autograd.forward_ad.make_dual(x0, torch.ones_like(x0)))
-
-
 def test_the_systems_are_symmetric() -> None:
     _, solution = solved(discs, numbers)
     node = solution.U.grad_fn
@@ -107,15 +88,6 @@ def test_the_systems_are_symmetric() -> None:
     torch.testing.assert_close(
         ahead, sum((a * b).sum() for a, b in zip(tangents, back, strict=True)), rtol=1e-8, atol=0
     )
-
-
-def test_a_second_derivative_is_refused() -> None:
-    x0 = torch.tensor([[1.0, 0.0]], dtype=D, requires_grad=True)
-    found = small(x0)
-    for value in (found.U.sum(), found.cost.sum()):
-        (slope,) = torch.autograd.grad(value, x0, create_graph=True)
-        with pytest.raises(RuntimeError, match="no second derivatives"):
-            torch.autograd.grad(slope.sum(), x0)
 
 
 def test_each_solve_has_a_graph_of_its_own() -> None:
@@ -146,9 +118,6 @@ def test_solutions_with_gradients_serve_as_others_do(tmp_path) -> None:
     ("field", "make"),
     [
         ("problem", lambda x: Problem(MODEL, COST, [ControlBounds(-3, 3)], x.float().detach().requires_grad_(), 10)),
-        ("problem", lambda x: Problem(MODEL, COST, [ControlBounds(-3, 3)], x, 10, horizon=[7])),
-        ("problem", lambda x: Problem(MODEL, COST, [ControlBounds(-3, 3)], x, 10, free_start=[True, False])),
-        ("problem", lambda x: Problem(MODEL, COST, [RateBounds(-1, 1)], x, 10)),
         ("goal.radius", lambda x: Problem(FunctionDynamics(lambda x, u: u, 1, 1, 0.1, position=slice(0, 1)),
             QuadraticCost([1.0], [1.0], [1.0]), [], x[:, :1].detach(), 10, Goal([1.0], x[0, 0]))),
     ],

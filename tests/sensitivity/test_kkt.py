@@ -78,24 +78,35 @@ def systems(problem: Problem) -> tuple[Tensor, Tensor, tuple[Tensor, ...], Tenso
     return X, U, lam, active, RightSides(random(COLUMNS, B, N + 1, 5), random(COLUMNS, B, N, 3), random(COLUMNS, B, R))
 
 
-def solved(problem: Problem, native: bool) -> KktSolve:
+def solved(problem: Problem, native: bool, give: Tensor | None = None) -> KktSolve:
     use_native(native)
     try:
-        return interior_of(problem.renewed()).kkt(problem, *systems(problem))
+        return interior_of(problem.renewed()).kkt(problem, *systems(problem), give)
     finally:
         use_native(True)
 
 
 @pytest.mark.parametrize("native", [True, False])
-@pytest.mark.parametrize("traced_cost", [True, False])
-def test_solutions_are_those_of_a_dense_matrix(native: bool, traced_cost: bool) -> None:
+@pytest.mark.parametrize(("traced_cost", "barrier"), [(True, False), (False, False), (False, True)])
+def test_solutions_are_those_of_a_dense_matrix(native: bool, traced_cost: bool, barrier: bool) -> None:
+    """With rows that hold as equalities, or that give way to their multipliers by shares of very different sizes."""
     problem = curved(traced_cost)
-    found = solved(problem, native)
     X, U, lam, active, right = systems(problem)
+    inside = torch.cat(
+        [
+            torch.full((p[0] * p[1],), c.sense != "equality")
+            for p, c in zip(problem.row_shapes, problem.constraints, strict=True)
+        ]
+    )
+    give = 10.0 ** (6 * draw(2)(*active.shape)) * inside if barrier else None
+    found = solved(problem, native, give)
     assert bool(found.definite.all()) and float(found.left.max()) < 1e-12
     for b in (0, 4, 8):
         one, rows = slice(b, b + 1), active[b].numpy()
         matrix, y = dense_kkt(problem.take(one), X[one], U[one], tuple(part[one] for part in lam), rows)
+        if give is not None:
+            last = np.arange(len(matrix) - rows.sum(), len(matrix))
+            matrix[last, last] -= give[b].numpy()[rows]
         np.testing.assert_allclose(found.costates[b, 1:], y, atol=1e-11)
         for c in range(COLUMNS):
             a = torch.cat((right.a[c, b, 1:, :3].flatten(), right.a[c, b, :-1, 3:].flatten()))

@@ -306,3 +306,22 @@ def test_a_browser_without_webgl_is_told_so(opened: Tab, file: Path) -> None:
     opened.open(file)
     assert "no WebGL 2" in opened.evaluate("document.getElementById('message').innerText")
     opened.call("Page.removeScriptToEvaluateOnNewDocument", **script)
+
+
+@pytest.mark.parametrize("width", [320, 390, 433])
+def test_nothing_is_cut_off_on_a_phone(tab: Tab, width: int) -> None:
+    """Whatever is shown ends within the window, values with their units and the button that folds the panel, too."""
+    try:
+        tab.size(width, 640)
+        tab.wait(f"innerWidth === {width}")
+        beyond = "[...document.querySelectorAll('body *')].filter((e) => e.getClientRects().length && "
+        beyond += "!e.closest('.unseen') && (e.getBoundingClientRect().right > innerWidth + 0.5 || "
+        beyond += "e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display === 'block')).map((e) => e.id)"
+        assert tab.evaluate(beyond) == []
+        assert tab.evaluate("document.documentElement.scrollWidth") == width
+        assert tab.evaluate("document.getElementById('fold').getBoundingClientRect().bottom") <= 640
+        tab.click("#fold")
+        assert tab.evaluate("document.getElementById('panel').getClientRects().length") == 0
+        tab.click("#fold")
+    finally:
+        tab.size(*SIZE)

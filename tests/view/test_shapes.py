@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import get_args, get_type_hints
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from tests.view.scenes import DT, RADIUS, SOLVERS, N, problem, trajectories
-from torchgco import Boxes, Field, FunctionDynamics, Planar, Problem, QuadraticCost
+from torchgco import Boxes, Field, FunctionDynamics, Planar, Problem, QuadraticCost, QuadrotorPlanning, Unicycle
+from torchgco.dynamics import Dynamics
 from torchgco.judging.contact import contacts
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.view import document
 from torchgco.view.cells import merged
 from torchgco.view.flights import flights_of, violated, whole
 from torchgco.view.shapes import SHAPES, Shapes, once, shapes_of, turns
-from torchgco.view.vehicles import Look
+from torchgco.view.vehicles import Look, look_of
 
 
 def distance(shapes: Shapes, p: np.ndarray, t: float) -> np.ndarray:
@@ -158,3 +164,40 @@ def test_a_path_ends_where_it_is_lost() -> None:
     X = np.arange(12.0).reshape(4, 3)
     X[2, 1] = np.nan
     assert len(whole(X)) == 2 and len(whole(np.array([[0.0], [1e7]]))) == 1
+
+
+def model(names: tuple[str, ...], d: int = 2) -> Dynamics:
+    """Dynamics with states of these names, whose position comes first."""
+    fields = {"n": len(names), "m": 1, "dt": 0.1, "state_names": names, "position": slice(0, d)}
+    return type("Own", (Dynamics,), fields)()
+
+
+def test_models_that_are_not_listed_turn_by_the_names_of_their_states() -> None:
+    assert look_of(Unicycle()) == Look("car", heading=2) and look_of(QuadrotorPlanning()).body == "quadrotor"
+    assert look_of(model(("x", "y", "v", "heading"))) == Look("dart", heading=3)
+    assert look_of(model(("x", "y", "z", "qw", "qx", "qy", "qz"), 3)) == Look("dart", quaternion=slice(3, 7))
+    assert look_of(model(("x", "y", "qw"))) == Look("dart", along=slice(0, 2))
+    assert look_of(FunctionDynamics(lambda x, u: x + u, 2, 2, 0.1)) == Look()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_dart_points_along_its_way(d: int) -> None:
+    """Its nose does, turned by SciPy; where the vehicle rests it points as before, at first as it will."""
+    p = np.random.default_rng(d).normal(size=(8, d)).cumsum(axis=0)
+    p[1], p[5], p[6] = p[0], p[4], p[4]
+    q = Look("dart", along=slice(0, d)).attitude(p)
+    assert q is not None
+    nose = Rotation.from_quat(q[:, [1, 2, 3, 0]]).apply([1.0, 0, 0])
+    steps = np.diff(np.pad(p, ((0, 0), (0, 3 - d))), axis=0)
+    for k, step in enumerate((1, 1, 2, 3, 3, 3, 6, 6)):
+        np.testing.assert_allclose(nose[k], steps[step] / np.linalg.norm(steps[step]), atol=1e-12)
+    left = Rotation.from_quat(q[:, [1, 2, 3, 0]]).apply([0.0, 1, 0])
+    np.testing.assert_allclose(left[:, 2], 0.0, atol=1e-12)
+    still = Look("dart", along=slice(0, d)).attitude(np.zeros((3, d)))
+    assert np.array_equal(still, [[1, 0, 0, 0]] * 3)
+
+
+def test_the_page_draws_every_body() -> None:
+    script = (Path(document.__file__).parent / "static" / "vehicle.js").read_text()
+    (drawn,) = re.findall(r"const built = \{ (.*?) \}", script)
+    assert set(drawn.split(", ")) == set(get_args(get_type_hints(Look)["body"]))

@@ -18,6 +18,7 @@ class Differentiability(IntEnum):
     WEAKLY_ACTIVE = 7
     LEAVES_GOAL = 8
     ROWS_CHANGE = 9
+    NOT_SMOOTHED = 10
 
     @property
     def sentence(self) -> str:
@@ -36,5 +37,7 @@ _SENTENCES = {
     Differentiability.DEPENDENT_ROWS: "Constraints that hold depend on each other, so their multipliers aren't unique.",
     Differentiability.ROWS_CHANGE: "The change is too large for first order: on the way a constraint begins or ceases "
     "to hold.",
+    Differentiability.NOT_SMOOTHED: "From the solver's trajectory, which is returned, no solution with this smoothing "
+    "was found.",
     Differentiability.WEAKLY_ACTIVE: "A constraint is on the edge of holding, and derivatives differ on its two sides.",
 }

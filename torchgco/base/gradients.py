@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import is_dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 _recording: ContextVar[bool] = ContextVar("recording", default=False)
 
@@ -19,10 +20,32 @@ def recording() -> Iterator[None]:
     """What is computed from tensors that ask for gradients is recorded, and checks of input admit such tensors."""
     token = _recording.set(True)
     try:
-        with torch.enable_grad():
+        with torch.enable_grad(), forward_ad._set_fwd_grad_enabled(True) if is_forward() else nullcontext():
             yield
     finally:
         _recording.reset(token)
+
+
+@contextmanager
+def not_recording() -> Iterator[None]:
+    """Nothing is recorded, neither for backward passes nor of tensors in forward mode."""
+    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False) if is_forward() else nullcontext():
+        yield
+
+
+def is_forward() -> bool:
+    """Whether this is within `forward_ad.dual_level`, where tensors may have tangents."""
+    return forward_ad._current_level >= 0
+
+
+def asks(tensor: Tensor) -> bool:
+    """Whether a tensor asks for gradients, or has a tangent of forward mode."""
+    return tensor.requires_grad or (is_forward() and _has_tangent(tensor))
+
+
+def _has_tangent(tensor: Tensor) -> bool:
+    with forward_ad._set_fwd_grad_enabled(True):  # else none is shown
+        return forward_ad.unpack_dual(tensor).tangent is not None
 
 
 def is_recording() -> bool:
@@ -46,13 +69,13 @@ def leaves(tree: Any) -> list[Any]:
 
 def asking(tree: Any) -> list[Tensor]:
     """The tensors in nested sequences, mappings and dataclasses that ask for gradients."""
-    return [leaf for leaf in leaves(tree) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    return [leaf for leaf in leaves(tree) if isinstance(leaf, Tensor) and asks(leaf)]
 
 
 def without_gradients(tree: Any) -> Any:
     """The same numbers without gradients; parts that hold no tensor that asks for one are the same objects."""
     if isinstance(tree, Tensor):
-        return tree.detach() if tree.requires_grad else tree
+        return tree.detach() if asks(tree) else tree
     if not asking(tree):
         return tree
     parts = {name: without_gradients(part) for name, part in _parts(tree)}

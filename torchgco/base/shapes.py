@@ -23,7 +23,7 @@ from torch._C._dynamo.eval_frame import get_eval_frame_callback  # type: ignore[
 from torch._C._functorch import peek_interpreter_stack  # type: ignore[import]
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.gradients import is_recording
+from torchgco.base.gradients import asks, is_recording, not_recording
 
 # What a user's function raises where it doesn't fit the problem.
 MISTAKES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError)
@@ -75,7 +75,7 @@ def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
         raise InputError(field, f"a {'float64 or float32' if like is None else like.dtype} tensor", describe(value))
     if value.layout != torch.strided:
         raise InputError(field, "a dense tensor", value.layout)
-    if value.requires_grad and not is_recording():
+    if not is_recording() and asks(value):
         expected = "a tensor without gradients, `.detach()`: no solution is differentiated with respect to it"
         raise InputError(field, expected, describe(value))
     if like is not None and value.dtype != like.dtype:
@@ -91,7 +91,8 @@ def check_untransformed(what: str) -> None:
     Kernels in C read memory, which tensors there don't have; and a batch is solved at once anyway.
     """
     if peek_interpreter_stack() is not None:
-        raise InputError(what, "a call outside of torch.func.vmap and grad: it takes a batch itself", "one inside")
+        expected = "a call outside of torch.func: it takes a batch itself, and torch.autograd serves for derivatives"
+        raise InputError(what, expected, "one inside")
     if get_eval_frame_callback():
         raise InputError(what, "a call outside of torch.compile: it makes kernels of its own", "one inside")
 
@@ -108,7 +109,7 @@ def check_device(device: Any) -> torch.device:
 def computing_on(device: torch.device) -> Iterator[None]:
     """No gradients are recorded, and new tensors lie on `device`, whatever the process's default device is."""
     elsewhere = torch.get_default_device() != device
-    with torch.no_grad(), device if elsewhere else nullcontext():
+    with not_recording(), device if elsewhere else nullcontext():
         yield
 
 

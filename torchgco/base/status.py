@@ -33,7 +33,7 @@ class Status(IntEnum):
 STOPPED = -1  # ended by guidance, for another attempt
 STALLED = -2  # neither the violation nor the cost of a feasible trajectory falls any more
 SOLVED = -3  # the optimality conditions hold to the solver's own tolerance
-UNMOVED = -4  # the same but for violated rows that no variable moves: nothing that is tried could mend them
+UNMOVED = -4  # the same but for violated rows that no variable moves: nothing that is tried could repair them
 
 _SENTENCES = {
     Status.RUNNING: "The solve has not ended.",

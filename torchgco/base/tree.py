@@ -84,7 +84,7 @@ def cast(tree: Any, dtype: torch.dtype) -> Any:
 def apart(tree: Any) -> Any:
     """The same with a tensor object of its own for every tensor, of the same memory, in tuples and `PerElement`s.
 
-    What else holds one of these tensors can then be told from the tree.
+    What else holds one of these tensors can then be distinguished from the tree.
     """
     if isinstance(tree, Tensor):
         return tree.detach()

@@ -26,7 +26,7 @@ from torchgco.search.chords import cleared, serving
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.infeasible import least_violated
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import InteriorPoint, guessed
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 
@@ -83,7 +83,8 @@ class PathPursuit(Solver):
         held = session.call
         U, found = self.guess(held.problem, held.U0)
         held = replace(held, U0=U)
-        end = self._cleared(held, self.solver.no_worse(held, self.solver.solved(held)))
+        guess = guessed(held)
+        end = self._cleared(held, self.solver.no_worse(held, guess, self.solver.solved(held, guess=guess)))
         solution = session.finished(least_violated(held, end, admitted), admitted)
         return replace(solution, guided=found.long())
 

@@ -48,7 +48,7 @@ class MPC:
         tolerance: as `torchgco.compile` takes it.
 
     Attributes:
-        t: time of the last step, s; the first one's is 0, or what `step` was told.
+        t: time of the last step, s; the first one's is 0, or what `step` was given.
         plan: what is flown since then, each vehicle's from the time that it was solved at; None before the first step.
         answer: the last solve's `Answer`, whether it is flown or not; None before the first step.
 

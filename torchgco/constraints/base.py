@@ -39,7 +39,7 @@ class Constraint(PerElement):
 
     @property
     def bare(self) -> Constraint:
-        """The constraint that a solver's form of it stands for; itself where it is none."""
+        """The user's constraint behind a solver's wrapper; itself if it isn't wrapped."""
         return self
 
     @property
@@ -75,6 +75,10 @@ class Constraint(PerElement):
     def at(self, x: Tensor, k: int) -> Tensor:
         """Rows (B, S, p) for samples x (B, S, n) of one knot; geometric constraints only."""
         raise undefined(self, "at")
+
+    def row_shape(self, N: int) -> tuple[int, int] | None:
+        """Knots and rows for N stages, where they are known without evaluating the rows."""
+        return None
 
     def holds_at(self, k: int) -> bool:
         """Whether the constraint applies to knot k."""
@@ -118,6 +122,11 @@ class WrappedConstraint(Constraint):
 def innermost(constraint: Constraint) -> Constraint:
     """The constraint within all that wraps it."""
     return innermost(constraint.constraint) if isinstance(constraint, WrappedConstraint) else constraint
+
+
+def count_of(index: slice | Tensor, of: int) -> int:
+    """How many of `of` things a slice or indices take."""
+    return len(range(of)[index]) if isinstance(index, slice) else len(index)
 
 
 def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> slice | Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, tensor
-from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.constraints.base import Constraint, count_of, resolve_knots
 
 LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
 
@@ -118,6 +120,11 @@ class _Bounds(Constraint):
             raise InputError(name, f"numbers or {-refused}", float(bound[bad][0]))
         return bound
 
+    def row_shape(self, N: int) -> tuple[int, int]:
+        assert self.above is not None and self.below is not None
+        size = self.upper.shape[-1]
+        return count_of(self.knots, N + 1), count_of(self.above, size) + count_of(self.below, size)
+
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         z = self._bounded(X, U)
         upper, lower = self.limits()
@@ -163,6 +170,21 @@ class ControlBounds(_Bounds):
     label: ClassVar[str] = "control_bounds"
 
 
+def joined_bounds(parts: Sequence[ControlBounds], N: int) -> ControlBounds | None:
+    """The bounds of several parts, once bound, as one; the only part as it is, and None of none.
+
+    Where they leave a control no value, its upper bound counts alone: the problem is infeasible.
+    """
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    lower, upper = zip(*(part.over(N) for part in parts), strict=True)
+    upper = reduce(torch.minimum, upper)
+    lower = torch.minimum(reduce(torch.maximum, lower), upper)
+    above, below = (torch.isfinite(bound).flatten(0, -2).any(dim=0).nonzero().flatten() for bound in (upper, lower))
+    ends = {"above": _range(above), "below": _range(below)}
+    return replace(parts[0], lower=lower.contiguous(), upper=upper.contiguous(), knots=slice(0, N), **ends)
+
+
 @dataclass(frozen=True)
 class StateBounds(_Bounds):
     """lower <= x_k <= upper at knots 1..N (x_0 is given), in the units of x."""
@@ -179,7 +201,7 @@ class RateBounds(_Bounds):
 
     Bounds are of the change from one stage to the next, in the units of u: an actuator's limit per second times dt.
     Solvers see the bounded controls of the stage before as further states, last in x: so does a callback, and a solver
-    of one's own. Solutions have the problem's own states. A problem has one RateBounds at most.
+    of your own. Solutions have the problem's own states. A problem has one RateBounds at most.
 
     Args:
         lower, upper: as for other bounds; without a lower one, say, controls may fall at any rate.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.gradients import asks
 from torchgco.base.shapes import Dimensions, check_shape, lead, tensor
 from torchgco.costs.base import Cost, add_blocks
 
@@ -212,7 +213,7 @@ def _vector(value: Any, field: str, size: int, B: int, N: int | None, like: Tens
 def _optional(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor | None:
     """A linear term, None where it is zero throughout, and no gradient is asked for, which needn't be."""
     v = _vector(value, field, size, B, N, like)
-    return v if v.requires_grad or bool((v != 0).any()) else None
+    return v if asks(v) or bool((v != 0).any()) else None
 
 
 def _one_of(value: Tensor, axis: int, length: int) -> int:
@@ -222,7 +223,7 @@ def _one_of(value: Tensor, axis: int, length: int) -> int:
 
 def _is_diagonal(given: Any, W: Tensor) -> bool:
     """Whether a weight is one for good: a matrix that asks for gradients may have them off its diagonal."""
-    if W.requires_grad and isinstance(given, Tensor) and given.dim() > 1:
+    if asks(W) and isinstance(given, Tensor) and given.dim() > 1:
         return False
     return bool((W - torch.diag_embed(W.diagonal(dim1=-2, dim2=-1)) == 0).all())
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.rows import Group, joined
-from torchgco.eager.state import Kinds, State, renew, settle
+from torchgco.eager.state import Kinds, State, first_barrier, renew, settle
 
 NUDGE = 1e-3  # how far from the iterate a row's slope is looked at again: it may vanish in one point alone
 GOLDEN = 0.6180339887498949
@@ -163,7 +163,7 @@ def readmit(kinds: Kinds, model: Model, t: State, of: Tensor, admitted: float) -
         return changed
     changed[rows] = True
     some, part = t.take(rows), model.take(rows)
-    some.mu = kinds.barrier[some.rows]
+    some.mu = first_barrier(kinds, some)
     some.watching, some.shortened = torch.zeros_like(some.watching), torch.zeros_like(some.shortened)
     some.least = torch.full_like(some.least, torch.inf)
     some.left = torch.full_like(some.left, torch.inf)

@@ -56,10 +56,11 @@ class EagerInterior:
         return solve(self.model.among(problem), X, U, multipliers, barrier, **options | fitted(options, X.dtype))
 
     def kkt(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
-    ) -> KktSolve:
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
+        right: RightSides, give: Tensor | None = None,
+    ) -> KktSolve:  # fmt: skip
         """As `native.interior.InteriorEngine.kkt`, in float64."""
-        return kkt(self.model.among(problem), X, U, multipliers, active, right)
+        return kkt(self.model.among(problem), X, U, multipliers, active, right, give)
 
 
 def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:

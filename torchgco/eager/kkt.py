@@ -11,17 +11,20 @@ from torchgco.lagrangian.kkt import PIVOT, ROUNDS, STIFF, KktSolve, RightSides
 
 
 def kkt(
-    model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
-) -> KktSolve:
+    model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides,
+    give: Tensor | None = None,
+) -> KktSolve:  # fmt: skip
     """As `native.interior.InteriorEngine.kkt`."""
     lam = torch.cat([X.new_zeros(X.shape[0], 0), *(part.flatten(1) for part in multipliers)], dim=1)
     lam = torch.where(active, lam, 0.0)
     y = _costates(model.slopes(X, U), lam)
     found = model.expand(X, U, torch.ones_like(X[:, 0, 0]), y, lam)
     sigma = STIFF * found.H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1, keepdim=True)
-    H = found.with_squares(torch.where(active, sigma, 0.0))
+    stays = torch.ones_like(lam) if give is None else torch.where(active, 1.0 + sigma * give, 1.0)
+    H = found.with_squares(torch.where(active, sigma / stays, 0.0))
     factors = factor(found.F, H, torch.zeros_like(sigma[:, 0]), PIVOT, model.problem.free_start)
-    columns = [_solved(found, factors, active, sigma, *side) for side in zip(right.a, right.b, right.c, strict=True)]
+    sides = zip(right.a, right.b, right.c, strict=True)
+    columns = [_solved(found, factors, active, sigma, stays, *side) for side in sides]
     none = (X.new_zeros(0, *shape.shape[1:]) for shape in (right.a, right.b, right.c, right.a[..., 0, 0]))
     z, v_of_gaps, v, left = (torch.stack(part) for part in zip(*columns, strict=True)) if columns else none
     return KktSolve(z, v_of_gaps, v, left, y, factors.good)
@@ -38,7 +41,7 @@ def _costates(slopes: Derivatives, lam: Tensor) -> Tensor:
 
 
 def _solved(
-    found: Derivatives, factors: Factors, active: Tensor, sigma: Tensor, a: Tensor, b: Tensor, c: Tensor
+    found: Derivatives, factors: Factors, active: Tensor, sigma: Tensor, stays: Tensor, a: Tensor, b: Tensor, c: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """z, y, v and what active rows leave open, for one right hand side; each round closes what the last one left."""
     n, F = b.shape[-1], found.F
@@ -50,9 +53,9 @@ def _solved(
         open_a[:, :-1] += (F.mT @ y.unsqueeze(-1)).squeeze(-1)
         open_a[:, 1:, :n] -= y
         open_b = b + (F @ z[:, :-1].unsqueeze(-1)).squeeze(-1) - z[:, 1:, :n]
-        pulled = found.pull((v + sigma * c).unsqueeze(1)).squeeze(1)
+        pulled = found.pull((v + sigma / stays * c).unsqueeze(1)).squeeze(1)
         dx, du, dy = solve(factors, open_a + pulled, open_b)
         step = torch.cat((dx, torch.nn.functional.pad(du, (0, 0, 0, 1))), dim=-1)
-        z, y, c = z + step, y + dy[:, 1:], c + torch.where(active, found.push(step, c), 0.0)
+        z, y, c = z + step, y + dy[:, 1:], (c + torch.where(active, found.push(step, c), 0.0)) / stays
         v = v + sigma * c
     return z, y, v, c.abs().amax(-1) if c.shape[1] > 0 else torch.zeros_like(sigma[:, 0])

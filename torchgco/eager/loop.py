@@ -33,6 +33,7 @@ from torchgco.eager.state import (
     column,
     errors,
     find_solved,
+    first_barrier,
     lower_barrier,
     remeasure,
     renew,
@@ -101,11 +102,12 @@ def _of_rows(problem: Problem, X: Tensor, flags: list[bool]) -> Tensor:
 def begin(kinds: Kinds, model: Model, t: State) -> None:
     """The scale of the cost, slacks and multipliers."""
     how = kinds.how
-    t.mu, t.soft = kinds.barrier[t.rows], torch.full_like(t.mu, how.soft)
+    t.soft = torch.full_like(t.mu, how.soft)
     slopes, H = model.cost_model(t.X, t.U)
     largest = torch.maximum(slopes.abs().flatten(1).amax(-1), H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1))
     scale = how.steepest / largest
     t.scale = torch.where(torch.isfinite(scale) & (largest > 0.0), scale, t.scale)
+    t.mu = first_barrier(kinds, t)
     settle(kinds, model, t)
     sort_rows(kinds, model, t)
     t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
@@ -255,7 +257,7 @@ class _Loop:
     def _recover(self, failed: Tensor) -> Tensor:
         """Problems whose line search failed look for feasibility alone: steps of least length that close residuals.
 
-        Where there is nothing to close, they start anew with new multipliers and a shift. Returns those that give up.
+        Where there is nothing to close, they start again with new multipliers and a shift. Returns those that give up.
         """
         t, how = self.t, self.kinds.how
         if not bool(failed.any()):

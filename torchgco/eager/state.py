@@ -104,6 +104,11 @@ class Kinds:
         return self.equality | (t.out & t.fixes)
 
 
+def first_barrier(kinds: Kinds, t: State) -> Tensor:
+    """The barrier parameter (b,) to begin with: at least that at which it ends, where the barrier stays."""
+    return torch.maximum(kinds.barrier[t.rows], kinds.how.smoothing * t.scale)
+
+
 def blank(problem: Problem, X: Tensor, U: Tensor, z: Tensor) -> State:
     """The state of problems that have not begun."""
     b = X.shape[0]
@@ -172,7 +177,7 @@ def remeasure(kinds: Kinds, t: State) -> None:
 
 
 def renew(kinds: Kinds, model: Model, t: State) -> None:
-    """Multipliers anew: those of the central path, none of equalities, and costates that fit them."""
+    """New multipliers: those of the central path, none of equalities, and costates that fit them."""
     t.z = torch.where(kinds.inside(t), column(t.mu) / t.s, 0.0)
     adjoin(kinds, model.slopes(t.X, t.U), t)
 
@@ -216,7 +221,7 @@ def errors(kinds: Kinds, at: Derivatives, t: State, r: Tensor, free: Tensor | No
     usual = torch.full_like(mean, how.usual_multiplier)
     dual = slope.abs().flatten(1).amax(-1) * usual / torch.maximum(mean, usual)
     scale_z = usual / torch.maximum(sum_z / max(t.z.shape[1], 1), usual)
-    whole = torch.maximum(torch.maximum(dual, gap), complementarity(kinds, t, torch.zeros_like(t.mu)) * scale_z)
+    whole = torch.maximum(torch.maximum(dual, gap), complementarity(kinds, t, how.smoothing * t.scale) * scale_z)
     return Errors(dual, gap, scale_z, whole)
 
 
@@ -228,10 +233,11 @@ def complementarity(kinds: Kinds, t: State, mu: Tensor) -> Tensor:
 
 
 def lower_barrier(kinds: Kinds, t: State, test: Errors, running: Tensor) -> None:
-    """The next mu where the barrier problem is solved well enough; the filter begins anew there."""
+    """The next mu where the barrier problem is solved well enough; the filter begins again there."""
     how = kinds.how
     base, usual = torch.maximum(test.dual, test.primal), how.tolerance * how.barrier_floor
     smallest = torch.where(t.presses, how.barrier_least, torch.full_like(t.mu, usual))
+    smallest = how.smoothing * t.scale if how.smoothing > 0 else smallest
     lowered = torch.zeros_like(t.presses)
     for _ in range(LONGEST_FALL):
         error = torch.maximum(base, complementarity(kinds, t, t.mu) * test.scale_z)
@@ -258,7 +264,7 @@ def find_solved(kinds: Kinds, t: State, test: Errors, running: Tensor) -> Tensor
     feasible = running & ~t.restoring & (test.primal <= how.violation)
     met = feasible & (error <= how.tolerance)
     left, size = barrier_share(kinds, t)
-    counts = met & (left > how.counts * size)
+    counts = met & (left > how.counts * size) & (how.smoothing == 0)
     t.idle = torch.where(counts & (left <= 0.5 * t.left), 0, t.idle)
     t.left = torch.where(counts, torch.minimum(left, t.left), t.left)
     t.presses, rests = t.presses | counts, t.idle >= how.idle

@@ -1,1 +1,1 @@
-"""What happened in a solve, in words: `Solution.explain`, and what it is told from."""
+"""What happened in a solve, in words: `Solution.explain`, and the facts that it rests on."""

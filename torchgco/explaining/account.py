@@ -25,6 +25,7 @@ class Account(PerElement):
         rows: the problems (b,) of the account; None: all.
         t: times, where the problem isn't there.
         kernels: that solved: "native", "pytorch", or another library's name; None where that isn't known.
+        smoothing: of the solution, in units of the cost.
     """
 
     def __init__(
@@ -35,9 +36,10 @@ class Account(PerElement):
         rows: Tensor | None = None,
         t: Tensor | None = None,
         kernels: str | None = None,
+        smoothing: float = 0.0,
     ) -> None:
         self._whole, self.solver, self._name, self._rows, self._t = problem, solver, name, rows, t
-        self.kernels = kernels
+        self.kernels, self.smoothing = kernels, smoothing
 
     @property
     def problem(self) -> Problem | None:
@@ -51,7 +53,11 @@ class Account(PerElement):
 
     def asked(self, problem: Problem, name: str | None) -> Account:
         """The same of the problem as the user gave it, and of a preset of this name; None: of no preset."""
-        return Account(problem, self.solver, name, self._rows, self._t, self.kernels)
+        return Account(problem, self.solver, name, self._rows, self._t, self.kernels, self.smoothing)
+
+    def smoothed(self, by: float) -> Account:
+        """The same of the solution with a smoothing."""
+        return Account(self._whole, self.solver, self._name, self._rows, self._t, self.kernels, by)
 
     def times(self) -> Tensor:
         """The times of the knots, (N+1,) or (b, N+1), s.
@@ -80,7 +86,7 @@ class Account(PerElement):
         else:
             index = index.nonzero().flatten() if index.dtype == torch.bool else index
             rows = index if self._rows is None else self._rows[index]
-        return Account(self._whole, self.solver, self._name, rows, self._t, self.kernels)
+        return Account(self._whole, self.solver, self._name, rows, self._t, self.kernels, self.smoothing)
 
     def __getstate__(self) -> dict[str, Any]:
         """Times and name alone: a problem may hold functions that no other process can read."""
@@ -88,4 +94,5 @@ class Account(PerElement):
             t = self.times()
         except InputError:
             t = None
-        return {"_whole": None, "solver": None, "_name": self.name, "_rows": None, "_t": t, "kernels": self.kernels}
+        return {"_whole": None, "solver": None, "_name": self.name, "_rows": None, "_t": t,
+                "kernels": self.kernels, "smoothing": self.smoothing}  # fmt: skip

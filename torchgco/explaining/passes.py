@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 FATES = {
     Fate.PROPOSED: "proposed",
-    Fate.REFINED: "refined, but dearer",
+    Fate.REFINED: "refined, but costs more",
     Fate.FAILED: "refined without a good end",
-    Fate.RELAXED: "dropped as relaxed, dearer than others",
+    Fate.RELAXED: "dropped as relaxed, others cost less",
     Fate.UNSOUND: "relaxed, but too deep in an obstacle or away from the goal",
-    Fate.TRACKED: "dropped as tracked, dearer than others",
+    Fate.TRACKED: "dropped as tracked, others cost less",
 }
 OUTER = 12  # outer iterations that are told, the last ones
 

@@ -54,7 +54,7 @@ def knots_told(knots: Sequence[int], t: Tensor | None) -> str:
 def caught_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None, depth: float = 0.0) -> str | None:
     """Where X (1, N+1, n), U (1, N, m) lies deeper than `depth`, m, in obstacles; None where it doesn't.
 
-    Knots inside two obstacles or more are told first: there their gradients can cancel. Start and end are left out.
+    Knots inside two obstacles or more come first: there their gradients can cancel. Start and end are left out.
     """
     counts = torch.zeros(problem.N + 1, dtype=torch.int64)
     rows: list[tuple[int, Tensor]] = []

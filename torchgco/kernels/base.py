@@ -26,8 +26,9 @@ class InteriorKernels(Protocol):
         ...
 
     def kkt(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
-    ) -> KktSolve:
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
+        right: RightSides, give: Tensor | None = None,
+    ) -> KktSolve:  # fmt: skip
         """See `InteriorEngine.kkt`."""
         ...
 

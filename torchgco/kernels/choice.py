@@ -8,6 +8,7 @@ from collections.abc import Hashable
 import torch
 
 from torchgco.base.errors import InputError
+from torchgco.base.gradients import is_forward
 from torchgco.kernels.base import Kernels
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import TorchKernels
@@ -55,7 +56,7 @@ def kernels_of(problem: Problem) -> Kernels:
         if known.in_c:
             return known.in_c
     if known.in_pytorch is None:
-        check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
+        _check_eager(problem)
         known.in_pytorch = TorchKernels()
     return known.in_pytorch
 
@@ -65,9 +66,17 @@ def _natively(problem: Problem) -> NativeKernels | None:
     try:
         return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
     except (InputError, NativeError) as error:
-        check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
+        _check_eager(problem)
         _warn(warned, error)
         return None
+
+
+def _check_eager(problem: Problem) -> None:
+    """Raise InputError for code that PyTorch's kernels can't differentiate, and where they would nest forward mode."""
+    if is_forward():
+        expected = "kernels in C within forward_ad.dual_level; torch.autograd.functional.jvp serves with others"
+        raise InputError("solve", expected, "PyTorch's")
+    check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
 
 
 def _warn(warned: set[str], error: Exception) -> None:

@@ -39,7 +39,7 @@ class NativeKernels:
 
     Args:
         engine: the library of the problems' form.
-        warn: is told why something is left to PyTorch's kernels.
+        warn: is called with the reason why something is left to PyTorch's kernels.
     """
 
     name = "native"

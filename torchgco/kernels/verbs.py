@@ -33,7 +33,7 @@ def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor,
 
 
 def reproducible(problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """X (B, N+1, n) and U (B, N, m) of a problem's kernels, mended where PyTorch's rollout of U would not give X.
+    """X (B, N+1, n) and U (B, N, m) of a problem's kernels, repaired where PyTorch's rollout of U would not give X.
 
     The two kinds of kernels differ in the last bits. Where unstable dynamics amplify this, as a rollout of slightly
     different controls shows, PyTorch tracks X with the `gains` (b, N, m, n) of these rows (b,), and X and U of that

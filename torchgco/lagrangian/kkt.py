@@ -2,11 +2,12 @@
 
     [H  F' A'] [z]     [a]
     [F       ] [y] = - [b]        H the curvature of the Lagrangian, F the slopes of step(x, u) - x',
-    [A       ] [v]     [c]        A those of the rows that hold as equalities
+    [A    -D ] [v]     [c]        A those of the rows that hold: D = 0, or slack / multiplier of rows in a barrier
 
 The matrix is symmetric: the same solve gives products with its inverse from both sides. The interior point's Riccati
-recursion factors H + sigma A'A and F; steps with these factors close, round by round, what the last one has left open:
-of the rows A all but a share of about 1 / sigma, as the method of multipliers does, of all else all but rounding.
+recursion factors H + A'wA, w = 1 / (D + 1 / sigma), and F; steps with these factors close, round by round, what the
+last one has left open: of the rows A all but a share of about 1 / sigma, as the method of multipliers does, of all else
+all but rounding.
 """
 
 from __future__ import annotations
@@ -37,6 +38,6 @@ class KktSolve:
     z: Tensor  # (C, B, N+1, S)
     y: Tensor  # (C, B, N, n): of the gaps
     v: Tensor  # (C, B, R): 0 where a row isn't active
-    left: Tensor  # (C, B): the largest of c + A z, which is more than rounding where rows depend on each other
+    left: Tensor  # (C, B): the largest of c + A z - D v, more than rounding where rows depend on each other
     costates: Tensor  # (B, N+1, n) that make the Lagrangian stationary in the states; those of knot 0 are 0
     definite: Tensor  # (B,) bool: the minimum is strict, H is positive definite where F z = 0 and A z = 0

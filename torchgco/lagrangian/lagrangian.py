@@ -62,9 +62,9 @@ class Multipliers:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
         if not isinstance(self.lam, tuple) or not all(isinstance(part, Tensor) for part in (*self.lam, self.mu)):
             raise InputError("warm", "multipliers that are tensors", type(self.lam).__name__)
-        want = Multipliers.zero(problem, 0.0)
-        for mine, theirs in ((self.lam, want.lam), ((self.mu,), (want.mu,))):
-            got, expected = ([tuple(t.shape) for t in tensors] for tensors in (mine, theirs))
+        want = [(problem.B, *shape) for shape in problem.row_shapes]
+        for mine, expected in ((self.lam, want), ((self.mu,), [(problem.B,)])):
+            got = [tuple(part.shape) for part in mine]
             if got != expected:
                 raise InputError("warm", f"multipliers of shapes {expected}", got)
         for part in (*self.lam, self.mu):
@@ -111,7 +111,7 @@ def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool)
 def binding(sense: Sense, c: Tensor, lam: Tensor) -> Tensor:
     """The multipliers (B, K, p) of rows c that bind, 0 elsewhere: at a slack that exceeds them.
 
-    An interior point's multipliers are above 0 on all inequalities; lam times slack is tiny, and the larger one tells.
+    An interior point's multipliers are above 0 on all inequalities: a row binds if its multiplier exceeds its slack.
     """
     return lam if sense == "equality" else torch.where(lam > -c, lam, 0.0)
 

@@ -20,6 +20,8 @@ FINE = 2**23  # nodes, at most, of fields with two nodes per cell and axis where
 NODES = 2**30  # of one field
 FAR = 1e6  # m: the distance where nothing is occupied
 MARGIN = 2  # nodes around the points of a cloud
+AT_ONCE = 2**17  # nodes whose distances are looked up together: Ctrl-C and SIGTERM wait for one such piece
+AFTER = 2.0  # s before a bar shows, in a terminal
 
 Unknown = Literal["occupied", "free"]
 
@@ -215,8 +217,6 @@ def _touched(cells: np.ndarray, outside: bool) -> np.ndarray:
 
 
 def _of_cloud(cloud: PointCloud, unknown: Unknown, resolution: float | None) -> DistanceField:
-    from scipy.spatial import cKDTree
-
     spacing = cloud.radius if resolution is None else float(check_value(resolution, float, "field.resolution"))
     if not 0.0 < spacing < np.inf:
         raise InputError("field.resolution", "a length above 0 m, as the cloud's radius is 0", spacing)
@@ -229,11 +229,25 @@ def _of_cloud(cloud: PointCloud, unknown: Unknown, resolution: float | None) -> 
     _check_count(counts.tolist())
     shape = counts.astype(int)
     values = np.full((len(clouds), *shape), FAR, np.float32)
-    offsets = spacing * np.stack(np.meshgrid(*(np.arange(size) for size in shape), indexing="ij"), axis=-1)
     for i, points in enumerate(clouds):
         if len(points):
-            values[i] = cKDTree(points).query((offsets + origin[i]).reshape(-1, d))[0].reshape(shape) - cloud.radius
+            _write_distances(points, values[i], origin[i], spacing)
+            values[i] -= np.float32(cloud.radius)
     return DistanceField(values, origin, spacing, cloud, unknown)
+
+
+def _write_distances(points: np.ndarray, values: np.ndarray, origin: np.ndarray, spacing: float) -> None:
+    """Distances of the nodes from the nearest of some points (P, d), into `values`."""
+    from scipy.spatial import cKDTree
+    from tqdm import tqdm
+
+    # Halved at the middle, not at the median, and with larger leaves the tree answers in a third of the time.
+    tree = cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
+    flat, numbers = values.reshape(-1), range(0, values.size, AT_ONCE)
+    for first in tqdm(numbers, "distances from points", delay=AFTER, leave=False, dynamic_ncols=True, disable=None):
+        some = np.arange(first, min(first + AT_ONCE, flat.size))
+        places = origin + spacing * np.stack(np.unravel_index(some, values.shape), axis=-1)
+        flat[some] = tree.query(places, workers=torch.get_num_threads())[0]
 
 
 def _check_count(counts: list[float]) -> None:

@@ -12,6 +12,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 
 OCCUPIED_FROM = 0.5  # the probability from which a cell counts as occupied
+LETHAL, NO_COST = 254, 255  # costs in ROS's navigation: an obstacle in the cell, and unknown
+LEVEL = 1e-6  # of a quaternion's x, y and z: less is no turn
 CELLS = 2**30  # of one grid: more is a mistake in the resolution
 
 
@@ -62,6 +64,74 @@ class OccupancyGrid:
             raise InputError("grid.origin", expected, f"shape {origin.shape} for cells {cells.shape}")
         for name, value in (("occupied", cells), ("origin", origin), ("resolution", resolution)):
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_costmap(cls, costs: Any, origin: Any, resolution: Any, occupied_from: int = LETHAL) -> OccupancyGrid:
+        """The grid of a costmap of ROS's navigation: lethal cells are occupied, 255 is unknown.
+
+        Costs of inflation, below 254, are left out: a vehicle keeps its own radius.
+
+        Args:
+            costs: (height, width), whole numbers from 0 to 255, rows from the lowest y up, as `Costmap2D` has them.
+            origin: (2,), m.
+            resolution: side of a cell, m.
+            occupied_from: the least cost of an occupied cell; 253 adds those where a robot's inscribed circle touches.
+
+        Raises:
+            InputError: another shape, or costs out of range.
+        """
+        held = np.asarray(costs)
+        if held.ndim != 2 or held.dtype.kind not in "iu":
+            got = f"{held.dtype} of shape {held.shape}"
+            raise InputError("grid.costs", "whole numbers (height, width)", got)
+        if ((held < 0) | (held > NO_COST)).any():
+            raise InputError("grid.costs", f"0 to {NO_COST}", f"{held.min()} to {held.max()}")
+        cells = np.where(held == NO_COST, np.float32("nan"), (held >= occupied_from).astype(np.float32))
+        return cls(cells.T, origin, resolution)
+
+    @classmethod
+    def from_esdf(cls, distances: Any, origin: Any, resolution: Any) -> OccupancyGrid:
+        """The grid of a distance field of another program, whose values stand for the centres of cells.
+
+        Cells are occupied where the distance is at most 0, NaN is unknown. A `DistanceField` of the grid has exact
+        distances from these cells; others' are often approximate, or end at a largest one.
+
+        Args:
+            distances: (X, Y[, Z]), or (B, ...), m; negative inside, or 0 in occupied cells.
+            origin, resolution: as of the grid.
+
+        Raises:
+            InputError: no floating numbers, or none that is positive.
+        """
+        held = np.asarray(distances)
+        if held.dtype.kind != "f" or not (held > 0).any():
+            got = f"{held.dtype} of shape {held.shape}" if held.dtype.kind != "f" else "none above 0"
+            raise InputError("grid.distances", "floating numbers, m, above 0 in free cells", got)
+        cells = np.where(np.isnan(held), np.float32("nan"), (held <= 0).astype(np.float32))
+        return cls(cells, origin, resolution)
+
+    @classmethod
+    def from_ros(cls, message: Any) -> OccupancyGrid:
+        """The grid of a message nav_msgs/OccupancyGrid: percent as probabilities, -1 unknown.
+
+        Raises:
+            InputError: a message of another kind, data of another length, an origin that is turned.
+        """
+        try:
+            info, data = message.info, np.asarray(message.data)
+            place, turn = info.origin.position, info.origin.orientation
+            shape = int(info.height), int(info.width)
+        except (AttributeError, TypeError, ValueError):
+            raise InputError("grid.message", "a nav_msgs/OccupancyGrid, with info and data", shown(message)) from None
+        if max(abs(turn.x), abs(turn.y), abs(turn.z)) > LEVEL:
+            expected = "an origin that isn't turned; `read` turns grids of bags"
+            raise InputError("grid.message", expected, f"a quaternion with {turn.x:g}, {turn.y:g}, {turn.z:g}")
+        data = data.astype(np.int8) if data.dtype.kind in "iu" else data
+        if data.shape != (shape[0] * shape[1],) or data.dtype.kind != "i" or (data > 100).any():
+            expected = f"{shape[0]} x {shape[1]} whole numbers from -1 to 100"
+            raise InputError("grid.message", expected, f"{data.dtype} of shape {data.shape}")
+        cells = np.where(data < 0, np.float32("nan"), data.astype(np.float32) / np.float32(100.0))
+        return cls(cells.reshape(shape).T, [place.x, place.y], info.resolution)
 
     @property
     def d(self) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
-from torchgco.maps.grid import coordinates, number
+from torchgco.maps.grid import CELLS, OccupancyGrid, coordinates, number
 
 POINTS = 2**28  # of one cloud
 
@@ -64,6 +64,36 @@ class PointCloud:
     def clouds(self) -> list[np.ndarray]:
         """The points (P', d) of each problem's cloud, or of the one that all share, without rows of NaN."""
         return [cloud[np.isfinite(cloud[:, 0])] for cloud in self.points.reshape(-1, *self.points.shape[-2:])]
+
+    def rasterised(self, resolution: float) -> OccupancyGrid:
+        """The cells that the balls reach into, as a grid around them: at most a cell's diagonal more than the balls.
+
+        Args:
+            resolution: side of a cell, m.
+
+        Raises:
+            InputError: a resolution that isn't a finite length above 0, clouds of several problems, too many cells.
+        """
+        side = number(resolution, "resolution")
+        if not 0.0 < side < np.inf:
+            raise InputError("resolution", "a finite length above 0 m", resolution)
+        if self.batch is not None:
+            raise InputError("cloud.points", "one cloud; `single` takes one of several", f"{self.batch} clouds")
+        (points,) = self.clouds()
+        points = points if len(points) else np.full((1, self.d), np.nan)
+        low = np.nan_to_num(points.min(0)) - self.radius - side
+        count = np.ceil((np.nan_to_num(points.max(0)) + self.radius + side - low) / side)
+        if np.prod(count) > CELLS:
+            raise InputError("resolution", f"cells of which the cloud takes at most {CELLS:,}", resolution)
+        occupied = np.zeros(count.astype(int), bool)
+        points = points[np.isfinite(points[:, 0])]
+        own, reach = np.floor((points - low) / side).astype(int), int(np.ceil(self.radius / side))
+        for offset in np.ndindex(*[2 * reach + 1] * self.d):
+            cell = own + np.array(offset) - reach
+            corner = low + side * cell
+            away = np.linalg.norm(points - np.clip(points, corner, corner + side), axis=1)
+            occupied[tuple(cell[away <= self.radius].T)] = True
+        return OccupancyGrid(occupied, low, side)
 
     def __repr__(self) -> str:
         batch = "" if self.batch is None else f"{self.batch} of "

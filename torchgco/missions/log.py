@@ -28,7 +28,7 @@ class MissionLog:
     plan: Tensor  # (B, K, N+1, 3): planned positions, m
     cost: Tensor  # (B, K): of the plan
     violation: Tensor  # (B, K): of the plan
-    shifted: Tensor  # (B, K): 1 where the former plan was kept, else 0
+    shifted: Tensor  # (B, K): 1 where the previous plan was kept, else 0
     guided: Tensor  # (B, K): outer iterations with guidance on
     iterations: Tensor  # (B, K): of the planner's solve
     planner_seconds: Tensor  # (B, K): of the batch's solve, divided by its missions

@@ -59,7 +59,7 @@ class Mission:
         duration: s, after which a mission ends with TIMEOUT.
         goal_radius: m, within which the goal counts as reached; None: the problems' own.
         latency: control periods between a measurement and the first use of the plan made from it, 0 or 1. With 1, a
-            plan starts where the former plan leads within the period, and without `first_step`.
+            plan starts where the previous plan leads within the period, and without `first_step`.
         sensor: what the vehicle knows of the obstacles: "full", all of them from the start, or what a "lidar" or a
             "depth" camera sees on the way.
         unknown: what plans make of space that hasn't been seen, with a lidar or a depth camera: "occupied" stay out of

@@ -43,7 +43,7 @@ class Plan:
     penalty: Tensor  # (B,): mu from which plans that continue this one start
     cost: Tensor
     violation: Tensor
-    shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
+    shifted: Tensor  # bool: the previous plan one stage later, as the new one was infeasible
     guided: Tensor  # int64: outer iterations with guidance on
     iterations: Tensor  # int64: of all solves for this plan
     measured: Tensor  # (B, 17): the plants' states
@@ -55,7 +55,7 @@ class Plan:
     def continued(self, problem: Problem) -> Multipliers:
         """The multipliers one stage later; where a group of obstacles ends, a knot takes those of the next group.
 
-        What one period raises the penalty by doesn't stay: over a mission it would grow beyond all measure.
+        The penalty is reset in every period; over a mission it would otherwise grow without bound.
         """
         held, parts = self.multipliers.lam, problem.constraints
         lam = [shifted(own) for own in held]
@@ -84,7 +84,7 @@ class Plan:
 TRAJECTORY = ("X", "U", "K", "multipliers", "penalty", "cost", "violation", "shifted")
 OTHERS = ("guided", "iterations", "measured", "bias", "arrived")
 AGAIN = 10  # control periods after which a plan that only waits, where one before it arrived, is sought again
-CONTINUED = 4  # outer iterations at most that continue a former plan
+CONTINUED = 4  # outer iterations at most that continue a previous plan
 MIN_SECONDS = 1e-4  # s, of a time limit
 
 
@@ -93,23 +93,23 @@ class Planner:
     """Solves the planning problem from every measured state.
 
     A first plan is the solver's. Later, where the solver makes attempts around a local solver (`gco`), the local solver
-    continues from the former plan for up to four outer iterations. Where the result is infeasible, the former plan one
-    stage later is flown if it is less violated; where that is infeasible, too, the whole solver searches again. So it
-    does every ten periods where plans end short of the goal and an earlier one didn't: what a search returned that
+    continues from the previous plan for up to four outer iterations. Where the result is infeasible, the previous plan
+    one stage later is flown if it is less violated; where that is infeasible, too, the whole solver searches again. So
+    it does every ten periods where plans end short of the goal and an earlier one didn't: what a search returned that
     found no way waits, and is feasible.
 
     Args:
         solver: any solver of the library.
-        feedback: a former plan is continued by its controls and their feedback gains, which bring the measured state
+        feedback: a previous plan is continued by its controls and their feedback gains, which bring the measured state
             back to it. Without, by its controls alone, as in the paper: over a long horizon a small difference of the
             state then leads metres away.
-        multipliers: "shifted" starts from those of the former plan one stage later, "reset" from zero, as the paper.
+        multipliers: "shifted" starts from those of the previous plan one stage later, "reset" from zero, as the paper.
         max_seconds: time limit of a plan, s; None: none. With a limit, results depend on the machine.
-        tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one; what the
+        tolerance: violation (m for lengths) up to which a plan is flown without a look at the previous one; what the
             margin has for the way between two knots comes on top. Infinity: a new plan always is, as in the paper,
             unless its violation is not a number.
         margin: by which obstacles are grown, m, and above 0 by as much more as a straight step between two knots of the
-            former plan may lead into them; margin_growth: by how much more per second of the horizon, m/s, in four
+            previous plan may lead into them; margin_growth: by how much more per second of the horizon, m/s, in four
             steps.
         first_step: the body rates of the second knot are the ones that the rotors lead to (`FirstStepRates`).
         estimation: gain per control period of an estimated constant acceleration that the planning model lacks, for
@@ -227,7 +227,7 @@ class Planner:
 
 
 def _brought_back(problem: Problem, before: Plan) -> Tensor:
-    """The controls (B, N, 4) of former plans one stage later, with feedback where that has the better Lagrangian.
+    """The controls (B, N, 4) of previous plans one stage later, with feedback where that has the better Lagrangian.
 
     Gains along a plan that is far from stationary may lead away.
     """
@@ -254,7 +254,7 @@ class _Solve:
         return replace(plan, arrived=self._arrives(plan))
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
-        """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
+        """Plans that continue previous ones, which are flown one stage later by U0 (B, N, 4)."""
         multipliers = before.continued(self.problem)
         warm = multipliers if self.planner.multipliers == "shifted" else None
         plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids), self.allowed)
@@ -306,7 +306,7 @@ class _Solve:
         return None if limit is None else max(MIN_SECONDS, limit - (time.perf_counter() - self.began))
 
     def _keep_former(self, plan: Plan, before: Plan, U: Tensor, multipliers: Multipliers) -> None:
-        """Put former plans, flown one stage later by U, in the place of new ones that are infeasible and worse."""
+        """Put previous plans, flown one stage later by U, in the place of new ones that are infeasible and worse."""
         rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         if rows.numel() == 0:
             return
@@ -337,10 +337,9 @@ class _Solve:
 
 
 def _penalty(multipliers: Multipliers, allowed: Tensor) -> Tensor:
-    """mu (B,) with which multipliers that are wrong by as much as they are large leave the allowed violation (B,).
+    """The penalty mu (B,) at which a multiplier error of 100 % causes the allowed violation (B,).
 
-    The mu of a solve's end is none to continue from: AL-iLQR raises it to where solves are stiff, and the interior
-    point has none.
+    The final penalty of a solve isn't used: AL-iLQR raises it until solves are stiff, and the interior point has none.
     """
     largest = torch.zeros_like(multipliers.mu)
     for lam in multipliers.lam:

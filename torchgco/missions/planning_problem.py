@@ -118,7 +118,7 @@ class Margin:
         """How deep vehicles get into the margin before any control has an effect, (B,), m.
 
         At most to where a quarter of the clearance from contact is left. Obstacles of `problem` are as at time 0, its
-        states as at time t, s; U are the controls (B, N, m) of the former plan.
+        states as at time t, s; U are the controls (B, N, m) of the previous plan.
         """
         p = open_loop(problem, U)[:, : BLIND + 1, problem.position]
         times = torch.arange(p.shape[1], dtype=p.dtype) * float(problem.dynamics.dt)

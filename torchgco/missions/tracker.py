@@ -139,4 +139,5 @@ class Tracker:
         lower, upper = [-math.inf] * 3 + [frame.thrust_min] * 4, [math.inf] * 3 + [frame.thrust_max] * 4
         limits = RotorLimits(frame) if self.limits == "commands" else StateBounds(lower, upper)
         model = RotorTracking(self.dt, airframe=frame)
-        return Problem(model, cost, [ThrustSum(acceleration, frame.mass), limits], x0, self.stages)
+        problem = Problem(model, cost, [ThrustSum(acceleration, frame.mass), limits], x0, self.stages)
+        return problem.renewed()  # nobody else holds its parts: no call has to look whether they have changed

@@ -75,15 +75,17 @@ class InteriorEngine:
         return out | ends
 
     def kkt(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides
-    ) -> KktSolve:
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
+        right: RightSides, give: Tensor | None = None,
+    ) -> KktSolve:  # fmt: skip
         """Solutions of linear systems with the matrix of the KKT conditions.
 
         Args:
             X, U: (B, N+1, n), (B, N, m), contiguous.
             multipliers: of every constraint, (B, K, p); those of rows that aren't active count as 0.
-            active: which rows hold as equalities, (B, R) bool; all of equalities do.
+            active: which rows hold, (B, R) bool; all of equalities do.
             right: the right hand sides.
+            give: D (B, R) of the rows that hold; None: 0.
         """
         B, n, free = problem.B, problem.n, problem.free_start
         out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
@@ -98,7 +100,7 @@ class InteriorEngine:
         run(
             self.library.tgco_kkt, B, LANES,
             Kkt.complete(
-                of=packed, active=active.double().contiguous(), y=costates, left=left, **sides, problems=B,
+                of=packed, active=active.double().contiguous(), give=give, y=costates, left=left, **sides, problems=B,
                 free_start=None if free is None else free.double().contiguous(), count=right.a.shape[0],
                 rounds=ROUNDS, stiff=STIFF, pivot=PIVOT,
             ),

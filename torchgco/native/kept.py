@@ -1,4 +1,4 @@
-"""Problems that stay packed for the interior point in C from call to call: only their numbers are written anew."""
+"""Problems that stay packed for the interior point in C from call to call: only their numbers are written again."""
 
 from __future__ import annotations
 

@@ -170,6 +170,7 @@ class Interior(Structure):
         ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
         ("double", "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest explodes relaxes"),
         ("double", "pivot noise rounding soft_growth soft_decay forced_growth"),
+        ("double", "smoothing"),  # mu in units of the cost, at which the barrier stays; 0: it falls
         ("double", "seconds"),  # after which problems end with TIME_LIMIT; infinite: never
     )
     _fields_ = fields(declared)
@@ -180,7 +181,8 @@ class Kkt(Structure):
 
     declared = (
         ("const Problem *", "of"),
-        ("const double *", "free_start active"),  # as in Interior; (E, R): 1 where a row holds as an equality
+        ("const double *", "free_start active"),  # as in Interior; (E, R): 1 where a row holds
+        ("const double *", "give"),  # (E, R): by which rows that hold give way to their multipliers; NULL: 0
         ("double *", "a b c"),  # (C, E, N+1, NX+NU), (C, E, N, NX), (C, E, R): right hand sides in, z, y, v out
         ("double *", "y left"),  # (E, N+1, NX): costates; (C, E): largest of what active rows leave open
         ("int64_t", "problems count rounds"),  # E, C

@@ -72,7 +72,7 @@ class Obstacles(Constraint):
 
     A kind of obstacles is a subclass with the fields below. It must define
 
-        bind, value, at, accumulate           as any constraint; `grown` too, or its chords can't be mended
+        bind, value, at, accumulate           as any constraint; `grown` too, or its chords can't be repaired
         absent, margins                       which obstacles there are, and their lengths
         signed_distance, segment_clearance    distances of points and of segments
 

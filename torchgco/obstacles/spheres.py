@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, space_of
-from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.constraints.base import Constraint, Sense, count_of, resolve_knots
 from torchgco.obstacles.base import ABSENT, TOUCH, Obstacles, Solids, least, picked
 from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.obstacles.body import Body
@@ -133,6 +133,9 @@ class BoundSpheres(Obstacles):
 
     def bind(self, dims: Dimensions) -> Self:
         return self
+
+    def row_shape(self, N: int) -> tuple[int, int]:
+        return count_of(self.knots, N + 1), self.absent.shape[1]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         p = X[:, self.knots, self.position]

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
-from torchgco.plotting.bodies import ABOVE, Body, Plane
+from torchgco.plotting.bodies import ABOVE, Ball, Body, Plane
 from torchgco.plotting.grid import grid, put_head
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
@@ -161,38 +161,55 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass
 
     Args:
         leads: where each of some trajectories passes them, by its colour. Obstacles at rest are cut where the first
-            passes, moving ones drawn where each comes closest to them, outlined in its colour.
+            passes, moving ones drawn where each comes closest to them, dashed in its colour, with the vehicle as
+            large as it is then: what lies between the two is their distance.
     """
     kinds = set[str]()
     for first, (colour, lead) in enumerate(leads.items()):
-        held: dict[str, list[np.ndarray]] = {"near": [], "own": [], "grown": [], "moving": [], "passed": []}
+        held: dict[str, list[np.ndarray]] = {"near": [], "own": [], "grown": [], "moving": [], "vehicle": []}
         for body, place in zip(scene.bodies[i], lead, strict=True):
-            if (body.moving and place.distance > FAR * _way(scene, i)) or (first > 0 and not body.moving):
+            if (body.moving and _is_far(scene, i, place)) or (first > 0 and not body.moving):
                 continue
             own, grown = _shapes(body, scene, place, plane)
             near = place.distance < NEAR * _way(scene, i)
             if own is not None:
                 held["moving" if body.moving else "own"].append(own)
-            if grown is not None and scene.margin > 0:
-                held["passed" if body.moving else "grown"].append(grown)
-            if grown is None and near:
+            if grown is not None and scene.margin > 0 and not body.moving:
+                held["grown"].append(grown)
+            if near and (own if body.moving else grown) is None:
                 held["near"].append(body.outline(0.0, plane, place.t))
             if body.moving and (grown is not None or near):
                 kinds.add("moving")
                 _draw_motion(ax, body, place, plane, colour)
+                held["vehicle"].append(Ball(place.place, scene.margin, np.zeros(scene.dimension)).outline(0.0, plane))
         looks: dict[str, dict[str, Any]] = {
             "near": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.7, "linestyle": ":"},
             "own": {"facecolor": STONE, "linewidth": 0.0},
             "grown": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.6},
             # Several trajectories pass a moving obstacle at several places, which may overlap.
-            "moving": {"facecolor": (*to_rgb(STONE), 0.6), "edgecolor": colour, "linewidth": 0.5},
-            "passed": {"facecolor": "none", "edgecolor": colour, "linewidth": 0.8, "linestyle": "-"},
+            "moving": {"facecolor": (*to_rgb(STONE), 0.35), "edgecolor": colour, "linewidth": 0.9, "linestyle": "--"},
+            "vehicle": {"facecolor": (*to_rgb(colour), 0.25), "edgecolor": colour, "linewidth": 0.9},
         }
         for zorder, (kind, shapes) in enumerate(held.items()):
             if shapes:
                 ax.add_collection(PolyCollection(shapes, zorder=0.2 + 0.1 * zorder, **looks[kind]), autolim=False)
-                kinds.add("grown" if kind == "passed" else kind)
+                kinds.add(kind)
     return kinds
+
+
+def moving_corners(scene: Scene, i: int, path: np.ndarray) -> list[np.ndarray]:
+    """Lower and upper corners (2, d), m, of the moving obstacles where `draw_obstacles` draws them for a path."""
+    found = []
+    for body, place in zip(scene.bodies[i], passes(scene, i, path), strict=True):
+        if body.moving and not _is_far(scene, i, place):
+            corners = body.corners + body.at(place.t) - body.at(0.0)
+            found.append(np.stack([corners.min(0) - body.radius, corners.max(0) + body.radius]))
+    return found
+
+
+def _is_far(scene: Scene, i: int, place: Pass) -> bool:
+    """Whether a flight stays so far from an obstacle that moves that this isn't drawn."""
+    return place.distance > FAR * _way(scene, i)
 
 
 def _shapes(body: Body, scene: Scene, place: Pass, plane: Plane) -> list[np.ndarray | None]:
@@ -204,21 +221,21 @@ def _shapes(body: Body, scene: Scene, place: Pass, plane: Plane) -> list[np.ndar
 
 
 def _draw_motion(ax: Axes, body: Body, place: Pass, plane: Plane, colour: str) -> None:
-    """A moving body's last second, the time when it is passed, and where the vehicle is then."""
+    """A moving body's last second, the time when it is passed, and the vehicle's centre then."""
     way = body.at(np.array([max(0.0, place.t - TRAIL), place.t]))[:, plane]
     ax.plot(*way.T, color=colour, linewidth=0.9, zorder=1)
     at = place.place[list(plane)]
-    ring: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markersize": 5, "linestyle": "none"}
-    ax.plot(*at, color=colour, zorder=5, **ring)
+    ax.plot(*at, color=colour, zorder=5, marker="o", markersize=2.5, linestyle="none")
     look: dict[str, Any] = {"ha": "center", "va": "center", "clip_on": True, "zorder": 5}
-    ax.text(float(way[-1, 0]), float(way[-1, 1]), f"{place.t:.1f}", fontsize=SMALL - 2, color=INK, **look)
+    ax.text(float(way[-1, 0]), float(way[-1, 1]), f"{place.t:.1f} s", fontsize=SMALL - 2, color=colour, **look)
 
 
 def moving_handles(whose: str, colour: str) -> list[Artist]:
     """The legend's entries of moving obstacles, drawn when some trajectory passes them."""
-    ring: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markersize": 8, "linestyle": "none"}
-    passed = Line2D([], [], color=colour, label=f"moving obstacle as {whose} passes (number: time [s])", **ring)
-    return [passed, Line2D([], [], color=colour, linewidth=0.9, label="its last second")]
+    look: dict[str, Any] = {"edgecolor": colour, "linewidth": 0.9}
+    passed = Patch(facecolor=(*to_rgb(STONE), 0.35), linestyle="--", label=f"moving obstacle as {whose} passes", **look)
+    vehicle = Patch(facecolor=(*to_rgb(colour), 0.25), label="and the vehicle then", **look)
+    return [passed, vehicle, Line2D([], [], color=colour, linewidth=0.9, label="the obstacle's last second")]
 
 
 def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane: Plane) -> set[str]:

@@ -23,7 +23,17 @@ from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.bodies import ABOVE, Plane
 from torchgco.plotting.gates import Outline, draw_gates, outlines
-from torchgco.plotting.layouts import EDGE, MARKED, SIDE, STONE, draw_obstacles, draw_targets, marker, moving_handles
+from torchgco.plotting.layouts import (
+    EDGE,
+    MARKED,
+    SIDE,
+    STONE,
+    draw_obstacles,
+    draw_targets,
+    marker,
+    moving_corners,
+    moving_handles,
+)
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import flown, leaving, passes, view
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
@@ -153,6 +163,8 @@ class _Map:
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
         boxes = [view(scene, [0], kept, others) for scene in world.scenes]
         box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+        moving = [c for scene in world.scenes for course in courses for c in moving_corners(scene, 0, course.paths[0])]
+        box = np.stack([np.min([box[0], *(c[0] for c in moving)], 0), np.max([box[1], *(c[1] for c in moving)], 0)])
         for course in courses:
             centers, radii = world.balls(course.X[: len(flown(course.paths[0]))])
             for i, radius in enumerate(radii if course.keeps else ()):

@@ -1,4 +1,4 @@
-"""A problem's parts as the user gave them, from which it is bound anew where their numbers have changed since.
+"""A problem's parts as the user gave them, from which it is bound again where their numbers have changed since.
 
 A problem holds numbers alone: solvers, pictures and judges never meet a gradient. Where tensors that it was given ask
 for gradients, its parts are bound once more, with gradients recorded, when a solution is to be differentiated.
@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.base.gradients import leaves, recording, without_gradients
+from torchgco.base.gradients import asking, leaves, recording, without_gradients
 from torchgco.base.shapes import as_states, check_untransformed
 from torchgco.problem.free_start import moved_inside
-from torchgco.problem.goal import with_goal, without_goal
+from torchgco.problem.goal import Goal, with_goal, without_goal
 
-PARTS = "dynamics", "cost", "constraints", "x0"  # tensors of a goal that ask for gradients are refused when it is bound
+# A goal that is only stated changes no minimum: where its tensors ask for gradients they are refused when it is bound.
+PARTS = "dynamics", "cost", "constraints", "x0", "time"
 
 
 @dataclass(frozen=True)
@@ -48,13 +49,13 @@ class Given:
     def of(cls, fields: Mapping[str, Any]) -> Given:
         """That of a problem's fields; InputError within a transform of torch.func or torch.compile."""
         check_untransformed("Problem")
-        asks = any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves([fields[name] for name in PARTS]))
+        asks = bool(asking([fields[name] for name in _live(fields)]))
         return cls(dict(fields), tuple(_facts(fields)), asks)
 
     @property
     def numbers(self) -> dict[str, Any]:
         """The fields that hold tensors that ask for gradients, without these."""
-        return {name: without_gradients(self.fields[name]) for name in PARTS} if self.asks else {}
+        return {name: without_gradients(self.fields[name]) for name in _live(self.fields)} if self.asks else {}
 
     def followed(self, whole: Any, by: Callable[[Any], Any]) -> Given:
         """The same of what is made of a problem, `whole`."""
@@ -70,7 +71,7 @@ class Given:
         return Given.of({**self.fields, **fields})
 
     def current(self, problem: Any) -> Any:
-        """`problem`, which is of these parts; bound anew where their numbers have changed since."""
+        """`problem`, which is of these parts; bound again where their numbers have changed since."""
         facts = tuple(_facts(self.fields))
         if facts == self.facts:
             return problem
@@ -88,6 +89,8 @@ class Given:
             goal = self.fields["goal"]
             rows = [part.bind(dims) for part in without_goal(goal, dims, self.fields["constraints"])]
             parts["constraints"] = with_goal(goal, rows, dims)
+            if self.fields["time"] is not None:
+                parts["time"] = self.fields["time"].bind(dims)
             parts["x0"] = moved_inside(x0, whole.free_start, parts["constraints"])
             return self._applied(whole._with(parts))
 
@@ -96,6 +99,12 @@ class Given:
         for step in self.then:
             problem = step(problem)
         return problem
+
+
+def _live(fields: Mapping[str, Any]) -> tuple[str, ...]:
+    """The fields whose tensors may ask for gradients."""
+    goal = fields["goal"]
+    return (*PARTS, "goal") if isinstance(goal, Goal) and goal.required is True else PARTS
 
 
 def place(part: Any, parts: Sequence[Any]) -> int | None:
@@ -111,7 +120,7 @@ def replaced(parts: Sequence[Any], old: Sequence[Any], new: Sequence[Any]) -> li
 
 @dataclass(frozen=True, eq=False)
 class _Itself:
-    """An object that is equal to itself alone; what it holds is looked at elsewhere, or read anew."""
+    """An object that is equal to itself alone; what it holds is looked at elsewhere, or read again."""
 
     held: Any
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
-from torchgco.base.tree import Rows, cast
+from torchgco.base.tree import Rows, cast, is_users
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds
+from torchgco.constraints.bounds import ControlBounds, RateBounds, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
@@ -162,8 +162,8 @@ class Problem:
 
     @property
     def control_bounds(self) -> ControlBounds | None:
-        """The first bounds on controls; None where there are none."""
-        return next((c for c in self.constraints if isinstance(c, ControlBounds)), None)
+        """The bounds on controls, those of several parts as one; None where there are none."""
+        return joined_bounds([c for c in self.constraints if isinstance(c, ControlBounds)], self.N)
 
     @cached_property
     def start_is_clear(self) -> Tensor:
@@ -205,11 +205,13 @@ class Problem:
         """Knots and rows of every constraint; the same for all problems of a form."""
         shapes = self.known.row_shapes
         if shapes is None:
+            stated = [None if is_users(part) else part.row_shape(self.N) for part in self.constraints]
             # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
-            one = self.take(slice(0, 1))
+            one = self.take(slice(0, 1)) if None in stated else self
             X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-            found = [c.value(X, U).shape for c in one.constraints]
-            shapes = self.known.row_shapes = tuple((knots, rows) for _, knots, rows in found)
+            parts = zip(stated, one.constraints, strict=True)
+            found = [shape or part.value(X, U).shape[1:] for shape, part in parts]
+            shapes = self.known.row_shapes = tuple((knots, rows) for knots, rows in found)
         return shapes
 
     @property
@@ -239,10 +241,12 @@ class Problem:
         return {f.name: getattr(self.current(), f.name) for f in fields(self)} | {"known": Known()}
 
     def take(self, index: Rows) -> Self:
-        """The problems in `index` (int64, (B',), or a slice); a row may occur more than once.
+        """The problems in `index` (int64, (B',), or a list or slice); a row may occur more than once.
 
         All of them in their order are this problem itself, with what is known of it.
         """
+        if isinstance(index, list):
+            index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
         if _is_whole(index, self.B):
             return self
         parts = {

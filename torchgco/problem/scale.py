@@ -35,7 +35,8 @@ def cost_scale(
 ) -> CostScale:
     """The mean cost per stage of staying at the start at rest, without its constant.
 
-    A thousandth of the controls' mean curvature is added; only this is left where the start is the goal.
+    A thousandth of the controls' mean curvature is added, of controls with narrow bounds times half their range
+    squared; only this is left where the start is the goal.
 
     Args:
         total: the cost of staying at the start, (B,).
@@ -49,12 +50,13 @@ def cost_scale(
     if stages is not None:
         own = torch.arange(count, device=total.device) < stages.unsqueeze(-1)
         curvatures, N = torch.where(own.unsqueeze(-1), curvatures, 0.0), stages
-    # Contiguous and one axis at a time: the order of summation must not depend on the batch.
-    curvature = curvatures.abs().contiguous().sum(-1).sum(-1) / (N * m)
-    idle = torch.full_like(curvatures[:, 0], UNBOUNDED)
+    idle, sizes = torch.full_like(curvatures[:, 0], UNBOUNDED), torch.ones_like(curvatures[:, 0])
     if bounds is not None:
         half = 0.5 * bounds.range
         idle = torch.where(torch.isfinite(half), BOUNDED * half.clamp(max=1.0), idle)
+        sizes = torch.where(half < NARROW, half, sizes)
+    # Contiguous and one axis at a time: the order of summation must not depend on the batch.
+    curvature = (curvatures.abs() * sizes.square().unsqueeze(1)).contiguous().sum(-1).sum(-1) / (N * m)
     idly = (curvatures.abs() * idle.square().unsqueeze(1)).contiguous().sum(-1).sum(-1) / m
     least, constant = LEAST_UNIT * curvature, torch.zeros_like(total)
     if changes is not None:
@@ -72,7 +74,8 @@ def reach(dynamics: Dynamics, X: Tensor, bounds: ControlBounds | None) -> tuple[
     """How far states and controls go from the start, (B, 1, n) and (B|1, 1, m), at least where a cost is tried.
 
     By one and by as much as they are; of controls with narrow bounds half their range, and of states then what a
-    rollout at either bound reaches: in small units a cost of one unit's change would hide every other.
+    rollout with the controls there, or one unit away, reaches, where that is less: in small units a cost of one unit's
+    change would hide every other.
 
     Args:
         X: states that stay at the start, (B, N+1, n).
@@ -81,16 +84,17 @@ def reach(dynamics: Dynamics, X: Tensor, bounds: ControlBounds | None) -> tuple[
     half = None if bounds is None else 0.5 * bounds.range
     if half is None or bounds is None or not bool((half < NARROW).any()):
         return far, controls
-    narrow = (half < NARROW).all(-1).view(-1, 1, 1)
+    narrow = (half < NARROW).unsqueeze(1)
     places = []
-    for bound in (bounds.lower, bounds.upper):
+    for bound, side in ((bounds.lower, -1.0), (bounds.upper, 1.0)):
         x, u = X[:, 0], bound.flatten(1, -2).amax(1) if bound.dim() == 3 else bound
-        u = torch.where(torch.isfinite(u), u, 0.0).expand(len(x), -1)
+        u = torch.where(half < NARROW, u, side).expand(len(x), -1)
         for k in range(X.shape[1] - 1):
             x = dynamics.at(k).step(x, u)
             places.append((x - X[:, 0]).abs())
     reached = torch.stack(places).nan_to_num(0.0, 0.0, 0.0).amax(0).unsqueeze(1)
-    return torch.where(narrow & (reached > 0), reached, far), torch.where(narrow, half.unsqueeze(1), controls)
+    far = torch.where(narrow.any(-1, keepdim=True) & (reached > 0), torch.minimum(reached, far), far)
+    return far, torch.where(narrow, half.unsqueeze(1), controls)
 
 
 def changes_of(

@@ -1,7 +1,7 @@
 """Ways through maps that keep clear of obstacles as far as there is room: for vehicles that turn slowly.
 
 A path that is drawn taut turns at the very corners, where such a vehicle has to stop. These are the cheapest ways where
-all that is near an obstacle is dear, in the middle of doors, with their corners averaged.
+all that is near an obstacle is expensive, in the middle of doors, with their corners averaged.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
     """Ways (P, d), m, of the problem at place b, from block to block; in the plane one of each homotopy class.
 
     Of up to `count` classes, the cheapest first, and of as many more that are the cheapest where only the last of the
-    room is dear, as for paths that are drawn taut: a wide way round may be far dearer to fly. In space one.
+    room is expensive, as for paths that are drawn taut: a wide way round may cost far more to fly. In space one.
     """
 
     def search(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:

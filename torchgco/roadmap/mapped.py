@@ -32,7 +32,7 @@ from torchgco.roadmap.search import DIVERSITY, HOPS
 SEARCHES = ((2**18, 0.5, True), (2**18, 0.5, False), (2**18, 0.0, False), (2**21, 0.0, False))
 MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
 LEAST = 1e-6  # of the price: no edge may cost nothing
-LONGEST = 2.0  # times as dear as the cheapest one other paths may be
+LONGEST = 2.0  # times as expensive as the cheapest one other paths may be
 TRIED = 3  # candidates per path in space that are drawn taut, and compared with those before
 COMPARED = 32  # points of a path that are compared
 SAMPLES = 16  # along each axis, at which the price is evaluated
@@ -177,7 +177,7 @@ class Ways:
 
 
 def _smoothed(price: Price, points: Array, counts: tuple[int, ...]) -> Array:
-    """Prices (V,) at points, interpolated between a few of them: costs are smooth, and may be dear to evaluate."""
+    """Prices (V,) at points, interpolated between a few of them: costs are smooth, and may be expensive to evaluate."""
     low, high, d = points.min(0), points.max(0), points.shape[1]
     sizes = [min(n + 1, SAMPLES) for n in counts[:d]]
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, sizes, strict=True)]

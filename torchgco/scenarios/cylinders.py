@@ -19,7 +19,7 @@ class Cylinders(Quadrotor):
     """Upright cylinders, uniform in a rectangle, which may overlap: too tall to fly over, and the ground below.
 
     The published worlds are three files with 41, 81 and 162 cylinders of 1.0 to 1.5 m on 100 x 40 m; layouts here are
-    drawn anew by that rule. Cylinders have half spheres as ends, outside of the height that is flown in. How the
+    drawn again by that rule. Cylinders have half spheres as ends, outside of the height that is flown in. How the
     published ones are spread is not known beyond this.
 
     Args:

@@ -25,6 +25,7 @@ from torchgco.scenarios.layouts import Layouts
 VEHICLE_RADIUS, GOAL_RADIUS = 0.25, 0.3  # m, where neither the command nor the file says them
 CLEAR = 1.2  # drawn places are as free as for a vehicle of this many radii
 PACES = {2: 0.7, 3: 2.0}  # m/s, by the dimension of space
+READ = "resolution", "radius", "origin", "height", "topic", "layer", "box", "solid"  # fields that `read` takes
 APART = 0.4  # share of the free space's diagonal that drawn starts and goals are apart, at least
 
 
@@ -36,7 +37,7 @@ class MapFile(Scenario):
     space that is free for the vehicle, at least 0.4 of its diagonal apart, else as far as can be.
 
     Args:
-        path, resolution, radius, origin, height, topic, layer: see `read`.
+        path, resolution, radius, origin, height, topic, layer, box, solid: see `read`.
         unknown: what unknown cells count as.
         outside: what lies around a map's cells: "free", or "occupied", a rim of one cell.
         start, goal: positions (d,), m.
@@ -57,6 +58,8 @@ class MapFile(Scenario):
     height: float | None = None
     topic: str | None = None
     layer: Any = None
+    box: Any = None
+    solid: bool | None = None
     unknown: Unknown = "occupied"
     outside: Unknown = "free"
     start: Any = None
@@ -76,8 +79,7 @@ class MapFile(Scenario):
         put("name", "map")
         check_options(self, "scenario")
         put("path", os.path.expanduser(self.path))
-        options = {key: getattr(self, key) for key in ("resolution", "radius", "origin", "height", "topic", "layer")}
-        found = read(self.path, field="scenario", **options)
+        found = read(self.path, field="scenario", **{key: getattr(self, key) for key in READ})
         if self.outside == "occupied":
             if not isinstance(found, OccupancyGrid):
                 raise InputError("scenario.outside", "free: a cloud of points has no edge", self.outside)

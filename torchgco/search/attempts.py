@@ -115,7 +115,7 @@ class Best:
     def restore(self, rows: Tensor, touching: Tensor) -> None:
         """Take back the clear trajectories that cheaper ones of `rows` have replaced.
 
-        That is where these are still `touching` an obstacle, (b,) bool, or have become dearer by keeping clear.
+        That is where these are still `touching` an obstacle, (b,) bool, or have become more expensive by keeping clear.
         """
         for row, touches in zip(rows.tolist(), touching.tolist(), strict=True):
             one = self.spare.pop(row, None)

@@ -63,7 +63,7 @@ def inner_solver(iterations: int, share: float = 1.0) -> ILQR:
 
 
 def unwatched(done: int, total: int) -> None:
-    """The watch of candidates that nobody watches."""
+    """Ignores the progress of candidates."""
 
 
 @dataclass(frozen=True)

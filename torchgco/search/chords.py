@@ -38,7 +38,7 @@ class ClearChords(Row):
     Obstacles grow by 1.1 times the clearance that the last solve missed, or a little more, and the solve continues from
     the best trajectory. A trajectory is replaced where the new one is feasible for the obstacles as they are, has
     arrived if the old one had, and keeps more clearance between the knots. Openings may leave no room for it: there a
-    dearer trajectory of the passes before that is clear is taken back.
+    more expensive trajectory of the passes before that is clear is taken back.
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before; in maps, by the interior point alone,

@@ -65,8 +65,8 @@ class Direct(Row):
     @property
     def does(self) -> str:
         return (
-            f"interior point from the guess and from there; over {self.gap:.0%} dearer than without obstacles, what "
-            "drives along its heading is steered along the paths; search"
+            f"interior point from the guess and from there; over {self.gap:.0%} more expensive than without obstacles, "
+            "what drives along its heading is steered along the paths; search"
         )
 
     def run(self, search: Search) -> None:
@@ -98,7 +98,7 @@ class Direct(Row):
         return at.stop - at.start == 2 and bodies <= self.most and not mapped(problem)
 
     def _compared(self, search: Search, rows: Tensor, call: Call, end: SolveEnd, bound: Tensor) -> Tensor:
-        """Keep results of `rows` that are hardly dearer than a bound (b,); places (b',) of the others, which wait."""
+        """Keep results of `rows` that hardly exceed a bound (b,) on costs; places (b',) of the others, which wait."""
         serves = end.best.violation <= search.solver.violation_tolerance
         if ranks_arrival(call.problem):
             serves &= has_arrived(call.problem, end.best.X)

@@ -19,7 +19,7 @@ from torchgco.search.converge import solved_nearby
 from torchgco.solvers.interior import InteriorPoint
 
 DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all others
-CUT = 0.3  # depth between two knots, in R, of solved ones that don't count: a step through a wall can't be mended
+CUT = 0.3  # depth between two knots, in R, of solved ones that don't count: a step through a wall can't be repaired
 # From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
 SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
 BOTH = Refine(top=2)  # marks candidates as solved in the record
@@ -28,7 +28,7 @@ BOTH = Refine(top=2)  # marks candidates as solved in the record
 def in_order(candidates: Candidates) -> Tensor:
     """Places (B, count) of each problem's candidates: live ones that aren't deep in an obstacle first, then cheap.
 
-    What a candidate costs as it is says more of what it will cost than its depth does, which will be mended.
+    What a candidate costs as it is says more of what it will cost than its depth does, which will be repaired.
     """
     merit = torch.full_like(candidates.unit, torch.inf)
     for rows in candidates.parts():

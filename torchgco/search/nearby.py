@@ -1,4 +1,4 @@
-"""Obstacles far from every sensible way are left out of a search, and looked at again at its end.
+"""Drops obstacles that no reasonable detour can touch from a search, and checks them again at its end.
 
 Time, memory and the answer then depend on the obstacles between start and goal, not on those of the whole world. Where
 a trajectory is only refined, those far from it are left out.
@@ -52,7 +52,7 @@ class Nearby:
 
     @classmethod
     def of(cls, call: Call) -> Nearby | None:
-        """None where every problem keeps all obstacles: none is far, or can be told far.
+        """None where no obstacle of any problem can be dropped.
 
         A single far one counts: points all over the scene, and with them paths, would spread to it.
         """

@@ -124,7 +124,7 @@ class PathProposals(Row):
     @property
     def problems(self) -> str:
         if self.when == "costly":
-            return f"with a proposal over {self.max_gap or 0.0:.0%} dearer than without obstacles"
+            return f"with a proposal over {self.max_gap or 0.0:.0%} more expensive than without obstacles"
         return WHEN[self.when]
 
     @property

@@ -133,7 +133,7 @@ class Paths(Row):
 
     @property
     def does(self) -> str:
-        more = "" if self.max_gap is None else f"; over {self.max_gap:.0%} dearer than free: twice as many paths"
+        more = "" if self.max_gap is None else f"; over {self.max_gap:.0%} above free: twice as many paths"
         far = "; still far: twice as many, all refined" if self.refined == 1 else ""
         return (
             f"{self.proposals.does}{more}; without any: followed closer; then AL-iLQR from the best, into the goal{far}"

@@ -4,38 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.errors import InputError
-from torchgco.base.gradients import recording
+from torchgco.base.gradients import asks, is_forward, not_recording, recording
+from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users
-from torchgco.constraints.bounds import RateBounds
-from torchgco.kernels import current
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
+from torchgco.sensitivity.form import for_systems, for_user
 from torchgco.sensitivity.function import Solved, System
 from torchgco.sensitivity.points import Points, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
 NEAR = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
-SERVED = "a problem in float64 with one horizon, a fixed time, a given start and no RateBounds"
+SERVED = "a problem in float64"
 
 
 def asks_for_gradients(problem: Problem) -> bool:
-    """Whether gradients are recorded, and a tensor asks for them in the problem, or one that its functions capture.
+    """Whether gradients are recorded, and a tensor asks for them in the problem, or one that its functions capture; or
+    one of these has a tangent of forward mode.
 
     Raises:
         InputError: they can't be served.
     """
-    if forward_ad._current_level >= 0:
-        raise InputError("solve", "a call outside of forward_ad.dual_level: derivatives are reverse", "one inside")
-    if not torch.is_grad_enabled() or torch.is_inference_mode_enabled() or problem.B == 0:
+    if not (torch.is_grad_enabled() or is_forward()) or torch.is_inference_mode_enabled() or problem.B == 0:
         return False
     if not (problem.given is not None and problem.given.asks) and not _captures(problem):
         return False
@@ -43,15 +43,22 @@ def asks_for_gradients(problem: Problem) -> bool:
     return True
 
 
+def check_smoothing(problem: Problem, smoothing: Any) -> float:
+    """The smoothing, 0 where none is asked for.
+
+    Raises:
+        InputError: not a number above 0, or of a form of problems that isn't served.
+    """
+    if smoothing is None:
+        return 0.0
+    value = check_value(smoothing, Positive, "smoothing")
+    refuse_forms(problem, "smoothing")
+    return value if problem.B > 0 else 0.0
+
+
 def refuse_forms(problem: Problem, what: str) -> None:
     """Raise InputError for forms of problems that have no derivatives here, of which `what` asks for them."""
-    for got, refused in (
-        (problem.x0.dtype, problem.x0.dtype != torch.float64),
-        ("horizons per problem", problem.horizon is not None),
-        ("a free start", problem.free_start is not None and bool(problem.free_start.any())),
-        ("a free time", problem.time is not None),
-        ("RateBounds", any(isinstance(part, RateBounds) for part in problem.constraints)),
-    ):
+    for got, refused in ((problem.x0.dtype, problem.x0.dtype != torch.float64),):
         if refused:
             raise InputError("problem", f"{SERVED}, for {what}", got)
 
@@ -66,10 +73,12 @@ def _captures(problem: Problem) -> bool:
         *((part, lambda part=part: part.value(X, U)) for part in one.constraints),
     ]
     with computing_on(one.x0.device), recording():  # a user's function may make tensors, too
-        return any(is_users(part) and value().requires_grad for part, value in uses)
+        return any(is_users(part) and asks(value()) for part, value in uses)
 
 
-def attached(asked: Problem, problem: Problem, solution: Solution) -> Solution:
+def attached(
+    asked: Problem, problem: Problem, solution: Solution, smoothing: float = 0.0, records: bool = True
+) -> Solution:
     """The solution with X, U, costs and multipliers as functions of all that asks for gradients.
 
     Where a problem's solution has no derivatives, these are constants: their gradients are 0.
@@ -77,22 +86,31 @@ def attached(asked: Problem, problem: Problem, solution: Solution) -> Solution:
     Args:
         asked: the problems as they were made, which know what asks for gradients.
         problem: the same, with what a solver keeps of them.
+        smoothing: mu in units of the cost: the solution is that of the barrier problem; 0: the solver's own.
+        records: whether anything asks for gradients; else all are numbers.
     """
     with computing_on(problem.x0.device):
-        points = points_of(current(problem), solution)
-    known = {"trace": solution.trace, "search": solution.search, "account": solution.account, "reason": points.reason}
+        points = points_of(*for_systems(problem, solution), smoothing)
+    checks = not torch.is_inference_mode_enabled()  # where nothing can be recorded, to know the step that is left
+    account = solution.account.smoothed(smoothing) if solution.account is not None and smoothing else solution.account
+    known = {"trace": solution.trace, "search": solution.search, "account": account, "reason": points.reason}
     found = replace(points.solution, **known)
     rows = (points.reason == Why.DIFFERENTIABLE).nonzero().flatten()
-    if rows.numel() == 0:
-        return _constant(found)
+    if rows.numel() == 0 or not checks:
+        return for_user(problem, _constant(found) if records else found, solution.K)
     with recording():
         at = points.take(rows)
-        found_at = _residual(asked, at, rows)
+        live = _live(asked, at, rows)
+        found_at = residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
         near = _step_left(at, found_at) <= NEAR
         if not bool(near.all()):
             points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
             rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)
-        return _with_values(found, rows, _values(at, found_at)) if rows.numel() > 0 else _constant(found)
+            live = live.take(near.nonzero().flatten())
+        if records:
+            live_at = rows.numel() > 0
+            found = _with_values(found, rows, _values(live, at, found_at)) if live_at else _constant(found)
+        return for_user(problem, found, solution.K)
 
 
 def _constant(found: Solution) -> Solution:
@@ -103,18 +121,18 @@ def _constant(found: Solution) -> Solution:
     return replace(found, multipliers=Multipliers(lam, found.multipliers.mu))
 
 
-def _residual(problem: Problem, at: Points, rows: Tensor) -> Residual:
-    """That of the problems `rows` at their points."""
-    live = problem.recorded().take(rows)
-    live = live.grown(at.growth) if bool((at.growth > 0).any()) else live
-    return residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
+def _live(problem: Problem, at: Points, rows: Tensor) -> Problem:
+    """The problems `rows` with gradients recorded, and obstacles grown as at their points."""
+    live = for_solvers(problem.recorded().take(rows))
+    return live.grown(at.growth) if bool((at.growth > 0).any()) else live
 
 
 def _step_left(at: Points, of: Residual) -> Tensor:
     """The step (B,) from the points to where the conditions hold to first order, as a share of 1 + the largest state or
     control; infinite where it isn't a number."""
-    with torch.no_grad():
-        x, u, _, _ = _system(at).solve(of.x[None], of.u[None], of.gaps[None], of.rows[None])
+    with not_recording():
+        c = of.rows if at.gap is None else of.rows + at.gap
+        x, u, _, _ = _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None])
         size = 1.0 + torch.maximum(at.solution.X.abs().flatten(1).amax(-1), at.solution.U.abs().flatten(1).amax(-1))
         step = torch.maximum(x[0].abs().flatten(1).amax(-1), u[0].abs().flatten(1).amax(-1)) / size
         return torch.where(torch.isfinite(step), step, torch.inf)
@@ -122,16 +140,18 @@ def _step_left(at: Points, of: Residual) -> Tensor:
 
 def _system(at: Points) -> System:
     found = at.solution
-    return System(at.problem, found.X, found.U, found.multipliers.lam, at.active)
+    return System(at.problem, found.X, found.U, found.multipliers.lam, at.active, at.give)
 
 
-def _values(at: Points, of: Residual) -> tuple[Tensor, ...]:
-    """X, U, multipliers (B, R) and costs of the points, which lead to the residual."""
+def _values(live: Problem, at: Points, of: Residual) -> tuple[Tensor, ...]:
+    """X, U, multipliers (B, R) and costs of the points, which lead to the residual of their problems `live`."""
     found, multipliers = at.solution, at.solution.multipliers.lam
     flat = torch.cat([found.X.new_zeros(len(found), 0), *(lam.flatten(1) for lam in multipliers)], dim=1)
     values = found.X, found.U, flat, found.cost
     X, U, lam, cost = Solved.apply(_system(at), values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
-    return torch.cat((of.start.unsqueeze(1), X[:, 1:]), dim=1), U, lam, cost
+    start = of.start if live.free_start is None else torch.where(live.free_start, X[:, 0], of.start)
+    X = torch.cat((start.unsqueeze(1), X[:, 1:]), dim=1)
+    return X, U, lam, cost if at.give is None else live.cost.total(X, U)  # no minimum of the cost, so no envelope
 
 
 def _with_values(found: Solution, rows: Tensor, values: tuple[Tensor, ...]) -> Solution:

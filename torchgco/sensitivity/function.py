@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import torch
-from torch import Tensor
+from torch import Tensor, _add_batch_dim, _remove_batch_dim  # type: ignore[import]
 from torch._C._functorch import is_legacy_batchedtensor  # type: ignore[import]
+from torch.autograd.function import once_differentiable
 
+from torchgco.base.gradients import not_recording
 from torchgco.kernels import interior_of
 from torchgco.lagrangian.kkt import RightSides
 from torchgco.problem.problem import Problem
@@ -27,14 +29,30 @@ class System:
     U: Tensor  # (B, N, m)
     multipliers: tuple[Tensor, ...]
     active: Tensor  # (B, R) bool
+    give: Tensor | None = None  # (B, R)
+
+    def once(self, x: Tensor, u: Tensor, gaps: Tensor | None, rows: Tensor) -> tuple[Tensor, ...]:
+        """`solve` of one right hand side, or of all those that `is_grads_batched` and `vectorize` hide in one."""
+        parts = [x, u, torch.zeros_like(x[:, 1:]) if gaps is None else gaps, rows]
+        if not any(map(is_legacy_batchedtensor, parts)):
+            return tuple(part[0] for part in self.solve(*(part.unsqueeze(0) for part in parts)))
+        level = torch._C._vmapmode_increment_nesting() - 1
+        torch._C._vmapmode_decrement_nesting()
+        hidden = next(part for part in parts if is_legacy_batchedtensor(part))
+        count = _remove_batch_dim(hidden, level, 1, 0).shape[0]
+        plain = [_remove_batch_dim(part, level, count, 0) for part in parts]
+        if any(map(is_legacy_batchedtensor, plain)):
+            raise RuntimeError("solutions: one `vectorize` or `is_grads_batched` within another isn't served")
+        return tuple(_add_batch_dim(part, 0, level) for part in self.solve(*plain))
 
     def solve(self, x: Tensor, u: Tensor, gaps: Tensor | None, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """-K^-1 of right hand sides x (C, B, N+1, n), u (C, B, N, m), gaps (C, B, N, n), rows (C, B, R); as these."""
-        with torch.no_grad():
+        with not_recording():
             n, gaps = self.problem.n, torch.zeros_like(x[:, :, 1:]) if gaps is None else gaps
             a = torch.cat((x, torch.nn.functional.pad(u, (0, 0, 0, 1))), dim=-1)
             right = RightSides(a, gaps, rows)
-            found = interior_of(self.problem).kkt(self.problem, self.X, self.U, self.multipliers, self.active, right)
+            point = self.X, self.U, self.multipliers, self.active
+            found = interior_of(self.problem).kkt(self.problem, *point, right, self.give)
         return found.z[..., :n], found.z[:, :, :-1, n:], found.y, found.v
 
 
@@ -54,31 +72,35 @@ class Solved(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, X: Tensor, U: Tensor, lam: Tensor, cost: Tensor) -> tuple[Any, ...]:
-        return None, None, *Adjoint.apply(ctx.system, X, U, lam, cost, *ctx.saved_tensors)
+        return None, None, *Adjoint.apply(ctx.system, X, U, lam, cost, *Fixed.apply(*ctx.saved_tensors))
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> tuple[Tensor, ...]:
+        x, u, gaps, rows, lagrangian = tangents[2:]
+        X, U, _, lam = ctx.system.once(x, u, gaps, rows)
+        return X, U, lam, lagrangian.clone()
 
 
 class Adjoint(torch.autograd.Function):
-    """Gradients by the residual's parts, from upstream ones of X, U, multipliers and costs.
+    """Gradients by the residual's parts, from upstream ones of X, U, multipliers and costs, of which it is linear.
 
     It is a function of its own, of the parts too, for two reasons: a rule for many right hand sides at once, and that a
-    second derivative is refused. Autodiff would take it at a fixed solution, without an error.
+    second derivative by the parts is refused. Autodiff would take it at a fixed solution, without an error.
     """
 
     @staticmethod
     def forward(system: System, X: Tensor, U: Tensor, lam: Tensor, cost: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
-        if is_legacy_batchedtensor(X) or is_legacy_batchedtensor(cost):
-            raise RuntimeError(
-                "solutions: no `vectorize` or `is_grads_batched`; torch.func.vmap over autograd.grad serves"
-            )
-        return *(part[0] for part in system.solve(X[None], U[None], None, lam[None])), cost.clone()
+        return *system.once(X, U, None, lam), cost.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        pass
+        ctx.system, ctx.parts = inputs[0], [torch.empty_like(part, device="meta") for part in inputs[5:]]
 
     @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> NoReturn:
-        raise RuntimeError("solutions have no second derivatives: their gradients can't be differentiated again")
+    @once_differentiable
+    def backward(ctx: Any, x: Tensor, u: Tensor, gaps: Tensor, rows: Tensor, cost: Tensor) -> tuple[Any, ...]:
+        X, U, _, lam = ctx.system.once(x, u, gaps, rows)
+        return None, X, U, lam, cost.clone(), *(torch.zeros_like(part, device=x.device) for part in ctx.parts)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], system: System, *given: Tensor) -> tuple[Any, Any]:
@@ -87,3 +109,21 @@ class Adjoint(torch.autograd.Function):
             for part, dim in zip(given[:4], in_dims[1:5], strict=True)
         )
         return (*system.solve(X, U, None, lam), cost.clone()), (0,) * 5
+
+
+class Fixed(torch.autograd.Function):
+    """The residual's parts, for gradients at which they are held: a derivative that leads here is a second one."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(*parts: Tensor) -> tuple[Tensor, ...]:
+        return tuple(part.view_as(part) for part in parts)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> NoReturn:
+        raise RuntimeError("solutions have no second derivatives: their gradients can't be differentiated again")

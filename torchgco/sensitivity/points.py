@@ -1,13 +1,15 @@
 """Points at which solutions are differentiated: polished, and with the reasons where there are no derivatives.
 
 A solver ends within its tolerances, derivatives need more: a few iterations of the interior point from there. Where
-they lead elsewhere, the trajectory was no minimum of the problem. Trajectories that `gco` has cleared between knots are
-ones of the same problem with larger obstacles: these are tried next, and their growth is then a constant.
+they lead elsewhere, the trajectory was no minimum of the problem. With smoothing they lead to the solution of the
+barrier problem instead, in which every inequality pushes a little. Trajectories that `gco` has cleared between knots
+are ones of the same problem with larger obstacles: these are tried next, and their growth is then a constant.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -46,9 +48,11 @@ class Points:
     Attributes:
         solution: polished where that is possible, else as the solver left it.
         problem: that of which the solution is a minimum, with obstacles grown by `growth` (B,), m.
-        active: rows that hold as equalities, (B, R) bool, constraint by constraint and knot by knot.
+        active: rows that hold, (B, R) bool, constraint by constraint and knot by knot.
         costates: (B, N+1, n).
         reason: (B,) int64, a `Differentiability`.
+        give: slack / multiplier (B, R) of rows in a barrier, 0 of rows that hold as equalities; None: all these do.
+        gap: mu / multiplier (B, R) of rows in a barrier, what their slack should be; None as `give`.
     """
 
     solution: Solution
@@ -57,6 +61,8 @@ class Points:
     active: Tensor
     costates: Tensor
     reason: Tensor
+    give: Tensor | None = None
+    gap: Tensor | None = None
 
     @property
     def lam(self) -> Tensor:
@@ -66,31 +72,35 @@ class Points:
 
     def take(self, rows: Tensor) -> Points:
         """Those of the problems `rows`, places (b,)."""
-        own = {name: getattr(self, name)[rows] for name in ("growth", "active", "costates", "reason")}
+        own: dict[str, Any] = {name: getattr(self, name)[rows] for name in ("growth", "active", "costates", "reason")}
+        own |= {name: None if (part := getattr(self, name)) is None else part[rows] for name in ("give", "gap")}
         return Points(self.solution.take(rows), self.problem.take(rows), **own)
 
 
-def points_of(problem: Problem, solution: Solution) -> Points:
-    """The points of solutions, with every reason against derivatives."""
+def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> Points:
+    """The points of solutions, with every reason against derivatives; with smoothing, mu in units of the cost."""
     result = copied(_bare(solution))
     solved = (solution.status == Status.CONVERGED) | (solution.status == Status.FEASIBLE)
     reason = torch.full_like(solution.status, int(Why.NOT_SOLVED))
     growth = torch.zeros_like(solution.cost)
-    _polish(problem, solved.nonzero().flatten(), growth, result, reason)
+    _polish(problem, solved.nonzero().flatten(), growth, result, reason, smoothing)
     room = clearance(problem, solution.X)
     grown = solved & (reason != Why.DIFFERENTIABLE) & (room > 0) & torch.isfinite(room)
     growth, first = torch.where(grown, room, growth), reason.clone()
-    _polish(problem, grown.nonzero().flatten(), growth, result, reason)
+    _polish(problem, grown.nonzero().flatten(), growth, result, reason, smoothing)
     reason = torch.where(reason == Why.DIFFERENTIABLE, reason, first)
     growth = torch.where(reason == Why.DIFFERENTIABLE, growth, 0.0)
     problem = problem.grown(growth) if bool((growth > 0).any()) else problem
-    active, untold = rows_that_hold(problem, result)
-    found = solve_at(problem, result, active, probe(problem, active))
-    weak = (untold.any(-1) & (reason == Why.DIFFERENTIABLE)).nonzero().flatten()
-    reason[weak] = _weakness(problem.take(weak), result.take(weak), active[weak], untold[weak])
+    if smoothing > 0:
+        active, give, gap = _rows_in_barrier(problem, result, smoothing)
+    else:
+        (active, untold), give, gap = rows_that_hold(problem, result), None, None
+        weak = (untold.any(-1) & (reason == Why.DIFFERENTIABLE)).nonzero().flatten()
+        reason[weak] = _weakness(problem.take(weak), result.take(weak), active[weak], untold[weak])
+    found = solve_at(problem, result, active, probe(problem, active), give)
     for where, why in ((~(found.left.amax(0) <= LEFT), Why.DEPENDENT_ROWS), (~found.definite, Why.NOT_STRICT)):
         reason[where & (reason == Why.DIFFERENTIABLE)] = int(why)
-    return Points(result, problem, growth, active, found.costates, reason)
+    return Points(result, problem, growth, active, found.costates, reason, give, gap)
 
 
 def _bare(solution: Solution) -> Solution:
@@ -98,25 +108,28 @@ def _bare(solution: Solution) -> Solution:
     return replace(solution, trace=None, search=None, account=None)
 
 
-def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, reason: Tensor) -> None:
+def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, reason: Tensor, smoothing: float) -> None:
     """Polish the solutions of the problems `rows`, with obstacles grown by `growth` (B,), in place; and say why not."""
     if rows.numel() == 0:
         return
     part, old, by = problem.take(rows), result.take(rows), growth[rows]
     asked = part.grown(by) if bool((by > 0).any()) else part
     call = replace(Call.checked(asked, old.U, warm=old.multipliers), X0=old.X)
-    end = POLISH.solved(call)
+    end = POLISH.solved(call, smoothing=smoothing)
     new = Session(call, RAW).trajectories(end)
     stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STAYS
+    stays = end.status == SOLVED if smoothing > 0 else stays
     stays &= ~(chord_clearance(part, new.X) < chord_clearance(part, old.X).clamp(max=0.0))
     leaves = (stays | (end.status == SOLVED)) & leaves_goal(part, new.X, old.X)
-    why = torch.where(stays, int(Why.DIFFERENTIABLE), int(Why.MOVED))
+    why = torch.where(stays, int(Why.DIFFERENTIABLE), int(Why.NOT_SMOOTHED if smoothing > 0 else Why.MOVED))
     reason[rows] = torch.where(leaves, int(Why.LEAVES_GOAL), why)
     kept = (reason[rows] == Why.DIFFERENTIABLE).nonzero().flatten()
     if kept.numel() > 0:
         best = take(new, kept)
         worst, more = measured(part.take(kept), best.X, best.U), old.iterations[kept] + end.iterations[kept]
         parts = {"X": best.X, "U": best.U, "multipliers": best.multipliers, "cost": best.cost}
+        if smoothing > 0:  # constraints hold, but it is another cost that can't be improved
+            parts["status"] = torch.full_like(more, int(Status.FEASIBLE))
         put(result, rows[kept], replace(old.take(kept), **parts, violation=worst, iterations=more))
 
 
@@ -136,7 +149,7 @@ def clearance(problem: Problem, X: Tensor) -> Tensor:
 
 
 def rows_that_hold(problem: Problem, solution: Solution) -> tuple[Tensor, Tensor]:
-    """Which rows hold as equalities, and of which inequalities that isn't told, (B, R) bool."""
+    """Which rows hold as equalities, and of which inequalities that isn't known, (B, R) bool."""
     unit, none = cost_unit(problem).view(-1, 1, 1), torch.zeros_like(solution.status, dtype=torch.bool)[:, None][:, :0]
     hold, untold = [none], [none]
     for part, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
@@ -148,9 +161,27 @@ def rows_that_hold(problem: Problem, solution: Solution) -> tuple[Tensor, Tensor
     return torch.cat(hold, dim=1), torch.cat(untold, dim=1)
 
 
-def solve_at(problem: Problem, solution: Solution, active: Tensor, right: RightSides) -> KktSolve:
+def _rows_in_barrier(problem: Problem, solution: Solution, mu: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Which rows hold, with the give and gap of those in the barrier, (B, R) all.
+
+    Slack times multiplier is mu there, and 0 of equalities, of bounds that coincide and of rows that no variable moves.
+    """
+    none = solution.cost.new_zeros(len(solution.cost), 0)
+    active, give, gap = [none.bool()], [none], [none]
+    for part, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
+        slack, equal = -part.value(solution.X, solution.U), part.sense == "equality"
+        inside = (slack * lam > 0.5 * mu) & (not equal)
+        active.append((inside | (lam > 0) | equal).flatten(1))
+        give.append(torch.where(inside, slack / lam, 0.0).flatten(1))
+        gap.append(torch.where(inside, mu / lam, 0.0).flatten(1))
+    return torch.cat(active, dim=1), torch.cat(give, dim=1), torch.cat(gap, dim=1)
+
+
+def solve_at(
+    problem: Problem, solution: Solution, active: Tensor, right: RightSides, give: Tensor | None = None
+) -> KktSolve:
     """The systems at solutions."""
-    return interior_of(problem).kkt(problem, solution.X, solution.U, solution.multipliers.lam, active, right)
+    return interior_of(problem).kkt(problem, solution.X, solution.U, solution.multipliers.lam, active, right, give)
 
 
 def probe(problem: Problem, active: Tensor) -> RightSides:

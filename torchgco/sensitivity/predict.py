@@ -15,6 +15,7 @@ from torchgco.explaining.account import Account
 from torchgco.kernels import current, followed, measured
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.sensitivity.attach import refuse_forms
 from torchgco.sensitivity.function import System
@@ -44,18 +45,30 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
         the solution itself, where the controls are those of before.
 
     Raises:
-        InputError: a problem of another form, one in float32 or with horizons per problem, a free start, a free time or
-            RateBounds, or a solution that no longer knows its problem.
+        InputError: a problem of another form, one in float32 or with horizons per problem, a free time or RateBounds,
+            or a solution that no longer knows its problem.
     """
     changed = current_problem(changed)
     before = problem if problem is not None else solution.account and solution.account.problem
     if before is None:
         raise InputError("problem", "the problem that was solved", "a solution that no longer knows it")
+    if solution.account is not None and solution.account.smoothing:
+        raise InputError("solution", "one without smoothing", "one with it")
     if current_problem(before) is not before:
         expected = "another problem: numbers of the one that was solved have been changed in place"
         raise InputError("changed", expected, "the changed one itself")
     for one in (before, changed):
         refuse_forms(one, "a prediction")
+        if for_solvers(one) is not one:
+            expected = "a problem with one horizon, a fixed time and no RateBounds, for a prediction"
+            got = (
+                "horizons per problem"
+                if one.horizon is not None
+                else "RateBounds"
+                if one.time is None
+                else "a free time"
+            )
+            raise InputError("problem", expected, got)
     _check_same(before, changed)
     with torch.no_grad(), computing_on(changed.x0.device):
         points = points_of(current(before), solution.detach())
@@ -83,7 +96,8 @@ def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:
     )
     holds &= torch.isfinite(x).flatten(1).all(-1) & torch.isfinite(u).flatten(1).all(-1)
     keep = holds.view(-1, 1, 1)
-    X = torch.cat((problem.x0.unsqueeze(1), old.X[:, 1:] + torch.where(keep, x[:, 1:], 0.0)), dim=1)
+    moved = old.X + torch.where(keep, x, 0.0)
+    X = torch.cat((problem.start_in(moved[:, 0]).unsqueeze(1), moved[:, 1:]), dim=1)
     X, U = followed(problem, X, old.U + torch.where(keep, u, 0.0), old.K)
     lam = at.lam + torch.where(holds.unsqueeze(-1) & at.active, v, 0.0)
     reason = torch.where(_rows_change(problem, at, X, U, lam) & holds, int(Why.ROWS_CHANGE), at.reason)

@@ -269,10 +269,10 @@ class Solver(Brief):
         return self
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
-        """For a planner that solves again and again: what it asks for a new plan, and what continues a former one.
+        """For a planner that solves again and again: what it asks for a new plan, and what continues a previous one.
 
-        The first is this solver, without what only a last answer is worth. The second improves a plan where it is, in
-        at most `rounds` outer iterations where a solver makes attempts around a local one; else it is the first again.
+        The first is this solver without the final polishing passes. The second improves a given plan locally, in at
+        most `rounds` outer iterations where a solver makes attempts around a local one; else it is the first again.
         """
         return self, self
 

@@ -1,11 +1,13 @@
 """The verdict on returned trajectories: feedback gains, optimality and statuses.
 
 Optimality is the share of the cost that the quadratic model could still save: the expected decrease of one full step on
-J_var + lam'c, plus the complementarity gap. It doesn't depend on the scale of cost, controls or constraints.
+J_var + lam'c, plus the complementarity gap. It doesn't depend on the scale of cost, controls or constraints. Where the
+model is regularised or rounded, its step is shorter than a full one, and slopes count, too: see `_by_slopes`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -20,6 +22,10 @@ from torchgco.problem.problem import Problem
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
 FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
+HIDES = (
+    0.1  # the error of a curvature by rounding, times the states' and controls' size squared, as a share of that unit
+)
+STEEP = 1e40  # the same of a pass whose steps are along the slopes, and so short that no stage feels another's
 
 
 def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
@@ -53,9 +59,35 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
+    hidden = (mu > 0) | _rounds(lagrangian, X, U)
+    if bool(hidden.any()):
+        saved = torch.where(hidden, torch.maximum(saved, _by_slopes(problem, run, U)), saved)
     cost = least_cost(problem) + (problem.cost.total(X, U) - constant_cost(problem)).abs()
     G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
     return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
+
+
+def _rounds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
+    """Where rounding of the rows' stiffness hides curvatures of the cost, (B,): states or controls have small units."""
+    size = torch.cat((X.flatten(1), U.flatten(1)), dim=1).abs().amax(-1)
+    stiffness = torch.finfo(X.dtype).eps * lagrangian.multipliers.mu * size.square()
+    return (stiffness > HIDES * cost_unit(lagrangian.problem)) & bool(lagrangian.problem.constraints)
+
+
+def _by_slopes(problem: Problem, run: Callable[[Tensor], BackwardPass], U: Tensor) -> Tensor:
+    """The slopes of J_var + lam'c by the controls U (B, N, m), times these controls' size, summed, (B,).
+
+    Regularisation adds the same to the curvature of each control, whatever its units: where these are large, it hides
+    what the controls could still save.
+    """
+    mu = STEEP * cost_unit(problem)
+    slopes = run(mu).gains[..., -1].movedim(0, 1).abs() * mu.view(-1, 1, 1)
+    size = U.abs().amax(dim=1)
+    if problem.control_bounds is not None:
+        half = 0.5 * problem.control_bounds.range
+        size = torch.where(torch.isfinite(half), torch.maximum(size, half), size)
+    size = torch.where(size > 0, size, 1.0).unsqueeze(1)
+    return (slopes * size).contiguous().sum(-1).sum(-1)
 
 
 def constant_cost(problem: Problem) -> Tensor:

@@ -39,7 +39,7 @@ from torchgco.solvers.timing import Chooser
 AT_ONCE = 256  # problems between two reports of progress
 ROUGH, FEW = 1e-2, 60  # tolerance, and iterations, of a trajectory whose time is to be freed next
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
-# Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
+# In brackets: the names of Waechter and Biegler (2006). Constants without such a name are not in the paper.
 FILTER: dict[str, Any] = {
     "push": 1e-2,  # least slack at the start, and how far guesses are moved inside of their bounds (kappa_1)
     "boundary": 0.99, "closest": 1.0 - 1e-12,  # share of the way to where a slack is 0 (tau_min), and at most: above 0
@@ -61,6 +61,7 @@ FILTER: dict[str, Any] = {
     "soft_growth": 100.0, "soft_decay": 0.1,
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,
+    "smoothing": 0.0,  # mu, in units of the cost, at which the barrier stays
     "rounding": 1e-10, "idle": 3,  # an error below this that doesn't fall by half for so long is due to rounding
 }  # fmt: skip
 
@@ -98,7 +99,8 @@ class InteriorPoint(Solver):
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         session, admitted = Session(call, RAW), self.admitted(call.problem)
-        end = self.no_worse(session.call, self.solved(session.call))
+        guess = guessed(session.call)
+        end = self.no_worse(session.call, guess, self.solved(session.call, guess=guess))
         return session.finished(least_violated(session.call, end, admitted), admitted)
 
     def admitted(self, problem: Problem) -> float:
@@ -139,41 +141,44 @@ class InteriorPoint(Solver):
         check_tensor(X0, "X0", problem.x0)
         return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
 
-    def solved(self, call: Call, X0: Tensor | None = None) -> SolveEnd:
+    def solved(
+        self, call: Call, X0: Tensor | None = None, guess: Iterate | None = None, smoothing: float = 0.0
+    ) -> SolveEnd:
         """The solve without its verdict, in the units of the call.
 
         Args:
             X0: states to begin with, (B, N+1, n), of the first those components that are free; None: the call's, else
                 the rollout of its controls; the start held where these are not finite.
+            guess: `guessed` of the call, where it is known.
+            smoothing: mu in units of the cost: J_var - mu times the logarithms of all slacks is minimised; 0: J_var.
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         kernels = interior_of(problem)
-        rollout = open_loop(problem, call.U0)
+        guess = guess or guessed(call)
+        rollout = guess.X
         X = rollout if X0 is None else torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
         status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
         X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
         end = SolveEnd.blank(problem, call.U0)
         end.best.X[:] = rollout  # where a solve never begins
-        end.best.cost[:] = problem.cost.total(rollout, call.U0)
-        end.best.violation[:] = measured(problem, rollout, call.U0)
+        end.best.cost[:], end.best.violation[:] = guess.cost, guess.violation
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
         for part in rows.split(AT_ONCE):
             if call.late:
                 end.status[part] = Status.TIME_LIMIT
                 continue
-            self._some(kernels, call.take(part), X[part], part, end)
+            self._some(kernels, call.take(part), X[part], part, end, smoothing)
             if call.callback is not None:
                 done = int((end.status != Status.RUNNING).sum())
                 call.callback(Progress(1, call.rows[part], done, problem.B))
         return end
 
-    def no_worse(self, call: Call, end: SolveEnd) -> SolveEnd:
+    def no_worse(self, call: Call, guess: Iterate, end: SolveEnd) -> SolveEnd:
         """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
         problem, found = call.problem, end.best
-        X = open_loop(problem, call.U0)
-        cost, worst = problem.cost.total(X, call.U0), measured(problem, X, call.U0)
+        X, cost, worst = guess.X, guess.cost, guess.violation
         lost = ~(torch.isfinite(found.cost) & torch.isfinite(found.violation))
         worse = is_better(cost, worst, found.cost, found.violation, self.admitted(problem)) | lost
         rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
@@ -183,7 +188,9 @@ class InteriorPoint(Solver):
             put(found, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
         return end
 
-    def _some(self, kernels: InteriorKernels, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
+    def _some(
+        self, kernels: InteriorKernels, call: Call, X: Tensor, rows: Tensor, end: SolveEnd, smoothing: float
+    ) -> None:
         """Solves problems, and puts how they ended into `end` at `rows`."""
         problem, warm = call.problem, call.warm
         if warm is None:
@@ -191,6 +198,7 @@ class InteriorPoint(Solver):
         else:
             mu, how = self.warm_barrier, FILTER | {"push": self.warm_barrier}
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
+        how = how | {"smoothing": smoothing}
         X, U = inside(problem, X, call.U0, how["push"])
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
         fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
@@ -212,6 +220,14 @@ class InteriorPoint(Solver):
         sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
         end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]
+
+
+def guessed(call: Call) -> Iterate:
+    """The trajectory that a call's controls lead to, without multipliers."""
+    problem, U = call.problem, call.U0
+    X = open_loop(problem, U)
+    none = Multipliers.none(problem, U.new_zeros(problem.B))
+    return Iterate(X, U, none, problem.cost.total(X, U), measured(problem, X, U))
 
 
 def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor, Tensor]:

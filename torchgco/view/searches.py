@@ -57,7 +57,7 @@ def _paths(one: Comparison, i: int) -> list[Line]:
 
 
 def _candidates(one: Comparison, problem: Problem, i: int) -> list[Line]:
-    """The trajectories of each candidate after each step that it reached; its fate is told once, with the last."""
+    """The trajectories of each candidate after each step that it reached; its fate is said once, with the last."""
     found = []
     for c in range(one.fate.shape[1]):
         fate = Fate(int(one.fate[i, c]))

@@ -1,7 +1,7 @@
 """Which body stands for a vehicle on the page, and which of its states turn it.
 
-`VEHICLES[Boat] = Look("car", heading=2)` shows a model of your own with a heading; models that aren't listed are a
-ball, or a disc in the plane.
+`VEHICLES[Boat] = Look("car", heading=2)` shows a model of your own. A model that isn't listed is a dart: it turns with
+states that are called `qw`, `qx`, `qy`, `qz` or `heading`, else it points to where it goes.
 """
 
 from __future__ import annotations
@@ -12,6 +12,11 @@ from typing import Literal
 import numpy as np
 
 from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, Unicycle
+from torchgco.dynamics.names import states_of
+
+QUATERNION = ["qw", "qx", "qy", "qz"]
+HEADING = "heading"
+STILL = 1e-9  # m: a way that is shorter has no direction
 
 
 @dataclass(frozen=True)
@@ -19,19 +24,23 @@ class Look:
     """A body and the states that turn it.
 
     Args:
-        body: "ball" (in the plane a disc), "car" or "quadrotor".
+        body: "ball" (in the plane a disc), "car", "quadrotor" or "dart".
         quaternion: states of the unit quaternion [w, x, y, z] from the body to space.
         heading: the state of the angle about z, rad.
+        along: the position, where nothing else turns the body: it points along the way, at rest as before or after.
     """
 
-    body: Literal["ball", "car", "quadrotor"] = "ball"
+    body: Literal["ball", "car", "quadrotor", "dart"] = "ball"
     quaternion: slice | None = None
     heading: int | None = None
+    along: slice | None = None
 
     def attitude(self, X: np.ndarray) -> np.ndarray | None:
         """Quaternions (..., 4) of states X (..., n); None where nothing turns the body."""
         if self.quaternion is not None:
             return X[..., self.quaternion]
+        if self.along is not None:
+            return _pointing(X[..., self.along])
         if self.heading is None:
             return None
         half, zero = 0.5 * X[..., self.heading], np.zeros(X.shape[:-1])
@@ -47,4 +56,26 @@ VEHICLES: dict[type[Dynamics], Look] = {
 
 def look_of(dynamics: Dynamics) -> Look:
     """How a model's vehicle looks."""
-    return next((look for kind, look in VEHICLES.items() if isinstance(dynamics, kind)), Look())
+    for kind, look in VEHICLES.items():
+        if isinstance(dynamics, kind):
+            return look
+    names = [one.name for one in states_of(dynamics)]
+    if QUATERNION[0] in names and names[(k := names.index(QUATERNION[0])) : k + 4] == QUATERNION:
+        return Look("dart", quaternion=slice(k, k + 4))
+    if HEADING in names:
+        return Look("dart", heading=names.index(HEADING))
+    return Look() if dynamics.position is None else Look("dart", along=dynamics.position)
+
+
+def _pointing(p: np.ndarray) -> np.ndarray:
+    """Quaternions (K, 4) of bodies without roll that point along a way p (K, d); x, where it leads nowhere."""
+    steps = np.diff(p, axis=0, append=p[-1:])
+    steps = np.concatenate((steps, np.zeros((len(p), 3 - p.shape[1]))), axis=1)
+    moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > STILL)
+    if len(moving) == 0:
+        return np.tile([1.0, 0.0, 0.0, 0.0], (len(p), 1))
+    last = np.searchsorted(moving, np.arange(len(p)), side="right") - 1
+    x, y, z = steps[moving[np.maximum(last, 0)]].T
+    yaw, pitch = 0.5 * np.arctan2(y, x), -0.5 * np.arctan2(z, np.hypot(x, y))
+    turn = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    return np.stack((turn[0] * turn[2], -turn[1] * turn[3], turn[0] * turn[3], turn[1] * turn[2]), axis=-1)

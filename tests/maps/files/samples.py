@@ -31,6 +31,14 @@ BT = (
 PACKED = b64decode("AQAA4BcAAYA/4BUDAQBA4BUDAEAgH+ATAwCAIB/gEwPgF1/geB8gAAGAPiAEIScAQCADQADgfw8BQD8=")
 PACKED_POINTS = np.stack([np.arange(40) // 8, np.full(40, 2.0), np.arange(40) % 4 / 4], 1)
 
+WORLD = (
+    b"<sdf version='1.7'><model name='a'><static>1</static><pose>0 1 0 0 0 0.4</pose>"
+    b"<link name='l'><collision name='c'><geometry><box><size>2 1 1</size></box></geometry>"
+    b"</collision></link></model></sdf>"
+)
+# A header of 80 bytes, one triangle: its normal, three corners, and two bytes.
+STL = bytes(80) + struct.pack("<I12f2x", 1, 0, 0, 1, *(0, 0, 0), *(2, 0, 0), *(0, 2, 0))
+
 
 def png(pixels: np.ndarray) -> bytes:
     """Grey (rows, columns), or with channels: grey and opacity, colours, colours and opacity; uint8 or uint16."""
@@ -130,6 +138,10 @@ SAMPLES: dict[str, tuple[bytes, dict[str, float]]] = {
     "big.ply": (ply("binary_big_endian"), RADIUS),
     "tree.bt": (b64decode(BT), {}),
     "tree.ot": (b64decode(OT), {}),
+    "city.map": (b"type octile\nheight 2\nwidth 3\nmap\n@.T\nSGW\n", RESOLUTION),
+    "yard.world": (WORLD, RESOLUTION),
+    "wedge.stl": (STL, RESOLUTION),
+    "wedge.obj": (b"v 0 0 0\nv 2 0 0\nv 0 2 0\nv 0 0 2\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n", RESOLUTION),
 }
 
 

@@ -196,7 +196,7 @@ def test_trees_with_colours_and_times(tmp_path: Path) -> None:
     ({"free_thresh": 0.9}, "free_thresh <= occupied_thresh"),
     ({"image": "[]"}, "image, the path"),
     ({"image": "gone.png"}, "gone.png: No such file"),
-    ({"image": "map.yaml"}, "a png, pgm, ppm or bmp image"),
+    ({"image": "map.yaml"}, "a png, pgm, ppm, bmp, jpg or tif image"),
     ({"image": "."}, "a folder"),
     ({"image": "/dev/zero"}, "no regular file"),
     ({"image": '"a\\0b"'}, "null"),

@@ -44,7 +44,7 @@ def test_points_whose_balls_touch_the_layer(tmp_path: Path) -> None:
     ("points.npy", (1, 0), "layer", "low < high"),
     ("points.npy", 3, "layer", "heights"),
     ("points.npy", (8, 9), "path", "points between 8 m and 9 m, got .*-0.5 m to 4 m"),
-    ("tree.bt", (8, 9), "path", "cells between 8 m and 9 m"),
+    ("tree.bt", (8, 9), "path", "known cells in the layer between 8 m and 9 m"),
     ("plan.png", (0, 1), "layer", "a map of the plane"),
 ])  # fmt: skip
 def test_wrong_layers(name: str, layer: Any, field: str, said: str, tmp_path: Path) -> None:

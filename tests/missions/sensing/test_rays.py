@@ -138,11 +138,20 @@ def test_unknown_cells_of_a_map_are_what_the_field_says() -> None:
         assert np.allclose(world.cast([0.0, 0.4, 0.4], np.array([[1.0, 0, 0]]), 9.0), [seen])
 
 
-def test_a_cloud_or_a_second_map_is_refused() -> None:
-    cloud, grid = PointCloud([[3.0, 0, 0]], 0.2), OccupancyGrid(np.ones((1, 1, 1), bool), [5.0, 5.0, 5.0], 0.5)
-    for maps, expected in (([Field(cloud, 0.1)], "an occupancy grid"), ([Field(grid, 0.1)] * 2, "one map at most")):
-        with pytest.raises(InputError, match=expected):
-            World.of(problem(maps), 0)
+@pytest.mark.parametrize("many", [False, True])
+def test_a_cloud_is_seen_as_cells(many: bool) -> None:
+    """At most a cell's diagonal before its ball, and never behind it; a problem sees its own cloud."""
+    points = np.array([[3.0, 0.0, 0.0], [3.1, 0.2, -0.1]])
+    cloud = PointCloud(np.stack((points + 1.0, points)) if many else points, 0.2)
+    world = World.of(problem([Field(cloud, 0.1)]), 1)
+    seen = world.cast([0.0, 0.01, -0.02], np.array([[1.0, 0, 0], [0, 1.0, 0]]), 9.0)
+    assert 2.8 - 0.2 * 3**0.5 < seen[0] <= 2.8 and seen[1] == np.inf
+
+
+def test_a_second_map_is_refused() -> None:
+    grid = OccupancyGrid(np.ones((1, 1, 1), bool), [5.0, 5.0, 5.0], 0.5)
+    with pytest.raises(InputError, match="one map at most"):
+        World.of(problem([Field(grid, 0.1)] * 2), 0)
 
 
 def test_constraints_that_are_no_obstacles_are_not_seen() -> None:

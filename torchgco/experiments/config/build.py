@@ -142,7 +142,7 @@ def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictCo
 
 
 def forget_composed() -> None:
-    """Compose anew what `recomposer` composes: the files of conf/ may have changed."""
+    """Compose again what `recomposer` composes: the files of conf/ may have changed."""
     _composed.cache_clear()
 
 

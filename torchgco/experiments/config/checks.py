@@ -63,7 +63,7 @@ def _hydra_path(key: str, value: str) -> str:
 
 
 def check_once(words: Iterable[str]) -> None:
-    """Check that no key is given twice: Hydra would take the last value without a word.
+    """Check that no key is given twice: Hydra would take the last value without a warning.
 
     Raises:
         InputError: a key that is.

@@ -141,7 +141,7 @@ def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts
 def _work(work: Callable[[Job], Result], job: Job, number: int) -> Result:
     Shared.job = number
     notices.speak(number == 0)  # all workers compile the same, and one line on that is enough
-    Shared.counts[number] = 0.0  # a former pool may have died in this job
+    Shared.counts[number] = 0.0  # a previous pool may have died in this job
     return work(job)
 
 

@@ -1,11 +1,11 @@
-"""`torchgco-export RUN`: the trajectories of a finished study as CSV files, with names and units."""
+"""`torchgco-export RUN`: the trajectories of a finished study, as CSV with names and units or as bags of ROS 2."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,7 @@ from torchgco.dynamics import QuadrotorPlant
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
+from torchgco.experiments.reports.bags import Storage, write_bag
 from torchgco.experiments.reports.finished import TRUST, Study
 from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
@@ -39,8 +40,9 @@ def write_export(
     layouts: Sequence[int] = (),
     solvers: Sequence[str] = (),
     trust: bool = False,
+    bag: Storage | None = None,
 ) -> list[Path]:
-    """Write a CSV file per solver and layout of a finished study; returns where they lie.
+    """Write a CSV file, or a bag, per solver and layout of a finished study; returns where they lie.
 
     Single trajectories have the columns of `Solution.trajectories`. Missions have those of the plant: states, the
     acceleration (differences of the velocities), the joint thrust, and the rotor speeds that are commanded; they are as
@@ -51,9 +53,11 @@ def write_export(
         output: a folder; None: `export` in that of the study.
         rate: samples per second; None: the knots of a trajectory, the rows of a mission's log.
         layouts, solvers: which; none: all.
+        bag: the container of bags, see `write_bag`; None: CSV.
 
     Raises:
-        InputError: as `Study.read`, a layout or solver that the study hasn't, or a rate that isn't above 0.
+        InputError: as `Study.read` and `write_bag`, a layout or solver that the study hasn't, or a rate that isn't
+            above 0.
     """
     check_value(rate, Positive | None, "--rate")
     study, place = Study.read(folder, trust), folder / FOLDER if output is None else output
@@ -66,11 +70,21 @@ def write_export(
     tables, written = _missions if study.missions else _trajectories, list[Path]()
     for solver, number, columns in tables(study, rate, lambda solver, number: number in (layouts or ids)):
         if solver in (solvers or names):
-            written.append(place / f"{solver}-{number}.csv")
+            written.append(place / (f"{solver}-{number}" if bag else f"{solver}-{number}.csv"))
             place.mkdir(parents=True, exist_ok=True)
-            text = columns.to_csv(index=False)
-            write(written[-1], lambda file, text=text: file.write(text.encode()))
+            if bag:
+                write_bag(written[-1], {name: columns[name].to_numpy() for name in columns}, _position(study), bag)
+            else:
+                text = columns.to_csv(index=False)
+                write(written[-1], lambda file, text=text: file.write(text.encode()))
     return written
+
+
+def _position(study: Study) -> list[str]:
+    """The labels of the position's columns."""
+    dynamics = QuadrotorPlant() if study.missions else study.vehicle.dynamics
+    at = dynamics.position
+    return [] if at is None else [one.label for one in states_of(dynamics)[at]]
 
 
 def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
@@ -136,7 +150,7 @@ def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = RunParser(prog="torchgco-export", description="The trajectories of a study as CSV, with names and units.")
+    parser = RunParser(prog="torchgco-export", description="The trajectories of a study as CSV, or as bags of ROS 2.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN")
     parser.add_argument("--rate", metavar="HZ", type=float, help="samples per second; default: as they were computed")
@@ -144,6 +158,8 @@ def _parser() -> argparse.ArgumentParser:
         "--layout", metavar="N", type=int, nargs="+", default=[], help="numbers of layouts; default: all"
     )
     parser.add_argument("--solver", metavar="NAME", nargs="+", default=[], help="default: all of the study")
+    kinds = list(get_args(Storage))
+    parser.add_argument("--bag", metavar="KIND", choices=kinds, help=f"bags of ROS 2 instead: {' or '.join(kinds)}")
     parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
@@ -154,9 +170,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def work() -> int:
         options = _parser().parse_args(arguments)
         files = write_export(
-            options.run, options.output, options.rate, options.layout, options.solver, options.trust
+            options.run, options.output, options.rate, options.layout, options.solver, options.trust, options.bag
         )  # fmt: skip
-        size = sum(path.stat().st_size for path in files)
+        parts = [part for path in files for part in ([path] if path.is_file() else path.iterdir())]
+        size = sum(part.stat().st_size for part in parts)
         say(f"{files[0].parent if files else options.run}: {len(files)} files, {size / 1e6:.2f} MB")
         return 0
 

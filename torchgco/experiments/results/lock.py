@@ -27,7 +27,7 @@ from torchgco.experiments.results.files import refused
 LOCK = ".lock"
 HOLDER = ".holder"  # ending of the file that says who holds a lock
 MARK = ".mark"  # ending of the file that is the lock where the file system has none
-# s until a second start is refused. SLURM queues a job again while its former processes may still end, 30 s by default
+# s until a second start is refused. SLURM queues a job again while its processes of before may end, 30 s by default
 # after their signal, and an NFS 4 server gives up the locks of a machine that went down after 90 s.
 PATIENCE = 120.0
 POLL = 0.2  # s

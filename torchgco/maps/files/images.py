@@ -1,4 +1,4 @@
-"""Images of floor plans and of heights: png, pgm, ppm and bmp, read by Pillow."""
+"""Images of floor plans and of heights: png, pgm, ppm, bmp, jpg and tif, read by Pillow."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torchgco.maps.files.source import Source, made
 from torchgco.maps.grid import OccupancyGrid
 
 MOST_PIXELS = 2**26  # 8192 x 8192
-IMAGE = "a png, pgm, ppm or bmp image"
-KINDS = ("PNG", "PPM", "BMP")  # Pillow tries no other decoder
+IMAGE = "a png, pgm, ppm, bmp, jpg or tif image"
+KINDS = ("PNG", "PPM", "BMP", "JPEG", "TIFF")  # Pillow tries no other decoder
 DARK = 0.5  # of a floor plan: darker pixels are occupied
 
 

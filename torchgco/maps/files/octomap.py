@@ -1,7 +1,7 @@
 """OctoMap's bt (free, occupied) and ot (probabilities) files.
 
 The format: OctoMap 1.10, OcTreeBaseImpl and OccupancyOcTreeBase. Its library reads by recursion in C++ without a bound,
-so this reader is a small one of its own.
+so this reader is written here.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NoReturn
 import numpy as np
 
 from torchgco.base.errors import shown
+from torchgco.maps.files.part import Box
 from torchgco.maps.files.source import MOST_CELLS, Cursor, Source, made
 from torchgco.maps.grid import OccupancyGrid
 
@@ -32,8 +33,11 @@ class Leaves:
     values: np.ndarray
 
 
-def read_octomap(source: Source) -> OccupancyGrid:
+def read_octomap(source: Source, box: Box) -> OccupancyGrid:
     """The smallest grid around all known leaves, unknown between them; probabilities of an ot file are kept.
+
+    Args:
+        box: only what lies in it is read: the tree may be larger than a grid can be.
 
     Raises:
         InputError: another header, a tree that is cut, has nodes more or fewer than the header says, or no leaf.
@@ -49,21 +53,26 @@ def read_octomap(source: Source) -> OccupancyGrid:
         source.refuse(f"a tree of {size:,} nodes", f"{nodes:,}")
     if not len(leaves.sides):
         source.refuse("a map with a known cell", "an empty tree")
-    low, high = leaves.lowest.min(0), (leaves.lowest + leaves.sides[:, None]).max(0)
-    source.limit(int(np.prod(high - low, dtype=np.float64)), MOST_CELLS, f"cells ({' x '.join(map(str, high - low))})")
+    middle, begin, end = 2 ** (DEPTH - 1), leaves.lowest, leaves.lowest + leaves.sides[:, None]
+    first, last = (np.clip(cells + middle, 0, 2**DEPTH) for cells in box.cells(resolution))
+    begin, end = np.maximum(begin, first), np.minimum(end, last)
+    held = (begin < end).all(-1)
+    if not held.any():
+        source.refuse(f"known cells in {box}", "none")
+    begin, end, values = begin[held], end[held], leaves.values[held]
+    low, high = begin.min(0), end.max(0)
+    count = f"cells ({' x '.join(map(str, high - low))}): read a part by `box` or `layer`"
+    source.limit(int(np.prod(high - low, dtype=np.float64)), MOST_CELLS, count)
     cells = np.full(tuple(high - low), np.nan, np.float32)
-    for side in np.unique(leaves.sides).tolist():
-        chosen = leaves.sides == side
-        _fill(cells, leaves.lowest[chosen] - low, side, leaves.values[chosen])
-    return made(source, cells, (low - 2 ** (DEPTH - 1)) * resolution, resolution)
+    _fill(cells, begin - low, end - low, values)
+    return made(source, cells, (low - middle) * resolution, resolution)
 
 
-def _fill(cells: np.ndarray, lowest: np.ndarray, side: int, values: np.ndarray) -> None:
-    if side == 1:
-        cells[tuple(lowest.T)] = values
-        return
-    for (i, j, k), value in zip(lowest.tolist(), values, strict=True):
-        cells[i : i + side, j : j + side, k : k + side] = value
+def _fill(cells: np.ndarray, begin: np.ndarray, end: np.ndarray, values: np.ndarray) -> None:
+    single = (end - begin == 1).all(-1)
+    cells[tuple(begin[single].T)] = values[single]
+    for low, high, value in zip(begin[~single].tolist(), end[~single].tolist(), values[~single], strict=True):
+        cells[tuple(map(slice, low, high))] = value
 
 
 def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float, int]:

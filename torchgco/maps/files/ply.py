@@ -1,4 +1,4 @@
-"""ply: the vertices of a Stanford polygon file, as text or binary. Written here, as plyfile has a stronger licence."""
+"""ply: the vertices of a Stanford polygon file, as text or binary, or its mesh. Plyfile has a stronger licence."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchgco.base.errors import shown
+from torchgco.base.errors import InputError, shown
+from torchgco.maps.files.meshes import read_mesh
 from torchgco.maps.files.source import MOST_POINTS, Cursor, Source, finite_points, whole
 from torchgco.maps.files.text import columns_of
+from torchgco.maps.grid import OccupancyGrid
 
 PLY = "a ply file of points with x, y and z"
 LINES, LETTERS = 1024, 4096
@@ -31,19 +33,23 @@ class Element:
     lists: bool = False
 
 
-def read_ply(source: Source) -> np.ndarray:
-    """Points (P, 3): the vertices. A mesh is refused, as its surface lies between them.
+def read_ply(source: Source, resolution: float | None, solid: bool | None) -> np.ndarray | OccupancyGrid:
+    """Points (P, 3): the vertices. Of a mesh, whose surface lies between them, cells, as `read_mesh` says.
 
     Raises:
-        InputError: another header, fewer bytes than it says, a mesh, or tables of lists before the vertices.
+        InputError: another header, fewer bytes than it says, tables of lists before the vertices, a mesh without a
+            resolution, points with one.
     """
     raw = source.bytes(PLY)
     order, elements, at, lines = _header(source, raw)
     vertices = next((element for element in elements if element.name == "vertex"), None)
     if vertices is None or not {"x", "y", "z"} <= set(vertices.names):
         source.refuse(PLY, f"properties {shown(vertices.names)}" if vertices else "no vertices")
-    if faces := sum(element.count for element in elements if element.name in ("face", "tristrips")):
-        source.refuse(f"{PLY}: draw points on the surface of a mesh first", f"a mesh of {faces:,} faces")
+    if any(element.count for element in elements if element.name in ("face", "tristrips")):
+        return read_mesh(source, resolution, solid)
+    for name, value in (("resolution", resolution), ("solid", solid)):
+        if value is not None:
+            raise InputError(f"{source.name}.{name}", f"none: {source.path} holds points, no mesh", value)
     before = elements[: elements.index(vertices)]
     if vertices.lists or any(element.lists and element.count for element in before):
         source.refuse(f"{PLY} without lists", "lists among or before the vertices")

@@ -12,10 +12,15 @@ import numpy as np
 
 from torchgco.base.errors import InputError, shown
 from torchgco.maps.files.arrays import read_npy, read_npz
+from torchgco.maps.files.bodies import read_world
 from torchgco.maps.files.images import read_image
+from torchgco.maps.files.las import read_las
 from torchgco.maps.files.layer import checked_layer, flat
 from torchgco.maps.files.map_server import beside, read_described, read_map_server
+from torchgco.maps.files.meshes import read_mesh
+from torchgco.maps.files.movingai import read_movingai
 from torchgco.maps.files.octomap import read_octomap
+from torchgco.maps.files.part import Box, checked_box, part
 from torchgco.maps.files.pcd import read_pcd
 from torchgco.maps.files.ply import read_ply
 from torchgco.maps.files.source import FARTHEST, LEAST, Source
@@ -54,9 +59,19 @@ def _read_image(
     return read_image(source, resolution, origin, height)
 
 
+def _read_octomap(source: Source, layer: tuple[float, float] | None, box: Box | None) -> OccupancyGrid:
+    """What `layer` and `box` leave of a tree, which may be larger than a grid can be."""
+    box = Box.everything(3) if box is None else box.of(source, 3)
+    return read_octomap(source, box if layer is None else box.between(*layer))
+
+
 METADATA = "metadata.yaml"  # is in the folder of each bag of ROS 2
 IMAGE = Format(_read_image, ("resolution", "origin", "height"))
 BAG = Format(_read_bag, ("topic",))
+WORLD = Format(read_world, ("resolution",))
+MESH = Format(read_mesh, ("resolution", "solid"))
+OCTOMAP = Format(_read_octomap, ("layer", "box"))
+LAS = Format(read_las)
 FORMATS = {
     ".npz": Format(read_npz),
     ".npy": Format(read_npy, ("resolution", "origin", "height")),
@@ -64,15 +79,41 @@ FORMATS = {
     ".yml": Format(read_map_server),
     ".png": IMAGE,
     ".pgm": IMAGE,
+    ".ppm": IMAGE,
     ".bmp": IMAGE,
+    ".jpg": IMAGE,
+    ".jpeg": IMAGE,
+    ".tif": IMAGE,
+    ".tiff": IMAGE,
+    ".map": Format(read_movingai, ("resolution", "origin")),
+    ".world": WORLD,
+    ".sdf": WORLD,
+    ".stl": MESH,
+    ".obj": MESH,
     ".xyz": Format(read_xyz),
     ".pcd": Format(read_pcd),
-    ".ply": Format(read_ply),
-    ".bt": Format(read_octomap),
-    ".ot": Format(read_octomap),
+    ".ply": Format(read_ply, ("resolution", "solid")),
+    ".las": LAS,
+    ".laz": LAS,
+    ".bt": OCTOMAP,
+    ".ot": OCTOMAP,
     ".bag": BAG,
     ".mcap": BAG,
     ".db3": BAG,
+}
+# What other formats become ones that are read by: a tool of theirs, and its line.
+_BY_TRIMESH = "an stl: `python -c \"import trimesh; trimesh.load('IN', force='mesh').export('OUT.stl')\"` writes one"
+CONVERTED = {
+    **dict.fromkeys((".dae", ".glb", ".gltf", ".off", ".3mf"), _BY_TRIMESH),
+    ".pdf": "an image: `pdftoppm -png -r 100 IN OUT` writes one",
+    ".svg": "an image: `rsvg-convert -o OUT.png IN` writes one",
+    ".webp": "an image: `python -c \"from PIL import Image; Image.open('IN').save('OUT.png')\"` writes one",
+    ".gif": "an image: `python -c \"from PIL import Image; Image.open('IN').save('OUT.png')\"` writes one",
+    ".e57": "a cloud of points: `pdal translate IN OUT.las` writes one",
+    ".urdf": "a world in SDF: `gz sdf -p IN > OUT.sdf` writes one",
+    ".xacro": "a world in SDF: `xacro IN > OUT.urdf; gz sdf -p OUT.urdf > OUT.sdf` writes one",
+    ".csv": "points as text, `.xyz`: lines of x, y, z without a heading",
+    ".txt": "points as text, `.xyz`: lines of x, y, z without a heading",
 }
 
 
@@ -85,20 +126,27 @@ def read(
     height: float | None = None,
     topic: str | None = None,
     layer: Any = None,
+    box: Any = None,
+    solid: bool | None = None,
     field: str = "map",
 ) -> OccupancyGrid | PointCloud:
     """The map in a file: a grid, or a cloud where the file holds points. What has no unit is in metres.
 
     Args:
         path: a file of one of `FORMATS`; of ROS 2 also a bag's folder; `~` is your home.
-        resolution: side of a cell, m: for images, and cells or heights in npy files, which don't state theirs. An image
-            that a map_server's yaml file of the same stem beside it describes is read as that says, unknown cells too.
+        resolution: side of a cell, m: for images, MovingAI's maps, and cells or heights in npy files, which don't state
+            theirs; for worlds and meshes, which become cells. An image that a map_server's yaml file of the same stem
+            beside it describes is read as that says, unknown cells too.
         radius: of the ball around each point, m: for files of points.
-        origin: lowest corner of the first cell, m, by default 0: for images, and cells or heights in npy files.
+        origin: lowest corner of the first cell, m, by default 0: for images, MovingAI's maps, and cells or heights in
+            npy files.
         height: makes an image or numbers (X, Y) in an npy file a heightmap: metres of white above black, or of 1.
         topic: of a bag's map; not needed where only one topic has maps.
         layer: heights (low, high), m: of a map of space, what lies between them is seen from above, as a map of the
             plane.
+        box: two corners (low, high), each of as many coordinates as the map has, m: what lies outside isn't read. Cells
+            that touch the box are kept whole.
+        solid: of a mesh, whether its inside is occupied, too; None: where its surface is closed.
         field: what errors call the file and these arguments: `<field>.path`, `<field>.resolution`.
 
     Raises:
@@ -106,7 +154,7 @@ def read(
             range, or not for this kind of file.
     """
     source, format = _find(path, field)
-    given = {"resolution": resolution, "origin": origin, "height": height, "topic": topic}
+    given = {"resolution": resolution, "origin": origin, "height": height, "topic": topic, "solid": solid}
     for name, value in given.items():
         if value is not None and name not in format.options:
             raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
@@ -116,9 +164,15 @@ def read(
         given["origin"] = origin = coordinates(origin, f"{field}.origin")
         if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST).all():
             raise InputError(f"{field}.origin", f"2 or 3 coordinates within {FARTHEST:g} m", shown(origin.tolist()))
+    if solid is not None and not isinstance(solid, bool):
+        raise InputError(f"{field}.solid", "True, False or None", shown(solid))
+    given["layer"] = layer = None if layer is None else checked_layer(layer, f"{field}.layer")
+    given["box"] = box = None if box is None else checked_box(box, f"{field}.box")
     found = format.reader(source, **{name: given[name] for name in format.options})
+    if box is not None:
+        found = part(source, found, box, radius)
     if layer is not None:
-        found = flat(source, found, checked_layer(layer, f"{field}.layer"), radius)
+        found = flat(source, found, layer, radius)
     if isinstance(found, OccupancyGrid):
         if radius is not None:
             raise InputError(f"{field}.radius", f"none: {source.path} holds cells, no points", radius)
@@ -135,7 +189,8 @@ def _find(path: Any, field: str) -> tuple[Source, Format]:
     if ending not in FORMATS and (source.path / METADATA).is_file():
         return source, BAG
     if ending not in FORMATS:
-        raise InputError(f"{field}.path", f"a file that ends with {', '.join(FORMATS)}", path)
+        expected = CONVERTED.get(ending, f"a file that ends with {', '.join(FORMATS)}")
+        raise InputError(f"{field}.path", expected, path)
     return source, FORMATS[ending]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.maps.field import BoundField
 from torchgco.maps.grid import OccupancyGrid
+from torchgco.maps.points import PointCloud
 from torchgco.missions.sensing.library import call
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
@@ -167,17 +169,27 @@ class World:
 def _cells(part: BoundField) -> tuple[np.ndarray, tuple[float, float, float], float]:
     """The occupied cells of one problem's map, where they begin, m, and their side, m.
 
+    A cloud of points is rasterised to the cells that its balls reach into, as large as those of its distance field.
+
     Raises:
-        InputError: a cloud of points, which has no cells, or a map of the plane.
+        InputError: a map of the plane.
     """
     source, which = part.field.source, int(part.which[0])
-    if not isinstance(source, OccupancyGrid) or source.d != 3:
+    if source.d != 3:
         kind = f"{type(source).__name__} in {source.d}-D"
-        raise InputError("scenario", "an occupancy grid in space, for a sensor", kind)
+        raise InputError("scenario", "a map in space, for a sensor", kind)
+    if isinstance(source, PointCloud):
+        source = _rasterised(source, which, part.field.spacing)
     held = source.is_occupied | (source.is_unknown & (part.field.unknown == "occupied"))
     occupied, origin = (held, source.origin) if source.batch is None else (held[which], source.origin)
     x, y, z = (origin if origin.ndim == 1 else origin[which]).tolist()
     return np.ascontiguousarray(occupied, np.uint8), (x, y, z), source.resolution
+
+
+@lru_cache(4)
+def _rasterised(cloud: PointCloud, which: int, side: float) -> OccupancyGrid:
+    """The cells of one of its clouds; kept, as every vehicle of a batch asks for the one that all share."""
+    return cloud.single(0 if cloud.batch is None else which).rasterised(side)
 
 
 def _bodies(part: Obstacles) -> tuple[np.ndarray, Motion]:

@@ -2,7 +2,7 @@
 
 In every control period the map takes what the sensor has seen, a search over its cells finds the cheapest path to the
 goal through all that isn't known to be occupied, and plans follow the part of this path that is known to be free. Every
-plan comes to rest within it. Where no new plan does, the former one is flown on.
+plan comes to rest within it. Where no new plan does, the previous one is flown on.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from torchgco.solvers.ending import optimality
 OUTER = 12  # outer iterations of a plan at most
 LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violation_tolerance": 5e-3}
 ROUGH = 0.01  # m of distance that sensed maps and plans between their knots may err by
-BETTER = 2 * ROUGH  # m by which an unsafe plan has to keep more distance than the one that is kept
+BETTER = 2 * ROUGH  # m of distance gained that an unsafe plan needs to replace another unsafe one
 AWAY = 1.0  # m/s^2 with which a vehicle gets out of a margin that it has entered
-NEARLY = 0.2  # at most, by which a plan exceeds what can be flown where the one that is kept isn't safe
+NEARLY = 0.2  # largest excess over the actuators' limits of a plan that replaces an unsafe one
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
@@ -233,7 +233,7 @@ class Exploration:
         return np.where(out, np.minimum(low, x[:3] - 1.0), low), np.where(out, np.maximum(high, x[:3] + 1.0), high)
 
     def _clear_part(self, former: Tensor) -> Tensor:
-        """Positions (B, N, 3) of former plans; where one has become blocked, it waits some knots before that."""
+        """Positions (B, N, 3) of previous plans; where one has become blocked, it waits some knots before that."""
         former = former.clone()
         for b, scout in enumerate(self.scouts):
             least = CONTACT_FACTOR * scout.radius + SPARE

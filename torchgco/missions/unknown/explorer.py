@@ -220,7 +220,7 @@ def unflyable(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 
 def within_bounds(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """The rollout, X (B, N+1, n) and U (B, N, m), of feedback K around former X and U, with controls cut off at their
+    """The rollout, X (B, N+1, n) and U (B, N, m), of feedback K around previous X and U, with controls cut off at their
     bounds: the vehicle wouldn't follow a plan that asks for more. What exceeds them by `FLYABLE` at most stays.
     """
     bounds = problem.control_bounds

@@ -1,4 +1,4 @@
-"""Former plans in unknown space, flown one stage later, and what stands in for them where there is none."""
+"""Previous plans in unknown space, flown one stage later, and what stands in for them where there is none."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchgco.problem.problem import Problem
 
 
 def former_plans(problem: Problem, before: Plan | None) -> Plan:
-    """The former plans one stage later, brought back to by feedback; of a first plan, rest."""
+    """The previous plans one stage later, brought back to by feedback; of a first plan, rest."""
     if before is None:
         x0, B, N = problem.x0, problem.B, problem.N
         U = problem.cost.rest_controls(x0.new_zeros(B, N, 4))

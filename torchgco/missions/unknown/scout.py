@@ -28,7 +28,7 @@ DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicl
 ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
-SLOW = 0.45  # of a slow reference's speed: its accelerations, 1 m/s^2, lead away from a place within `patience`
+SLOW = 0.45  # factor on the speed of a slow reference; at 1 m/s^2 it still leaves a place within `patience`
 PAUSE = 0.25  # s in one place after which a reference that no plan follows becomes slow, for `HELD`
 
 
@@ -149,7 +149,7 @@ class Scout:
     def slow_down(self, came_through: bool) -> None:
         """Make the reference of a vehicle in one place slow, where no plan comes through that follows it.
 
-        Plans within the former one's corridor do, but may lead nowhere: each of them may begin by hovering.
+        Plans within the previous one's corridor do, but may lead nowhere: each of them may begin by hovering.
         """
         self.slow = max(0, self.slow - 1)
         if not came_through and self.slow == 0 and self.waited * self.dt >= PAUSE:

@@ -36,6 +36,12 @@ static V steepest(const Barrier *t) {
     return largest;
 }
 
+/* The barrier parameter at which lane l begins: at least that at which it ends, where the barrier stays. */
+static double first_barrier(const Barrier *t, int l) {
+    double own = t->how->barrier[t->lanes.element[l]], end = t->how->smoothing * t->scale[l];
+    return own > end ? own : end;
+}
+
 /* Lanes `of` have just been loaded: the scale of their cost, slacks and multipliers. */
 static void begin(Barrier *t, Track *k, I of) {
     V one = SET(1.0), zero = SET(0.0), largest;
@@ -59,10 +65,10 @@ static void begin(Barrier *t, Track *k, I of) {
             for (int l = 0; l < LANES; l++)
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
-    for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = how->barrier[t->lanes.element[l]];
     largest = steepest(t);
     V scale = SET(how->steepest) / largest;
     t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
+    for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
     if (how->warm) {
         if (t->some_out) join_multipliers(t, of);
@@ -83,6 +89,7 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
     const Interior *how = t->how;
     V base = most(dual, primal), usual = SET(how->tolerance * how->barrier_floor);
     V smallest = tgco_choose(k->presses, SET(how->barrier_least), usual);
+    if (how->smoothing > 0) smallest = SET(how->smoothing) * t->scale;
     I lowered = running & ~running;
     for (int tries = 0; tries < LONGEST_FALL; tries++) {
         V error = most(base, complementarity(t, t->mu) * scale_z);
@@ -170,6 +177,7 @@ static void resume(Barrier *t, Track *k) {
    complementarity within its tolerance, in all `left`, isn't small beside it. */
 static I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
+    if (t->how->smoothing > 0) return of & ~of; /* it is to stay */
     if (!any(of)) return of;
     V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
     ROWS(t, 0, *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)))
@@ -224,7 +232,7 @@ static I readmit(Barrier *t, Track *k, I of, double admitted) {
     ROWS(t, 0, changed |= t->dz[q] != tgco_truth(t->out[q]))
     if (!any(changed)) return changed;
     for (int l = 0; l < LANES; l++) if (changed[l]) {
-        t->mu[l] = t->how->barrier[t->lanes.element[l]];
+        t->mu[l] = first_barrier(t, l);
         k->watching[l] = k->shortened[l] = 0;
     }
     k->least = tgco_choose(changed, SET(INFINITY), k->least);
@@ -244,7 +252,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     expand(t);
     errors(t, &dual, &primal, &scale_z);
-    *error = most(most(dual, primal), complementarity(t, SET(0.0)) * scale_z);
+    *error = most(most(dual, primal), complementarity(t, SET(how->smoothing) * t->scale) * scale_z);
     I ended = running & ~running, astray = running & k->watching & ~finite(*error);
     I small = (*error <= most(SET(how->tolerance), SET(how->rounding))) & (primal <= SET(how->violation));
     small &= ~k->restoring; /* no step that can't be taken matters there */

@@ -1,28 +1,33 @@
 /* Linear systems with the matrix of the KKT conditions at given points, for derivatives of solutions: the curvature H of
-   the Lagrangian, the dynamics' slopes F and those A of the rows that hold as equalities, `active`,
+   the Lagrangian, the dynamics' slopes F and those A of the rows that hold, `active`, which give way to their multipliers
+   by D, `give`: 0 of those that hold as equalities, slack / multiplier of those in a barrier,
 
        [H  F' A'] [z]     [a]
        [F       ] [y] = - [b]
-       [A       ] [v]     [c]
+       [A    -D ] [v]     [c]
 
-   The interior point's factors of H + sigma A'A, and of F, give steps towards the solution: each round closes what the
-   last one has left open, of active rows all but a share of about 1 / sigma, as the method of multipliers does. */
+   The interior point's factors of H + A'wA with w = 1 / (D + 1 / sigma), and of F, give steps towards the solution: each
+   round closes what the last one has left open, of active rows all but a share of about 1 / sigma, as the method of
+   multipliers does. */
 
 #define LEAST 1e-200 /* multiplier of an active row of an inequality, by which its stiffness is divided */
 
 /* What a solve needs beside the interior point's own memory. */
 typedef struct {
-    V *active;      /* (rows): 1 where a row holds as an equality */
+    V *active, *give; /* (rows): 1 where a row holds, and its D */
     V *H;           /* (N+1, S, S): curvatures without what holds the rows, upper triangles */
     V *a, *b, *c;   /* (N+1, S), (N, NX), (rows): a right hand side */
     V *z, *y, *v;   /* the same: its solution */
     V sigma;
 } System;
 
-/* A row of inequalities that holds has this curvature sigma across; one that doesn't none. (The interior point: z / s.) */
-static void stiffen(Barrier *t, const V *active, V sigma) {
-    ROWS(t, 0, t->s[q] = tgco_choose(active[q] > SET(0.0), t->z[q] / sigma, SET(INFINITY)))
-    t->soft = SET(1.0) / sigma;
+/* The curvature w across row q, where it holds. */
+static inline V weight_of(const System *of, int64_t q) { return of->sigma / (SET(1.0) + of->sigma * of->give[q]); }
+
+/* A row of inequalities that holds has this curvature; one that doesn't none. (The interior point: z / s.) */
+static void stiffen(Barrier *t, const System *of) {
+    ROWS(t, 0, t->s[q] = tgco_choose(of->active[q] > SET(0.0), t->z[q] / weight_of(of, q), SET(INFINITY)))
+    t->soft = SET(1.0) / of->sigma;
 }
 
 /* Adds the slopes of all rows, times their sigma r, to g[1], and their sigma's curvature to H. */
@@ -46,7 +51,8 @@ static I factor_kkt(Barrier *t, System *of, double stiff) {
     t->scale = t->objective = SET(1.0); t->mu = t->shift = SET(0.0);
     memset(t->y, 0, (N + 1) * NX * sizeof(V));
     memset(t->r, 0, t->rows * sizeof(V));
-    stiffen(t, of->active, SET(0.0)); /* infinite slacks: rows have no weight yet */
+    of->sigma = SET(0.0);
+    stiffen(t, of); /* infinite slacks: rows have no weight yet */
     expand(t);
     adjoin(t, all);
     expand(t);
@@ -54,7 +60,7 @@ static I factor_kkt(Barrier *t, System *of, double stiff) {
     for (int64_t k = 0; k <= N; k++)
         for (int i = 0; i < (k < N ? S : NX); i++) largest = most(tgco_fabs(t->H[k * S * S + i * S + i]), largest);
     of->sigma = SET(stiff) * largest;
-    stiffen(t, of->active, of->sigma);
+    stiffen(t, of);
     add_all_rows(t);
     return factor(t, ~all);
 }
@@ -93,7 +99,7 @@ static void find_open(Barrier *t, const System *of) {
     }
 }
 
-/* Steps that close what is open, from z, y, v = 0 on; returns the largest of c + A z of active rows at the end. What is
+/* Steps that close what is open, from z, y, v = 0 on; returns the largest of c + A z - D v of active rows at the end. What is
    open of rows is counted in c itself: v, in which it is multiplied by sigma, would magnify the rounding of c + A z. */
 static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
     int64_t N = t->lanes.of->N;
@@ -103,7 +109,7 @@ static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
     for (int64_t round = 0; round < rounds; round++) {
         find_open(t, of);
         for (int64_t q = 0; q < t->rows; q++)
-            t->r[q] = tgco_if(of->active[q] > SET(0.0), of->c[q] + of->v[q] / of->sigma);
+            t->r[q] = tgco_if(of->active[q] > SET(0.0), of->c[q] + of->v[q] / weight_of(of, q));
         add_all_rows(t);
         solve(t);
         along_rows(t);
@@ -113,7 +119,8 @@ static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
         }
         for (int64_t i = 0; i < N * NX; i++) of->y[i] += t->yn[NX + i];
         for (int64_t q = 0; q < t->rows; q++) {
-            of->c[q] += tgco_if(of->active[q] > SET(0.0), t->ds[q]);
+            V open = of->c[q] + tgco_if(of->active[q] > SET(0.0), t->ds[q]), stays = SET(1.0) + of->sigma * of->give[q];
+            of->c[q] = open / stays;
             ADD(of->v[q], of->sigma, of->c[q]);
         }
     }
@@ -151,6 +158,7 @@ static void enter_system(Barrier *t, System *of, const Kkt *how, int lane, int64
         for (int64_t j = 0; j < count; j++, q++) {
             double lam = con->lam[e * count + j], held = how->active[e * t->rows + q];
             of->active[q][lane] = held;
+            of->give[q][lane] = how->give && held > 0 ? how->give[e * t->rows + q] : 0;
             t->z[q][lane] = held <= 0 ? 0 : con->equality || lam > LEAST ? lam : LEAST;
         }
     }
@@ -158,9 +166,9 @@ static void enter_system(Barrier *t, System *of, const Kkt *how, int lane, int64
 
 static V *start_system(System *of, int64_t N, int64_t rows) {
     int64_t point = (N + 1) * S, gaps = N * NX;
-    V *memory = aligned_alloc(sizeof(V), ((N + 1) * S * S + 2 * (point + gaps + rows) + rows + 1) * sizeof(V)), *m = memory;
+    V *memory = aligned_alloc(sizeof(V), ((N + 1) * S * S + 2 * (point + gaps + rows) + 2 * rows + 1) * sizeof(V)), *m = memory;
     if (!memory) return 0;
-    of->H = cut(&m, (N + 1) * S * S); of->active = cut(&m, rows);
+    of->H = cut(&m, (N + 1) * S * S); of->active = cut(&m, rows); of->give = cut(&m, rows);
     of->a = cut(&m, point); of->b = cut(&m, gaps); of->c = cut(&m, rows);
     of->z = cut(&m, point); of->y = cut(&m, gaps); of->v = cut(&m, rows);
     return memory;

@@ -71,8 +71,8 @@ class Polish:
     def refine(self, problem: Problem, solution: Solution) -> Solution:
         """The solution with the problems that could be improved replaced: X, U, gains, multipliers, cost, violation.
 
-        A trajectory is replaced where its violation falls below the tolerance, or stays within it (or within its former
-        value) while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight
+        A trajectory is replaced where its violation falls below the tolerance, or stays within it (or within its value
+        before) while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight
         segments between knots would cut an obstacle deeper than before. The status of a replaced trajectory is that of
         the new one. `iterations` grows by the Newton steps, even where the trajectory isn't replaced.
 

@@ -1,12 +1,12 @@
 // The body of a vehicle, and the ball or disc of its radius.
 import * as THREE from "./three.module.min.js";
 
-/** A vehicle of a radius, m, nose along x, z up; `kind` is "ball", "car" or "quadrotor". */
+/** A vehicle of a radius, m, nose along x, z up; `kind` is "ball", "car", "quadrotor" or "dart". */
 export function vehicle(kind, radius, colour, flat) {
   const group = new THREE.Group();
   const paint = new THREE.MeshLambertMaterial({ color: colour });
   const dark = new THREE.MeshLambertMaterial({ color: 0x30343a });
-  const built = { ball, car, quadrotor }[kind](radius, paint, dark, flat);
+  const built = { ball, car, quadrotor, dart }[kind](radius, paint, dark, flat);
   built.forEach((mesh) => (mesh.castShadow = true));
   group.add(...built);
   if (kind !== "ball") group.add(reach(radius, colour, flat));
@@ -37,6 +37,15 @@ function car(radius, paint, dark) {
     ),
   );
   return [body, cabin, ...wheels];
+}
+
+/** A pointed body with a fin: which way is ahead and which is up is all that it tells. */
+function dart(radius, paint, dark) {
+  const body = mesh(new THREE.ConeGeometry(0.45 * radius, 1.5 * radius, 24), paint, [0.1 * radius, 0, 0]);
+  body.rotation.z = -0.5 * Math.PI;
+  body.scale.z = 0.5;
+  const fin = mesh(new THREE.BoxGeometry(0.4 * radius, 0.06 * radius, 0.45 * radius), dark, [-0.43 * radius, 0, 0.2 * radius]);
+  return [body, fin];
 }
 
 function quadrotor(radius, paint, dark) {

@@ -1,0 +1,99 @@
+"""The mission's planner as a policy: what a learned one is compared with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import computing_on
+from torchgco.base.tree import put
+from torchgco.envs.missions import MissionVectorEnv
+from torchgco.missions.mission import CPU
+from torchgco.missions.pilot import SEED_STEP
+from torchgco.missions.planner import OTHERS, TRAJECTORY, Plan, Planner
+from torchgco.missions.tracker import RATES
+
+AHEAD = 2  # the knot of a plan that is asked for
+
+
+class PlannerPolicy:
+    """Plans from the measured state in every period, and asks for what the plan has two periods later.
+
+    At a plan's second knot the body rates are those that the rotors lead to in any case, see `FirstStepRates`.
+
+        policy = PlannerPolicy(env)
+        action = policy(observation)
+
+    It knows the whole state and all obstacles: it reads nothing of the observation. Its draws depend on how often it
+    has been called.
+
+    Args:
+        env: whose missions it plans, with control "rates"; wrapped ones, too.
+        planner: None: that of the environment's mission.
+
+    Raises:
+        InputError: another environment, or one whose actions are rotor speeds.
+    """
+
+    def __init__(self, env: Any, planner: Planner | None = None, seed: int = 0) -> None:
+        env = env.unwrapped
+        if not isinstance(env, MissionVectorEnv) or env.episodes.control != "rates":
+            given = type(env).__name__ if not isinstance(env, MissionVectorEnv) else 'control "rotors"'
+            raise InputError("env", 'a MissionVectorEnv with control "rates"', given)
+        self.env, self.seed = env, seed
+        self.planner = env.episodes.mission.planner if planner is None else planner
+        self._plan: Plan | None = None
+        self._step, self._number = 0, torch.zeros_like(env.episodes.number)
+
+    def __call__(self, observation: Any = None) -> np.ndarray:
+        """Actions (B, 4), float32; of environments that wait for a reset as for one that rests.
+
+        Raises:
+            InputError: before the first reset.
+        """
+        flying = self.env.episodes
+        if bool((flying.number == 0).any()):
+            raise InputError("env", "a reset before a policy is asked", "none")
+        with computing_on(CPU):
+            x, waiting = flying.measured(), torch.from_numpy(self.env.waiting)
+            begun = (flying.number != self._number) & ~waiting
+            action = torch.zeros(len(x), 4, dtype=x.dtype)
+            action[:, 3] = flying.airframe.gravity
+            for rows, anew in ((begun, True), (~begun & ~waiting, False)):
+                at = rows.nonzero().flatten()
+                if len(at) > 0:
+                    action[at] = _asked(self._planned(x, at, anew).X)
+            self._number, self._step = torch.where(waiting, self._number, flying.number), self._step + 1
+            return action.clamp(*self.env._bounds).to(torch.float32).numpy()
+
+    def _planned(self, x: Tensor, rows: Tensor, anew: bool) -> Plan:
+        """The plans of the environments `rows` (b,), which are kept for the next call."""
+        flying, planner = self.env.episodes, self.planner
+        whole, x = flying.problem.take(flying.layout[rows]), x[rows]
+        before = None if anew or self._plan is None else self._plan.take(rows)
+        ids, seed = torch.tensor(self.env.ids)[rows], self.seed + SEED_STEP * self._step
+        posed = planner.problem(whole, x)
+        plan, _, _ = planner.plan(whole, posed, x, self._step, before, seed, ids)
+        plan = replace(plan, model=whole.dynamics)
+        if self._plan is None:
+            self._plan = _room(plan, len(flying.x))
+        for name in (*TRAJECTORY, *OTHERS):
+            put(getattr(self._plan, name), rows, getattr(plan, name))
+        self._plan = replace(self._plan, model=flying.problem.dynamics.take(flying.layout), step=plan.step)
+        return plan
+
+
+def _asked(X: Tensor) -> Tensor:
+    """Body rates and thrust accelerations (b, 4) of plans X (b, N+1, 14)."""
+    return X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
+
+
+def _room(plan: Plan, B: int) -> Plan:
+    """Plans of B vehicles, to be written to, that are like the first of `plan`."""
+    first = plan.take(torch.zeros(B, dtype=torch.int64))
+    return replace(first)

@@ -1,0 +1,171 @@
+"""A trajectory as a bag of ROS 2, by the library `rosbags`: a path, a trajectory and odometry.
+
+Positions, velocities and accelerations are in the frame `map`, whose axes are the problem's. Vehicles in the plane stay
+at z = 0 and turn by their heading; those without an attitude don't turn.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from torchgco.base.errors import InputError
+from torchgco.problem.sampled import TIME
+
+Storage = Literal["mcap", "sqlite3"]
+FRAME, BODY = "map", "base_link"
+QUATERNION = "qw", "qx", "qy", "qz"
+RATES = tuple(f"w{axis} [rad/s]" for axis in "xyz")
+HEADING = "heading [rad]"
+NANO = 10**9
+
+
+def write_bag(place: Path, columns: Mapping[str, np.ndarray], position: Sequence[str], storage: Storage) -> None:
+    """Write a trajectory as the bag (a folder) `place`, in the place of one that lies there.
+
+    Topics: /path, nav_msgs/Path; /trajectory, trajectory_msgs/MultiDOFJointTrajectory, with velocities and
+    accelerations in the world's axes; /odometry, nav_msgs/Odometry for each sample, with velocities in the body's axes.
+
+    Args:
+        columns: samples (T,) by label, as `Solution.trajectories` and `torchgco-export` name them.
+        position: the labels of the position, one to three.
+
+    Raises:
+        InputError: no position, without rosbags, another folder in that place.
+    """
+    if not position:
+        raise InputError("--bag", "a vehicle with a position", "one without")
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise InputError("--bag", "rosbags (`pip install torchgco[ros]`)", error) from None
+    if place.exists():
+        if not (place / "metadata.yaml").is_file():
+            raise InputError("--output", "a folder whose bags are rosbags", place)
+        shutil.rmtree(place)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    made = _Messages(store.types, columns, position)
+    with Writer(place, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag:
+        for topic, messages in (
+            ("/path", made.path()),
+            ("/trajectory", made.trajectory()),
+            ("/odometry", made.odometry()),
+        ):
+            connection = bag.add_connection(topic, messages[0][1].__msgtype__, typestore=store)
+            for nanoseconds, message in messages:
+                bag.write(connection, nanoseconds, store.serialize_cdr(message, message.__msgtype__))
+
+
+class _Messages:
+    """The messages of a trajectory, with their times in ns."""
+
+    def __init__(self, types: Mapping[str, Any], columns: Mapping[str, np.ndarray], position: Sequence[str]) -> None:
+        self.types = types
+        t = np.asarray(columns[TIME], float)
+        self.nanoseconds = [round(value * NANO) for value in t.tolist()]
+        self.p = _stacked(columns, position)
+        self.q = _attitudes(columns, len(t))
+        self.v = _or_slope(columns, [f"v{axis} [m/s]" for axis in "xyz"], self.p, t)
+        self.a = _or_slope(columns, [f"a{axis} [m/s^2]" for axis in "xyz"], self.v, t)
+        self.w = _stacked(columns, RATES) if RATES[0] in columns else _turning(columns, t)  # in the body's axes
+        self.w_world = _turned(self.q, self.w)
+        self.turning = _slope(self.w_world, t)
+
+    def _of(self, name: str, *values: Any) -> Any:
+        return self.types[name](*values)
+
+    def _header(self, nanoseconds: int) -> Any:
+        stamp = self._of("builtin_interfaces/msg/Time", *divmod(nanoseconds, NANO))
+        return self._of("std_msgs/msg/Header", stamp, FRAME)
+
+    def _vector(self, values: np.ndarray) -> Any:
+        return self._of("geometry_msgs/msg/Vector3", *values.tolist())
+
+    def _attitude(self, k: int) -> Any:
+        w, x, y, z = self.q[k].tolist()
+        return self._of("geometry_msgs/msg/Quaternion", x, y, z, w)
+
+    def _pose(self, k: int) -> Any:
+        return self._of(
+            "geometry_msgs/msg/Pose", self._of("geometry_msgs/msg/Point", *self.p[k].tolist()), self._attitude(k)
+        )
+
+    def _twist(self, linear: np.ndarray, angular: np.ndarray) -> Any:
+        return self._of("geometry_msgs/msg/Twist", self._vector(linear), self._vector(angular))
+
+    def path(self) -> list[tuple[int, Any]]:
+        poses = [
+            self._of("geometry_msgs/msg/PoseStamped", self._header(at), self._pose(k))
+            for k, at in enumerate(self.nanoseconds)
+        ]
+        return [(self.nanoseconds[0], self._of("nav_msgs/msg/Path", self._header(self.nanoseconds[0]), poses))]
+
+    def trajectory(self) -> list[tuple[int, Any]]:
+        first, points = self.nanoseconds[0], []
+        for k, at in enumerate(self.nanoseconds):
+            transform = self._of("geometry_msgs/msg/Transform", self._vector(self.p[k]), self._attitude(k))
+            motion = [self._twist(self.v[k], self.w_world[k])], [self._twist(self.a[k], self.turning[k])]
+            since = self._of("builtin_interfaces/msg/Duration", *divmod(at - first, NANO))
+            points.append(self._of("trajectory_msgs/msg/MultiDOFJointTrajectoryPoint", [transform], *motion, since))
+        whole = self._of("trajectory_msgs/msg/MultiDOFJointTrajectory", self._header(first), [BODY], points)
+        return [(first, whole)]
+
+    def odometry(self) -> list[tuple[int, Any]]:
+        body = self.q * [1.0, -1.0, -1.0, -1.0]
+        v, unknown, messages = _turned(body, self.v), np.zeros(36), []
+        for k, at in enumerate(self.nanoseconds):
+            pose = self._of("geometry_msgs/msg/PoseWithCovariance", self._pose(k), unknown)
+            twist = self._of("geometry_msgs/msg/TwistWithCovariance", self._twist(v[k], self.w[k]), unknown)
+            messages.append((at, self._of("nav_msgs/msg/Odometry", self._header(at), BODY, pose, twist)))
+        return messages
+
+
+def _stacked(columns: Mapping[str, np.ndarray], labels: Sequence[str]) -> np.ndarray:
+    """(T, 3) of up to three columns; 0 in the place of others."""
+    found = [np.asarray(columns[label], float) for label in labels]
+    return np.stack([*found, *[np.zeros_like(found[0])] * (3 - len(found))], axis=1)
+
+
+def _or_slope(
+    columns: Mapping[str, np.ndarray], labels: Sequence[str], values: np.ndarray, t: np.ndarray
+) -> np.ndarray:
+    """The columns that are there, (T, 3); without the first one, how `values` change."""
+    known = [label for label in labels if label in columns]
+    return _stacked(columns, known) if labels[0] in known else _slope(values, t)
+
+
+def _slope(values: np.ndarray, t: np.ndarray) -> np.ndarray:
+    return np.gradient(values, t, axis=0) if len(t) > 1 else np.zeros_like(values)
+
+
+def _attitudes(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
+    """Unit quaternions (T, 4), scalar first."""
+    q = np.zeros((count, 4))
+    q[:, 0] = 1.0
+    if QUATERNION[0] in columns:
+        q = np.stack([np.asarray(columns[name], float) for name in QUATERNION], axis=1)
+        q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    elif HEADING in columns:
+        half = 0.5 * np.asarray(columns[HEADING], float)
+        q[:, 0], q[:, 3] = np.cos(half), np.sin(half)
+    return q
+
+
+def _turning(columns: Mapping[str, np.ndarray], t: np.ndarray) -> np.ndarray:
+    """Rates (T, 3), rad/s, of a vehicle that turns by its heading."""
+    rates = np.zeros((len(t), 3))
+    if HEADING in columns:
+        rates[:, 2] = _slope(np.asarray(columns[HEADING], float), t)
+    return rates
+
+
+def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors v (T, 3) turned by unit quaternions (T, 4)."""
+    across = 2.0 * np.cross(q[:, 1:], v)
+    return v + q[:, :1] * across + np.cross(q[:, 1:], across)

@@ -1,0 +1,180 @@
+"""world and sdf: the boxes, cylinders and spheres that stand in a Gazebo world, as cells."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from torchgco.base.errors import shown
+from torchgco.maps.files.source import FARTHEST, MOST_CELLS, Source, check_far, made
+from torchgco.maps.grid import OccupancyGrid
+
+WORLD = "a Gazebo world or model in SDF"
+MOST_XML = 2**24  # bytes
+MOST_BODIES = 2**14
+MOST_WORK = 2**29  # cells that are looked at, all bodies together
+DEPTH = 16  # of models within models
+EMPTY = {"model://sun", "model://ground_plane"}  # what many worlds include, and nothing stands in the way of
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A place and the axes there: a point p of it lies at R p + t."""
+
+    R: np.ndarray
+    t: np.ndarray
+
+    def then(self, other: Frame) -> Frame:
+        """The frame `other`, which is given in this one."""
+        return Frame(self.R @ other.R, self.R @ other.t + self.t)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A box, or a cylinder or sphere, m: half its sides; `round` axes are measured together, as a radius."""
+
+    frame: Frame
+    half: np.ndarray  # (3,)
+    round: int  # 0: a box, 2: a cylinder along z, 3: a sphere
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distances (...) of points (..., 3) from the body, 0 inside, m."""
+        p = (points - self.frame.t) @ self.frame.R
+        beside = [np.linalg.norm(p[..., : self.round], axis=-1) - self.half[0]] if self.round else []
+        beside += [np.abs(p[..., i]) - self.half[i] for i in range(self.round, 3)]
+        return np.linalg.norm(np.maximum(np.stack(beside, axis=-1), 0.0), axis=-1)
+
+    @property
+    def reach(self) -> np.ndarray:
+        """Half the sides of the box along the axes that holds the body, (3,), m."""
+        return self.half if self.round == 3 else np.abs(self.frame.R) @ self.half
+
+
+def read_world(source: Source, resolution: float | None) -> OccupancyGrid:
+    """Cells whose centre lies within half a diagonal of a static model's box, cylinder or sphere are occupied.
+
+    So every cell that a body touches is, and some beside it. Planes, the sun and models that move are left out.
+
+    Raises:
+        InputError: another file, no body, geometry of other kinds, models that are included from elsewhere, poses that
+            are relative to named frames.
+    """
+    source.needs("resolution", resolution, "the side of a cell, m")
+    assert resolution is not None
+    bodies = list(_bodies(source, _root(source)))
+    if not bodies:
+        source.refuse(f"{WORLD} with a box, cylinder or sphere in a static model", "none")
+    source.limit(len(bodies), MOST_BODIES, "bodies")
+    ends = np.array([(body.frame.t - body.reach, body.frame.t + body.reach) for body in bodies])
+    check_far(source, ends)
+    near = 0.5 * math.sqrt(3.0) * resolution
+    first, last = (np.floor((ends[:, i] + sign * near) / resolution).astype(np.int64) for i, sign in ((0, -1), (1, 1)))
+    low, shape = first.min(0), last.max(0) - first.min(0) + 1
+    for count, most, what in (
+        (int(np.prod(shape, dtype=float)), MOST_CELLS, f"cells ({' x '.join(map(str, shape))})"),
+        (int(np.prod(last - first + 1.0, axis=-1).sum()), MOST_WORK, "cells around all bodies"),
+    ):
+        source.limit(count, most, what)
+    cells = np.zeros(tuple(shape), bool)
+    for body, begin, end in zip(bodies, first, last, strict=True):
+        for k in range(begin[2], end[2] + 1):  # layer by layer: a large body would take much memory
+            axes = [resolution * (np.arange(a, b + 1) + 0.5) for a, b in zip(begin[:2], end[:2], strict=True)]
+            points = np.stack(np.meshgrid(*axes, [resolution * (k + 0.5)], indexing="ij"), axis=-1)[:, :, 0]
+            at = tuple(slice(a, b + 1) for a, b in zip((begin - low)[:2], (end - low)[:2], strict=True))
+            cells[(*at, k - low[2])] |= body.distance(points) <= near
+    return made(source, cells, low * resolution, resolution)
+
+
+def _root(source: Source) -> Element:
+    raw = source.bytes(WORLD, MOST_XML)
+    if re.search(rb"<!(DOCTYPE|ENTITY)", raw, re.IGNORECASE):
+        source.refuse(f"{WORLD} without definitions of its own", "a DOCTYPE or ENTITY")
+    with source.library(WORLD):
+        root = ElementTree.fromstring(raw)
+    if root.tag not in ("sdf", "gazebo"):
+        source.refuse(WORLD, f"<{root.tag[:40]}>")
+    return root
+
+
+def _bodies(source: Source, root: Element) -> Iterator[Body]:
+    for world in root.findall("world") or [root]:
+        for include in world.iter("include"):
+            uri = (include.findtext("uri") or "").strip()
+            if uri not in EMPTY:
+                expected = "a world whose models stand in the file: `gz sdf -p FILE` writes included ones out"
+                source.refuse(expected, f"an include of {shown(uri[:60])}")
+        yield from _of_models(source, world, Frame(np.eye(3), np.zeros(3)), static=False, depth=0)
+
+
+def _of_models(source: Source, parent: Element, frame: Frame, static: bool, depth: int) -> Iterator[Body]:
+    if depth > DEPTH:
+        source.refuse(f"models within models {DEPTH} deep at most", "more")
+    for model in parent.findall("model"):
+        at = frame.then(_pose(source, model))
+        fixed = static or (model.findtext("static") or "").strip().lower() in ("1", "true")
+        yield from _of_models(source, model, at, fixed, depth + 1)
+        for link in model.findall("link") if fixed else ():
+            here = at.then(_pose(source, link))
+            for collision in link.findall("collision"):
+                body = _body(source, collision.find("geometry"), here.then(_pose(source, collision)))
+                if body is not None:
+                    yield body
+
+
+def _body(source: Source, geometry: Element | None, frame: Frame) -> Body | None:
+    """None of a plane, or of nothing."""
+    shape = None if geometry is None else next(iter(geometry), None)
+    if shape is None or shape.tag in ("plane", "empty"):
+        return None
+    if shape.tag == "box":
+        half = 0.5 * np.array(_numbers(source, shape, "size", 3))
+        return Body(frame, _lengths(source, half), 0)
+    if shape.tag in ("sphere", "cylinder"):
+        (radius,) = _numbers(source, shape, "radius", 1)
+        if shape.tag == "sphere":
+            return Body(frame, _lengths(source, np.full(3, radius)), 3)
+        (length,) = _numbers(source, shape, "length", 1)
+        return Body(frame, _lengths(source, np.array([radius, radius, 0.5 * length])), 2)
+    return source.refuse("static bodies that are boxes, cylinders or spheres", f"<{shape.tag[:40]}>")
+
+
+def _lengths(source: Source, half: np.ndarray) -> np.ndarray:
+    if not (half > 0).all():
+        source.refuse("bodies of sizes above 0 m", f"half sides {half.tolist()}")
+    return half
+
+
+def _pose(source: Source, element: Element) -> Frame:
+    """x, y, z, m, and the angles of Rz Ry Rx, rad; the parent's frame where there is no pose."""
+    pose = element.find("pose")
+    if pose is None or not (pose.text or "").strip():
+        return Frame(np.eye(3), np.zeros(3))
+    if pose.get("relative_to") or pose.get("frame"):
+        source.refuse("poses relative to what is around them", f"one relative to {shown(dict(pose.attrib))}")
+    x, y, z, *angles = _numbers(source, element, "pose", 6)
+    if (pose.get("degrees") or "").strip().lower() in ("1", "true"):
+        angles = [math.radians(angle) for angle in angles]
+    (cr, cp, cy), (sr, sp, sy) = ([f(angle) for angle in angles] for f in (math.cos, math.sin))
+    R = np.array([
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ])  # fmt: skip
+    return Frame(R, np.array([x, y, z]))
+
+
+def _numbers(source: Source, element: Element, name: str, count: int) -> list[float]:
+    text = (element.findtext(name) or "").strip()
+    try:
+        found = [float(word) for word in text.split()]
+    except ValueError:
+        found = []
+    if len(found) != count or not all(abs(number) <= FARTHEST for number in found):
+        source.refuse(f"<{name}> of {count} numbers", shown(text[:60]))
+    return found

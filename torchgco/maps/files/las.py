@@ -1,0 +1,30 @@
+"""las and laz: points of a laser scan from the air, read by laspy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Source, finite_points
+
+LAS = "a las or laz file of points"
+AT_ONCE = 2**20  # points: a header may promise more than there are
+
+
+def read_las(source: Source) -> np.ndarray:
+    """Points (P, 3), m, in the file's own frame: often far from its origin, as coordinates on the Earth are.
+
+    Raises:
+        InputError: another file, a damaged one, or one of too many points.
+    """
+    source.limit(source.size(LAS), MOST_BYTES, "bytes")
+    try:
+        import laspy
+    except ImportError:
+        source.refuse("las with the extra maps: pip install 'torchgco[maps]'", "no laspy")
+    with source.library(LAS), laspy.open(source.path) as file:
+        source.limit(file.header.point_count, MOST_POINTS, "points")
+        parts = [np.stack([part.x, part.y, part.z], axis=-1) for part in file.chunk_iterator(AT_ONCE)]
+    points = np.concatenate([np.empty((0, 3)), *parts])
+    if len(points) != file.header.point_count:
+        source.refuse(f"{LAS} with {file.header.point_count:,} of them", f"{len(points):,}")
+    return finite_points(source, points)

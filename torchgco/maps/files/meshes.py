@@ -1,0 +1,71 @@
+"""stl, obj, and ply with faces: triangles of a surface as cells, read by trimesh."""
+
+from __future__ import annotations
+
+import math
+from io import BytesIO
+
+import numpy as np
+
+from torchgco.maps.files.source import MOST_CELLS, MOST_TEXT, Source, check_far, made
+from torchgco.maps.grid import OccupancyGrid
+
+MESH = "a mesh of triangles, stl, obj or ply"
+EDGE = 0.5  # of a cell: triangles are divided until no edge is longer
+MOST_PIECES = 2**25  # triangles after this
+
+
+def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> OccupancyGrid:
+    """The cells that a surface passes through are occupied, and what it encloses.
+
+    Args:
+        resolution: side of a cell, m.
+        solid: whether the inside is occupied, too; None: where the surface is closed.
+
+    Raises:
+        InputError: no such mesh, too fine a grid, a surface that isn't closed where `solid` is asked for.
+    """
+    source.needs("resolution", resolution, "the side of a cell, m, for a mesh")
+    assert resolution is not None
+    vertices, faces, closed = _loaded(source)
+    if solid and not closed:
+        source.refuse("a closed surface, or solid=False", "one with holes or edges of its own")
+    low, high = (np.floor(end(0) / resolution).astype(np.int64) for end in (vertices.min, vertices.max))
+    shape = high - low + 1
+    source.limit(int(np.prod(shape, dtype=float)), MOST_CELLS, f"cells ({' x '.join(map(str, shape))})")
+    cells = np.zeros(tuple(shape), bool)
+    cells[tuple((_pieces(source, vertices, faces, resolution) - low).T)] = True
+    if solid or (solid is None and closed):
+        from scipy.ndimage import binary_fill_holes
+
+        cells = binary_fill_holes(cells)
+    return made(source, cells, low * resolution, resolution)
+
+
+def _loaded(source: Source) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Vertices (V, 3), m, faces (F, 3), and whether the surface is closed."""
+    raw, kind = source.bytes(MESH, MOST_TEXT), source.path.suffix.lower()[1:]
+    try:
+        import trimesh
+    except ImportError:
+        source.refuse("a mesh with the extra maps: pip install 'torchgco[maps]'", "no trimesh")
+    with source.library(MESH):  # no resolver: files that it names, such as materials, aren't read
+        mesh = trimesh.load_mesh(BytesIO(raw), file_type=kind, force="mesh", skip_materials=True)
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+        closed = bool(mesh.is_watertight)
+    if not len(faces) or not np.isfinite(vertices).all():
+        source.refuse(MESH, f"{len(faces):,} faces" if not len(faces) else "vertices that aren't finite")
+    check_far(source, vertices)
+    return vertices, faces, closed
+
+
+def _pieces(source: Source, vertices: np.ndarray, faces: np.ndarray, resolution: float) -> np.ndarray:
+    """The cells (P, 3), as whole numbers, that hold a corner of the triangles once these are small."""
+    from trimesh.remesh import subdivide_to_size
+
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(-1)
+    halvings = np.ceil(np.log2(np.maximum(longest / (EDGE * resolution), 1.0)))
+    source.limit(int((4.0**halvings).sum()), MOST_PIECES, "pieces of triangles: larger cells take fewer")
+    divided = subdivide_to_size(vertices, faces, EDGE * resolution, max_iter=math.ceil(halvings.max()) + 1)
+    return np.unique(np.floor(divided[0] / resolution).astype(np.int64), axis=0)

@@ -1,0 +1,86 @@
+"""The part of a map that is read: what lies in a box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchgco.base.errors import InputError, shown
+from torchgco.maps.files.source import FARTHEST, Source, made
+from torchgco.maps.grid import OccupancyGrid, coordinates
+
+EDGE = 1e-9  # of a cell: a box that ends this close to a cell doesn't touch it
+
+
+@dataclass(frozen=True)
+class Box:
+    """From one corner (d,) to the opposite one, m; infinite where the map isn't cut."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def everything(cls, d: int) -> Box:
+        """All of space."""
+        return cls(np.full(d, -np.inf), np.full(d, np.inf))
+
+    def of(self, source: Source, d: int) -> Box:
+        """Itself, for a map of d dimensions; InputError where it has others."""
+        if len(self.low) != d:
+            raise InputError(f"{source.name}.box", f"corners of {d} coordinates, as {source.path} is {d}-D", str(self))
+        return self
+
+    def between(self, low: float, high: float) -> Box:
+        """What of a box in space lies between two heights."""
+        floor, top = np.array([-np.inf, -np.inf, low]), np.array([np.inf, np.inf, high])
+        return Box(np.maximum(self.low, floor), np.minimum(self.high, top))
+
+    def cells(self, resolution: float, origin: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """The first cell (d,) that the box touches, of cells that begin at an origin, and the one after the last."""
+        first = np.floor((self.low - origin) / resolution + EDGE)
+        last = np.ceil((self.high - origin) / resolution - EDGE)
+        most = 2.0**40
+        return np.clip(first, -most, most).astype(np.int64), np.clip(last, -most, most).astype(np.int64)
+
+    def __repr__(self) -> str:
+        if np.isinf(self.low[:2]).all():
+            return f"the layer between {self.low[-1]:g} m and {self.high[-1]:g} m"
+        corners = (", ".join(f"{x:g}" for x in corner) for corner in (self.low, self.high))
+        return "the box from ({}) to ({})".format(*corners)
+
+
+def checked_box(value: Any, field: str) -> Box:
+    """Two corners, each of 2 or 3 coordinates.
+
+    Raises:
+        InputError: other numbers, or a corner that isn't below the other one.
+    """
+    box = coordinates(value, field)
+    if box.shape not in ((2, 2), (2, 3)) or not (np.abs(box) <= FARTHEST).all() or not (box[0] < box[1]).all():
+        expected = f"two corners (low, high), low < high, of 2 or 3 coordinates within {FARTHEST:g} m"
+        raise InputError(field, expected, shown(value))
+    return Box(box[0], box[1])
+
+
+def part(
+    source: Source, found: OccupancyGrid | np.ndarray, box: Box, radius: float | None
+) -> OccupancyGrid | np.ndarray:
+    """The cells of a grid that a box touches, or those of some points (P, d) whose balls do.
+
+    Raises:
+        InputError: a box of another space than the map's, or nothing in it.
+    """
+    box.of(source, found.d if isinstance(found, OccupancyGrid) else found.shape[1])
+    if isinstance(found, OccupancyGrid):
+        first, last = (np.clip(cells, 0, found.shape) for cells in box.cells(found.resolution, found.origin))
+        if not (first < last).all():
+            source.refuse(f"a cell in {box}", f"cells from {found.origin.tolist()} to {found.upper.tolist()}")
+        cells = found.occupied[tuple(map(slice, first, last))]
+        return made(source, np.ascontiguousarray(cells), found.origin + found.resolution * first, found.resolution)
+    reach = radius or 0.0
+    held = ((found >= box.low - reach) & (found <= box.high + reach)).all(-1)
+    if not held.any():
+        source.refuse(f"a point in {box}", f"points from {found.min(0).tolist()} to {found.max(0).tolist()}")
+    return found[held]
