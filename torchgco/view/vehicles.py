@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, Unicycle
+from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Look:
 VEHICLES: dict[type[Dynamics], Look] = {
     QuadrotorPlanning: Look("quadrotor", quaternion=slice(6, 10)),
     QuadrotorPlant: Look("quadrotor", quaternion=slice(6, 10)),
+    QuadrotorThrusts: Look("quadrotor", quaternion=slice(6, 10)),
     Unicycle: Look("car", heading=2),
 }
 
