@@ -213,7 +213,7 @@ def test_compiled_problems_take_other_gates_at_the_same_knots(gates: Gates) -> N
     own = gates if gates.normals is None else replace(fresh, centers=given)
     own = replace(own, radius=[0.1, 0.2], knots=places) if gates.normals is None else own
     np.testing.assert_allclose(again.U, torchgco.solve(points(own, ControlBounds(-5.0, 5.0))).U, atol=1e-5)
-    with pytest.raises(InputError, match="gates.centers: expected finite numbers"):
+    with pytest.raises(InputError, match=r"gates\.centers: expected finite numbers"):
         compiled(numbers={"gates.centers": given * torch.nan})
     size = "gates.radius" if gates.normals is None else "gates.half_widths"
     with pytest.raises(InputError, match=f"{size}: expected numbers above 0"):

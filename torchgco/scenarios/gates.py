@@ -35,7 +35,8 @@ PUBLISHED_GATES = tuple(PUBLISHED[i % len(PUBLISHED)] for i in range(19))
 class GateForest(Quadrotor):
     """Gates that are passed one after the other in the least time, and spheres beside and between them.
 
-    Each gate, and the goal behind the last, lies a drawn distance from the one before, in a drawn direction. The number of stages is `stages` for each leg, whose durations are free.
+    Each gate, and the goal behind the last, lies a drawn distance from the one before, in a drawn direction. The number
+    of stages is `stages` for each leg, whose durations are free.
 
     Args:
         goal: without meaning here: it is drawn.
@@ -88,8 +89,8 @@ class GateForest(Quadrotor):
         keep_clear = [(place.tolist(), self.clearance) for place in places]
         centers = uniform_clear(rng, np.column_stack([low, high]).tolist(), spheres, keep_clear)
         return Layouts(
-            **equal_spheres(centers, self.obstacle_radius), start=places[0], goal=places[-1], gate_centers=places[None, 1:-1],
-            gate_radii=np.full((1, count), self.gate_radius), vehicle_radius=self.vehicle_radius,
+            **equal_spheres(centers, self.obstacle_radius), start=places[0], goal=places[-1],
+            gate_centers=places[None, 1:-1], gate_radii=np.full((1, count), self.gate_radius), vehicle_radius=self.vehicle_radius,
             goal_radius=self.goal_radius, dt=self.dt, stages=self.stages * (count + 1),
             free_time=np.array([self.time_least, self.time_most, 1.0]),
         )  # fmt: skip

@@ -31,7 +31,19 @@ BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 SINES = ("box_amplitudes", "box_rates", "box_phases")
 GATES = ("gate_centers", "gate_radii")
 TIME = "free_time"
-NAMED = (*REQUIRED, "velocities", *BOXES, *SINES, *GATES, "start", "goal", *checks.SCALARS, *CONTROLS, TIME, "best_cost")
+NAMED = (
+    *REQUIRED,
+    "velocities",
+    *BOXES,
+    *SINES,
+    *GATES,
+    "start",
+    "goal",
+    *checks.SCALARS,
+    *CONTROLS,
+    TIME,
+    "best_cost",
+)
 IDS = "layout"
 SHARED = tuple(name for name in checks.SCALARS if name != "stages")  # numbers that all layouts share
 

@@ -280,7 +280,7 @@ def gates_of(layouts: Layouts, stages: int) -> tuple[Gates | None, list[int]]:
         return None, []
     count = int(counts[0])
     if (counts != count).any():
-        raise InputError("layouts.gate_centers", "as many gates in all layouts of a batch", sorted(set(counts.tolist())))
+        raise InputError("layouts.gate_centers", "as many gates in all layouts of a batch", counts.tolist())
     legs = [round(stages * (leg + 1) / (count + 1)) for leg in range(count)]
     knots = None if layouts.free_time is None else legs
     return Gates(layouts.gate_centers[:, :count], layouts.gate_radii[:, :count].tolist(), knots=knots), legs

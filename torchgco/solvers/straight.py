@@ -1,4 +1,4 @@
-"""States to begin with where the time is free: on straight lines through the gates to what is asked of the last knot."""
+"""States to begin with where the time is free: on straight lines, through gates, to what is asked of the last knot."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ class Legs:
         leg = self._leg(k)
         first, last = self.knots.gather(1, leg), self.knots.gather(1, leg + 1)
         share = ((k - first) / (last - first).clamp(min=1)).to(self.stops).unsqueeze(-1)
-        a, b = (self.stops.gather(1, (leg + shift).unsqueeze(-1).expand(-1, -1, self.stops.shape[-1])) for shift in (0, 1))
+        index = leg.unsqueeze(-1).expand(-1, -1, self.stops.shape[-1])
+        a, b = (self.stops.gather(1, index + shift) for shift in (0, 1))
         return (1.0 - share) * a + share * b
 
     def stage_factors(self, estimate: Tensor, N: int) -> Tensor:

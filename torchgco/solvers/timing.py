@@ -192,7 +192,9 @@ class Timed:
         if not self.chooser.paces:
             return
         far = ((self.first / self.own - 1.0).abs() > NEAR).any(-1)
-        for pace in (None, *self.chooser.paces):
+        # Where legs between gates have times of their own, other paces of all of them have found nothing better.
+        alone = self.through_gates and self.time.count > 1
+        for pace in (None, *(() if alone else self.chooser.paces)):
             found = self._found.violation <= self.chooser.limit
             rows = (found & far if pace is None else found).nonzero().flatten()
             factors = self.own if pace is None else pace * factors_in(self.problem, self._found.X)

@@ -19,7 +19,7 @@ from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.finished import TRUST, Study
 from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
-from torchgco.experiments.results.durations import states_of, times_at
+from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import damaged, write
 from torchgco.experiments.results.limits import read_table
 from torchgco.experiments.results.records import SOLUTIONS
@@ -78,8 +78,8 @@ def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int],
     for places, problem in study.batches():
         for name, controls in study.flown(SOLUTIONS, "U").items():
             U = torch.from_numpy(controls[places, : problem.N])
-            own = times_at(None if held is None else held[name], places, problem.N)
-            X = states_of(problem, U, own)
+            own = durations.times_at(None if held is None else held[name], places, problem.N)
+            X = durations.states_of(problem, U, own)
             t = times(problem).expand(problem.B, -1) if own is None else own
             for b, number in enumerate(study.layouts.ids[places].tolist()):
                 last = problem.N if problem.horizon is None else int(problem.horizon[b])
