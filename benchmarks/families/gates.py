@@ -46,10 +46,15 @@ def field(x: Any, u: Any, gravity: float, lag: float) -> Any:
     """x' of the planning model."""
     q = x[6:10] / ca.norm_2(x[6:10])
     w, a = x[10:13], x[13]
-    axis = ca.vertcat(2 * (q[1] * q[3] + q[0] * q[2]), 2 * (q[2] * q[3] - q[0] * q[1]),
-                      q[0] ** 2 - q[1] ** 2 - q[2] ** 2 + q[3] ** 2)  # fmt: skip
-    turn = 0.5 * ca.vertcat(-q[1] * w[0] - q[2] * w[1] - q[3] * w[2], q[0] * w[0] + q[2] * w[2] - q[3] * w[1],
-                            q[0] * w[1] - q[1] * w[2] + q[3] * w[0], q[0] * w[2] + q[1] * w[1] - q[2] * w[0])  # fmt: skip
+    axis = ca.vertcat(
+        2 * (q[1] * q[3] + q[0] * q[2]), 2 * (q[2] * q[3] - q[0] * q[1]), q[0] ** 2 - q[1] ** 2 - q[2] ** 2 + q[3] ** 2
+    )
+    turn = 0.5 * ca.vertcat(
+        -q[1] * w[0] - q[2] * w[1] - q[3] * w[2],
+        q[0] * w[0] + q[2] * w[2] - q[3] * w[1],
+        q[0] * w[1] - q[1] * w[2] + q[3] * w[0],
+        q[0] * w[2] + q[1] * w[1] - q[2] * w[0],
+    )
     return ca.vertcat(x[3:6], a * axis - ca.vertcat(0, 0, gravity), turn, (u[:3] - w) / lag, (u[3] - a) / lag)
 
 
@@ -162,9 +167,15 @@ def _row(some: list[Flown]) -> list[object]:
 
 
 main = Command(
-    __doc__, "gates", text,
-    "{count} layouts of seed {seed}, IPOPT on the first {beside} of them, processor time of one thread", "CasADi", count=(64, "layouts"), seed=(0, "of the layouts"), beside=(16, "layouts that IPOPT solves, too"),
-)  # fmt: skip
+    __doc__,
+    "gates",
+    text,
+    "{count} layouts of seed {seed}, IPOPT on the first {beside} of them, processor time of one thread",
+    "CasADi",
+    count=(64, "layouts"),
+    seed=(0, "of the layouts"),
+    beside=(16, "layouts that IPOPT solves, too"),
+)
 
 if __name__ == "__main__":
     raise SystemExit(main())

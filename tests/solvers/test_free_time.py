@@ -265,7 +265,7 @@ def around_a_disc(free: bool = False, **time: Any) -> Problem:
     cost = QuadraticCost([0.0] * 4, [0.01] * 2, [0.0] * 4, x_ref=there)
     model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, position=slice(0, 2))
     rows: list[Any] = [ControlBounds(-2.0, 2.0), Spheres([[2.0, 0.0]], [0.5], 0.1)]
-    rows += [StateBounds([-INF, -0.8, -INF, -INF], [INF, 0.8, INF, INF], knots=[0])] if free else []
+    rows.append(StateBounds([-INF, -0.8, -INF, -INF], [INF, 0.8, INF, INF], knots=[0]))
     mask = [False, True, False, False] if free else None
     return Problem(model, cost, rows, x0, 30, Goal(state=there, required=True), free_start=mask, time=FreeTime(**time))
 

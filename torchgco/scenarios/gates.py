@@ -90,9 +90,9 @@ class GateForest(Quadrotor):
         centers = uniform_clear(rng, np.column_stack([low, high]).tolist(), spheres, keep_clear)
         return Layouts(
             **equal_spheres(centers, self.obstacle_radius), start=places[0], goal=places[-1],
-            gate_centers=places[None, 1:-1], gate_radii=np.full((1, count), self.gate_radius), vehicle_radius=self.vehicle_radius,
-            goal_radius=self.goal_radius, dt=self.dt, stages=self.stages * (count + 1),
-            free_time=np.array([self.time_least, self.time_most, 1.0]),
+            gate_centers=places[None, 1:-1], gate_radii=np.full((1, count), self.gate_radius),
+            vehicle_radius=self.vehicle_radius, goal_radius=self.goal_radius, dt=self.dt,
+            stages=self.stages * (count + 1), free_time=np.array([self.time_least, self.time_most, 1.0]),
         )  # fmt: skip
 
     def _course(self, rng: np.random.Generator, legs: int) -> np.ndarray:
