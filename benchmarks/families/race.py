@@ -35,6 +35,7 @@ MASS, GRAVITY, INERTIA = 0.85, 9.8066, (0.001, 0.001, 0.0017)  # kg, m/s^2, kg m
 ARM, TURN = 0.15, 0.05  # m, to each axis; yaw torque per newton, m
 STRONGEST, FASTEST = 6.879, (15.0, 15.0, 3.0)  # N per rotor, rad/s
 PACE = 8.0  # m/s, of the guess on straight lines
+MEAN = float(torch.tensor([START, *GATES, END], dtype=D).diff(dim=0).norm(dim=-1).mean())  # m, of a leg
 
 
 def rates(x: Tensor, u: Tensor) -> Tensor:
@@ -82,7 +83,7 @@ def race(
     at_knots[:, firsts] = places
     rest = torch.cat((ends[1], torch.zeros(3, dtype=D))).expand(B, -1) if rest is None else rest
     lengths = way.diff(dim=1).norm(dim=-1)
-    dt = float(lengths.mean()) / PACE / stages
+    dt = MEAN / PACE / stages  # of all tracks: with another one code would be compiled again
     rows = [
         ControlBounds(0.0, STRONGEST),
         StateBounds([-math.inf] * 10 + [-w for w in FASTEST], [math.inf] * 10 + list(FASTEST)),

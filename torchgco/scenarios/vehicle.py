@@ -211,17 +211,14 @@ class Vehicle:
             constraints.append(boxes if sines[0] is None else OscillatingBoxes(boxes, *map(tensor, sines)))
         if layouts.map is not None:
             constraints.append(Field(layouts.map, _given(layouts.vehicle_radius, self.radius)))
-        if self.state_lower is not None or self.state_upper is not None:
-            constraints.append(StateBounds(*(tensor(bound) for bound in self._state_bounds)))
+        constraints += self._state_bounds
         gates, legs = gates_of(layouts, longest)
         constraints += [] if gates is None else [replace(gates, centers=tensor(gates.centers))]
-        time, share = None, (1.0, 1.0)
-        if layouts.free_time is not None:
-            least, most, weight = layouts.free_time.tolist()
-            time, share = FreeTime(least, most, weight, segments=legs or None), (0.0, BESIDE_TIME * dynamics.dt)
+        time = free_time(layouts, legs)
+        rest, moving = (1.0, 1.0) if time is None else (0.0, BESIDE_TIME * dynamics.dt)
         cost = QuadraticCost(
-            Q=share[0] * tensor(list(self.state_weight)), R=share[1] * tensor(list(self.control_weight)),
-            Qf=share[0] * tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
+            Q=rest * tensor(list(self.state_weight)), R=moving * tensor(list(self.control_weight)),
+            Qf=rest * tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
             u_ref=tensor(list(self.control_reference)),
         )  # fmt: skip
         goal_radius = _given(layouts.goal_radius, self.goal_radius)
@@ -232,13 +229,16 @@ class Vehicle:
         return Task(problem, U0, center, goal_radius, layouts)
 
     @property
-    def _state_bounds(self) -> list[list[float]]:
-        """Lower and upper bounds (n,) on the states, infinite where there are none."""
+    def _state_bounds(self) -> list[StateBounds]:
+        """Bounds on the states, where there are any."""
+        if self.state_lower is None and self.state_upper is None:
+            return []
         given = (self.state_lower, -inf), (self.state_upper, inf)
-        return [
+        sides = [
             [none] * self.dynamics.n if side is None else [none if bound is None else bound for bound in side]
             for side, none in given
         ]
+        return [StateBounds(*sides)]
 
     def _required(self, goal: Tensor, center: Tensor, radius: float) -> Goal:
         """The goal that has to be met, at states (B, n), where time is the cost."""
@@ -284,6 +284,14 @@ def gates_of(layouts: Layouts, stages: int) -> tuple[Gates | None, list[int]]:
     legs = [round(stages * (leg + 1) / (count + 1)) for leg in range(count)]
     knots = None if layouts.free_time is None else legs
     return Gates(layouts.gate_centers[:, :count], layouts.gate_radii[:, :count].tolist(), knots=knots), legs
+
+
+def free_time(layouts: Layouts, legs: list[int]) -> FreeTime | None:
+    """The free time of layouts, with a duration for each leg; None where the time is given."""
+    if layouts.free_time is None:
+        return None
+    least, most, weight = layouts.free_time.tolist()
+    return FreeTime(least, most, weight, segments=legs or None)
 
 
 def fitting(dimension: int, states: int | None) -> str:
