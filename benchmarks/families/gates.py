@@ -20,6 +20,7 @@ import torchgco
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import markdown, share
 from torchgco import Problem, Solution, Status
+from torchgco.constraints.gates import GateBalls, gates_of
 from torchgco.scenarios import Task
 
 NEAR = 3.0  # m: spheres farther than this from our knot aren't rows of IPOPT's
@@ -60,8 +61,8 @@ def field(x: Any, u: Any, gravity: float, lag: float) -> Any:
 
 def by_hand(problem: Problem, found: Solution) -> float | None:
     """The duration, s, that IPOPT finds from our trajectory; None where it finds none."""
-    part, time_ = problem.constraints, problem.time
-    assert time_ is not None
+    gates, time_ = gates_of(problem), problem.time
+    assert isinstance(gates, GateBalls) and gates.places is not None and time_ is not None
     N, dt, legs = problem.N, problem.dynamics.dt, time_.count
     X0, U0 = found.X[0].numpy(), found.U[0].numpy()
     of_stages = time_.of_stages(N).tolist()
@@ -81,7 +82,6 @@ def by_hand(problem: Problem, found: Solution) -> float | None:
         low, high = low + [0.0] * 14, high + [0.0] * 14
         beside = sum(w * (U[i, k] - rest[i].item()) ** 2 for i, w in enumerate(weights))
         cost += h * (float(time_.weight[0]) * dt + beside)
-    gates = next(c for c in part if getattr(c, "label", "") == "gates")
     goal = problem.goal
     assert goal is not None
     balls = [*zip(gates.places[0].tolist(), gates.centers[0].numpy(), gates.sizes[0].tolist(), strict=True),

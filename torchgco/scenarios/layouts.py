@@ -377,9 +377,10 @@ def _joined_gates(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
     columns: dict[str, list[Any]] = {name: [] for name in GATES}
     for part in parts:
         none = np.empty((part.count, 0, part.dimension)), np.empty((part.count, 0))
-        own = none if part.gate_centers is None else (part.gate_centers, part.gate_radii)
-        for name, value in zip(GATES, own, strict=True):
-            columns[name].append(np.pad(value, _behind(value, most - own[0].shape[1]), constant_values=np.nan))
+        centers = none[0] if part.gate_centers is None else part.gate_centers
+        radii = none[1] if part.gate_radii is None else part.gate_radii
+        for name, value in zip(GATES, (centers, radii), strict=True):
+            columns[name].append(np.pad(value, _behind(value, most - radii.shape[1]), constant_values=np.nan))
     return columns
 
 

@@ -238,7 +238,7 @@ class Vehicle:
             [none] * self.dynamics.n if side is None else [none if bound is None else bound for bound in side]
             for side, none in given
         ]
-        return [StateBounds(*sides)]
+        return [StateBounds(sides[0], sides[1])]
 
     def _required(self, goal: Tensor, center: Tensor, radius: float) -> Goal:
         """The goal that has to be met, at states (B, n), where time is the cost."""
