@@ -58,6 +58,7 @@ from torchgco.dynamics import FunctionDynamics as FunctionDynamics
 from torchgco.dynamics import Planar as Planar
 from torchgco.dynamics import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
+from torchgco.dynamics import QuadrotorThrusts as QuadrotorThrusts
 from torchgco.dynamics import RotorTracking as RotorTracking
 from torchgco.dynamics import Unicycle as Unicycle
 from torchgco.guidance import GCO as GCO
@@ -99,7 +100,7 @@ if TYPE_CHECKING:
 __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "FreeTime", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning",
-    "QuadrotorPlant",
+    "QuadrotorPlant", "QuadrotorThrusts",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
     "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates", "Separation",
     "FirstStepRates", "FunctionConstraint", "FunctionCost",

@@ -30,6 +30,7 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.gates import passes
 from torchgco.kernels import measured
 from torchgco.roadmap.legs import timed
+from torchgco.search import Follow
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
 
@@ -186,6 +187,55 @@ def test_beside_horizons_rates_and_the_rest_of_a_batch() -> None:
             torch.testing.assert_close(alone.U[0], both.U[b], rtol=1e-9, atol=1e-9)
             part = points(gates, ControlBounds(-5.0, 5.0)).take(torch.tensor([b]))
             assert torch.equal(torchgco.solve(part).U[0], both.U[b])
+
+
+@pytest.mark.parametrize("gates", [BALLS, SQUARES])
+def test_compiled_problems_take_other_gates_at_the_same_knots(gates: Gates) -> None:
+    given = torch.tensor([PLACES] * B, dtype=D)
+    places = points(gates).constraints[0].places
+    fixed = replace(gates, centers=given, knots=places)
+    compiled = torchgco.compile(points(fixed, ControlBounds(-5.0, 5.0)))
+    moved = given + torch.tensor([[[0.2, 0.3, -0.1], [0.0, -0.4, 0.2]], [[0.0, -0.2, 0.1], [0.1, 0.1, 0.0]]], dtype=D)
+    if gates.normals is None:
+        new: dict[str, Any] = {"gates.centers": moved, "gates.radius": [0.1, 0.2]}
+        fresh = replace(fixed, centers=moved, radius=[0.1, 0.2])
+    else:
+        turned = [[1.0, 0.3, 0.0], [1.0, 0.5, -0.2]]
+        new = {"gates.centers": moved, "gates.normals": turned, "gates.half_widths": 0.15 * np.ones(2)}
+        fresh = replace(fixed, centers=moved, normals=turned, half_widths=0.15)
+    other = points(fresh, ControlBounds(-5.0, 5.0))
+    answer, found = compiled(numbers=new), torchgco.solve(other)
+    np.testing.assert_allclose(answer.U, found.U, atol=1e-5)
+    now = compiled.problem
+    np.testing.assert_allclose(now.constraints[0].centers, moved, atol=0)
+    assert judge(now, torch.as_tensor(answer.U)).gates_passed.tolist() == [2, 2]
+    again = compiled(numbers={"gates.centers": given}, x0=START)
+    own = gates if gates.normals is None else replace(fresh, centers=given)
+    own = replace(own, radius=[0.1, 0.2], knots=places) if gates.normals is None else own
+    np.testing.assert_allclose(again.U, torchgco.solve(points(own, ControlBounds(-5.0, 5.0))).U, atol=1e-5)
+    with pytest.raises(InputError, match=r"gates\.centers: expected finite numbers"):
+        compiled(numbers={"gates.centers": given * torch.nan})
+    size = "gates.radius" if gates.normals is None else "gates.half_widths"
+    with pytest.raises(InputError, match=f"{size}: expected numbers above 0"):
+        compiled(numbers={size: [0.1, 0.0]})
+
+
+def test_every_pace_is_another_trajectory() -> None:
+    """Gates say when they are passed: the paces of a path differ after the last of them."""
+    problem = points(BALLS, Spheres([[3.0, 0.1, 1.2]], [0.5], 0.1))
+    part = problem.constraints[0]
+    legs = torch.tensor([[[0.0, 0, 1], PLACES[0], PLACES[0], PLACES[1], PLACES[1], [6.0, 0, 1]]], dtype=D)
+    path, arrive = legs.repeat_interleave(2 * B, dim=0), torch.tensor([0.5, 1.0] * B, dtype=D)
+    at = Follow()._centers(path, arrive, problem, None)  # type: ignore[arg-type]
+    last = part.places[:, -1].tolist()
+    for b in range(B):
+        slow, fast = at[2 * b + 1], at[2 * b]
+        for own in (slow, fast):
+            for g, k in enumerate(part.places[b].tolist()):
+                torch.testing.assert_close(own[k], legs[0, 2 * g + 1])
+        half = last[b] + (N - last[b] + 1) // 2
+        torch.testing.assert_close(fast[half], legs[0, -1])
+        assert float((slow[half] - legs[0, -1]).norm()) > 0.1
 
 
 def test_pictures_show_them() -> None:

@@ -14,6 +14,7 @@ from torchgco import (
     QuadraticCost,
     QuadrotorPlanning,
     QuadrotorPlant,
+    QuadrotorThrusts,
     RotorTracking,
     Unicycle,
 )
@@ -37,6 +38,18 @@ def states_of(model, lead=(3, 5), seed=0):
         x[..., -4:] = 3.0 + x[..., -4:].clamp(-2, 2)
         u = 5000.0 + 300.0 * u
     return x, u
+
+
+def test_thrusts_move_as_the_plants_do_whose_rotors_have_got_there() -> None:
+    """And a quaternion of another norm is the same attitude."""
+    own, plant = QuadrotorThrusts(airframe=Airframe(drag=0.2)), QuadrotorPlant(airframe=Airframe(drag=0.2))
+    x, u = states_of(own)
+    x[..., 6:10] /= x[..., 6:10].norm(dim=-1, keepdim=True)
+    u = 3.0 + u
+    expected = plant.field(torch.cat((x, u), dim=-1), 5000.0 * torch.ones_like(u))[..., :13]
+    torch.testing.assert_close(own.field(x, u), expected)
+    longer = torch.cat((x[..., :6], 1.3 * x[..., 6:10], x[..., 10:]), dim=-1)
+    torch.testing.assert_close(own.field(longer, u)[..., 3:6], expected[..., 3:6])
 
 
 @pytest.mark.parametrize("kind", [QuadrotorPlanning, QuadrotorPlant])

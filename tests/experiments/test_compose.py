@@ -27,9 +27,10 @@ MISSIONS = ("mission", "mission_study", "mission_unknown")
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("floors", "yard"),
     "quadrotor": (
-        "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "mazes", "rooms", "trefoils", "walls",
-        "woods",
+        "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "gates", "mazes", "rooms", "trefoils",
+        "walls", "woods",
     ),
+    "rotors": ("race",),
 }  # fmt: skip
 MODEL = {scenario: model for model, scenarios in OF_MODEL.items() for scenario in scenarios}
 FILES = {"forest30": "quadrotor", "planar_trap": "planar"}

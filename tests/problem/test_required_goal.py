@@ -32,6 +32,7 @@ from torchgco import (
 )
 from torchgco.kernels import measured
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived
+from torchgco.problem.covered import covered_goals
 from torchgco.problem.goal import GoalBall, GoalState
 
 D, NAN = torch.float64, torch.nan
@@ -153,6 +154,15 @@ def test_one_out_of_reach_or_covered_is_infeasible_and_told() -> None:
     mixed = torchgco.solve(points(BALL, cover))
     assert mixed.statuses == [Status.INFEASIBLE] * 2 + [Status.CONVERGED]
     assert "an obstacle, grown by the vehicle's radius, covers all of it" in " ".join(mixed.explain(1).split())
+
+
+def test_covered_goals_are_known_at_each_problems_own_last_knot() -> None:
+    """A disc moves away from the goal at 1 m/s: it covers it at knot 4, and no longer at the others' last ones."""
+    ball = Spheres([[0.5, 0.5]], [0.6], 0.1, velocities=[[1.0, 0.0]])
+    ends = [4, N, 5]
+    by_hand = [0.1 * k <= 0.6 + 0.1 - radius for k, radius in zip(ends, BALL.radius, strict=True)]
+    held = points(BALL, ball, horizon=torch.tensor(ends))
+    assert covered_goals(held).tolist() == by_hand == [True, False, True]
 
 
 def test_compiled_numbers_move_it() -> None:

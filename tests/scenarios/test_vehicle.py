@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def vehicle(name: str):
-    scenario = {"quadrotor": "forest", "unicycle": "yard"}.get(name, "planar_trap")
+    scenario = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard"}.get(name, "planar_trap")
     return compose([f"model={name}", f"scenario={scenario}"]).vehicle
 
 
@@ -71,7 +71,7 @@ def test_the_built_in_models_are_those_of_the_configurations() -> None:
         (
             "model=quadrotor scenario=yard",
             "expected model=unicycle, as yard is 2-D with 4 states, or scenario=crossing or cylinders or forest or "
-            "forest_moving or mazes or rooms or trefoils or walls or woods, got model=quadrotor",
+            "forest_moving or gates or mazes or rooms or trefoils or walls or woods, got model=quadrotor",
         ),
         ("model=unicycle scenario=forest", "expected model=quadrotor, as forest is 3-D with 14 states"),
     ],

@@ -258,6 +258,46 @@ def test_the_time_frees_itself_of_its_guess_among_obstacles() -> None:
     assert bool((found.duration > straight).all())
 
 
+def around_a_disc(free: bool = False, **time: Any) -> Problem:
+    """A ball goes round a disc to a place at rest; with `free`, from any height of at most 0.8 m."""
+    there = torch.tensor([4.0, 0.0, 0.0, 0.0], dtype=D)
+    x0 = torch.tensor([[0.0, 0.2, 0.0, 0.0], [0.0, -0.1, 0.0, 0.0]], dtype=D)
+    cost = QuadraticCost([0.0] * 4, [0.01] * 2, [0.0] * 4, x_ref=there)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, position=slice(0, 2))
+    rows: list[Any] = [ControlBounds(-2.0, 2.0), Spheres([[2.0, 0.0]], [0.5], 0.1)]
+    rows.append(StateBounds([-INF, -0.8, -INF, -INF], [INF, 0.8, INF, INF], knots=[0]))
+    mask = [False, True, False, False] if free else None
+    return Problem(model, cost, rows, x0, 30, Goal(state=there, required=True), free_start=mask, time=FreeTime(**time))
+
+
+def test_a_free_start_is_chosen_with_the_time() -> None:
+    """The best start is beside the straight line, as the way round the disc is, and no dearer than others."""
+    free = torchgco.solve(around_a_disc(True))
+    assert bool((free.violation < 1e-6).all())
+    for heights, better in (([0.2, -0.1], 1e-3), ([0.5, -0.5], -1e-3)):
+        given = around_a_disc()
+        x0 = given.x0.clone()
+        x0[:, 1] = torch.tensor(heights, dtype=D)
+        held = torchgco.solve(replace(given, x0=x0))
+        assert bool((held.violation < 1e-6).all() & (free.cost < held.cost - better).all())
+
+
+def test_a_record_is_kept_and_explained() -> None:
+    problem = around_a_disc(weight=0.3)
+    plain, kept = torchgco.solve(problem), torchgco.solve(problem, record=True)
+    assert torch.equal(plain.U, kept.U) and torch.equal(plain.cost, kept.cost)
+    assert kept.trace is not None and kept.search is not None
+    for b in (0, 1):
+        own = kept.trace[kept.trace["element"] == b]
+        assert own.groupby("attempt")["iteration"].apply(lambda i: i.is_monotonic_increasing).all()
+        assert own["attempt"].nunique() > 1 and len(own) <= int(kept.iterations[b])
+    good = torch.stack([one.violation.le(1e-3) for one in kept.search.standings if one is not None]).any()
+    assert bool(good) and kept.search.comparisons[0].tracked.shape[-1] == problem.n
+    costs = torch.cat([one.cost[one.violation <= 1e-3] for one in kept.search.standings if one is not None])
+    assert float(costs.min()) == pytest.approx(float(kept.cost.min()), rel=1e-4)  # in the user's units
+    assert "pass" in kept.explain(0)
+
+
 def test_state_bounds_are_certified_too() -> None:
     model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1, "rk4")
     cost = QuadraticCost([0.0, 0.0], [1e-3], [0.0, 0.0])

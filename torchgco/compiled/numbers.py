@@ -208,8 +208,10 @@ def numbers_of(problem: Problem) -> list[Number]:
             found.append(Number("goal.radius", (_view(part.upper[:, 0]),), i, True, _radii))
         elif isinstance(part, GoalState):
             found.append(Number("goal.state", (_view(part.state),), i, True, partial(_fixed, part)))
-        elif isinstance(part, GateBalls | GateSquares):
-            continue  # at other knots they would be other gates
+        elif isinstance(part, GateBalls):
+            found += _of_balls(part, i)
+        elif isinstance(part, GateSquares):
+            found += _of_squares(part, i)
         elif isinstance(part, NormBounds | Cone):
             found += _of_vectors(part, name, i)
         elif isinstance(part, BoundSpheres):
@@ -326,6 +328,25 @@ def _of_vectors(part: NormBounds | Cone, name: str, i: int) -> list[Number]:
         Number(f"{name}.{field}", (_view(getattr(part, field)),), i, True, checks[field], joint=joint if both else None)
         for field in part.per_element
         if field in checks and getattr(part, field) is not None
+    ]
+
+
+def _of_balls(part: GateBalls, i: int) -> list[Number]:
+    """Of gates, which keep their knots."""
+    centers, radii = part.centers, part.sizes
+    write = lambda: part.write(centers, radii)
+    return [
+        Number("gates.centers", (_view(centers),), i, True, _finite, write),
+        Number("gates.radius", (_view(radii),), i, True, _radii, write),
+    ]
+
+
+def _of_squares(part: GateSquares, i: int) -> list[Number]:
+    normals = part.axes[:, :, 0].clone()
+    return [
+        Number("gates.centers", (_view(part.centers),), i, True, _finite, part.write),
+        Number("gates.half_widths", (_view(part.half_widths),), i, True, _radii, part.write),
+        Number("gates.normals", (_view(normals),), i, True, _axes, lambda: part.write(normals)),
     ]
 
 

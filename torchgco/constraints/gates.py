@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
-from torchgco.constraints.base import Constraint, whole
+from torchgco.constraints.base import Constraint, innermost, whole
 from torchgco.constraints.norms import AWAY, NormBounds
 from torchgco.costs.base import add_blocks
 
@@ -99,6 +99,12 @@ class GateBalls(NormBounds):
         assert self.places is not None
         return self.upper.gather(1, self.places - 1)
 
+    def write(self, centers: Tensor, sizes: Tensor) -> None:
+        """Put other gates (B, G, d) of other radii (B, G) in the places of these, in this memory."""
+        assert self.places is not None
+        self.center.scatter_(1, (self.places - 1).unsqueeze(-1).expand_as(centers), centers)
+        self.upper.scatter_(1, self.places - 1, sizes)
+
 
 @dataclass(frozen=True)
 class GateSquares(Constraint):
@@ -122,18 +128,26 @@ class GateSquares(Constraint):
         return self.half_widths
 
     def bind(self, dims: Dimensions) -> Self:
-        B, G, d = self.centers.shape
-        p, normal, sides = 2 * d - 1, self.axes[:, :, :1], self.axes[:, :, 1:]
-        slopes = self.centers.new_zeros(B, dims.N, p, d)
+        B, _, d = self.centers.shape
+        slopes = self.centers.new_zeros(B, dims.N, 2 * d - 1, d)
         limits = torch.full_like(slopes[..., 0], -AWAY)  # 0 - 1: no row
+        bound = replace(self, slopes=slopes, limits=limits, knots=slice(1, dims.N + 1))
+        bound.write()
+        return bound
+
+    def write(self, normals: Tensor | None = None) -> None:
+        """Make the rows of the centres and half widths as they are, and of other normals (B, G, d), in this memory."""
+        assert self.slopes is not None and self.limits is not None
+        if normals is not None:
+            self.axes.copy_(_axes(normals))
+        (B, G, _), p, half = self.centers.shape, self.slopes.shape[2], self.half_widths.unsqueeze(-1)
+        normal, sides = self.axes[:, :, :1], self.axes[:, :, 1:]
         each = torch.arange(B, device=self.centers.device).unsqueeze(-1)
         for beyond, sign in ((0, 1.0), (1, -1.0)):
             rows = torch.cat((sign * normal, sides, -sides), dim=2)  # (B, G, p, d)
-            room = torch.cat((torch.zeros_like(self.half_widths.unsqueeze(-1)),
-                self.half_widths.unsqueeze(-1).expand(B, G, p - 1)), dim=-1)  # fmt: skip
+            room = torch.cat((torch.zeros_like(half), half.expand(B, G, p - 1)), dim=-1)
             at = each, self.places - 1 + beyond
-            slopes[at], limits[at] = rows, room + (rows @ self.centers.unsqueeze(-1))[..., 0]
-        return replace(self, slopes=slopes, limits=limits, knots=slice(1, dims.N + 1))
+            self.slopes[at], self.limits[at] = rows, room + (rows @ self.centers.unsqueeze(-1))[..., 0]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         p = X[:, self.knots][..., self.components]
@@ -193,7 +207,13 @@ def _sizes(value: Any, name: str, dims: Dimensions, G: int) -> Tensor:
 
 def has_gates(problem: Any) -> bool:
     """Whether gates are among a problem's constraints, whose knots count from its start: a loop would put them off."""
-    return any(isinstance(part, GateBalls | GateSquares) for part in problem.constraints)
+    return gates_of(problem) is not None
+
+
+def gates_of(problem: Any) -> GateBalls | GateSquares | None:
+    """The first gates that a trajectory has to pass; None where there are none."""
+    bare = (innermost(part) for part in problem.constraints)
+    return next((part for part in bare if isinstance(part, GateBalls | GateSquares)), None)
 
 
 def _given(knots: Any, dims: Dimensions, G: int, gap: int, ends: Tensor) -> Tensor:

@@ -7,4 +7,5 @@ from torchgco.dynamics.quadrotor import Airframe as Airframe
 from torchgco.dynamics.quadrotor import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics.quadrotor import QuadrotorPlant as QuadrotorPlant
 from torchgco.dynamics.quadrotor import RotorTracking as RotorTracking
+from torchgco.dynamics.rotors import QuadrotorThrusts as QuadrotorThrusts
 from torchgco.dynamics.unicycle import Unicycle as Unicycle

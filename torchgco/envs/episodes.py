@@ -1,4 +1,4 @@
-"""Vehicles that fly missions side by side, each with a clock of its own, and begin anew when they have ended."""
+"""Vehicles that fly missions side by side, each with a clock of its own, and begin again when they have ended."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             mission = Mission(Planner(presets.gco(3))) if mission is None else mission
             self.episodes = Episodes(mission, problem, num_envs, control)
         self._spaces(control, max_rate)
-        self.waiting = np.zeros(num_envs, bool)  # has ended, and begins anew with the next step or reset
+        self.waiting = np.zeros(num_envs, bool)  # has ended, and begins again with the next step or reset
         self._ended = np.full(num_envs, FLYING)  # how it has
         self._streams: list[np.random.Generator] = []
 
@@ -129,7 +129,7 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             seed: of all environments, or one for each; None: each goes on with its own draws, at first with some of the
                 system.
-            options: `reset_mask`, (B,) bool: the environments to begin anew; `layout`, (B,) whole numbers: the rows of
+            options: `reset_mask`, (B,) bool: the environments to begin again; `layout`, (B,) whole numbers: the rows of
                 the problems that they fly then. None: all, and those that are drawn.
 
         Raises:
@@ -174,18 +174,18 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             reward = np.where(waiting, 0.0, (before - after).numpy() + BONUS * _bonus(outcome))
             over = (self.episodes.step >= self.episodes.steps).numpy() & (outcome == FLYING)
             outcome = np.where(over, int(Outcome.TIMEOUT), outcome)
-            anew, info = waiting, dict[str, Any]()
+            again, info = waiting, dict[str, Any]()
             if self.autoreset_mode is AutoresetMode.DISABLED:
-                anew, outcome = np.zeros_like(waiting), np.where(waiting, self._ended, outcome)
+                again, outcome = np.zeros_like(waiting), np.where(waiting, self._ended, outcome)
             elif self.autoreset_mode is AutoresetMode.NEXT_STEP:
                 outcome = np.where(waiting, FLYING, outcome)
             terminated, truncated = (outcome != FLYING) & (outcome != Outcome.TIMEOUT), outcome == Outcome.TIMEOUT
             self.waiting, self._ended = outcome != FLYING, outcome
             if self.autoreset_mode is AutoresetMode.SAME_STEP and self.waiting.any():
-                info, anew = self._final(self.waiting, outcome), self.waiting.copy()
-            if anew.any():
-                self._begin(anew.nonzero()[0])
-            return self._observed(), reward, terminated, truncated, self._info(np.where(anew, FLYING, outcome)) | info
+                info, again = self._final(self.waiting, outcome), self.waiting.copy()
+            if again.any():
+                self._begin(again.nonzero()[0])
+            return self._observed(), reward, terminated, truncated, self._info(np.where(again, FLYING, outcome)) | info
 
     def _checked(self, actions: Any) -> Tensor:
         """Actions (B, 4) within their bounds."""

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape, check_tensor, computing_on, tensor
-from torchgco.constraints.base import CONTACT_FACTOR, Constraint, innermost
-from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.constraints.base import CONTACT_FACTOR, Constraint
+from torchgco.constraints.gates import has_gates
 from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
 from torchgco.judging.gates import passes
@@ -381,6 +381,11 @@ def frame_columns(verdict: Verdict) -> dict[str, Any]:
     return {name: getattr(verdict, name).cpu().numpy() for name in names}
 
 
+def gates_passed(problem: Problem, verdict: Verdict) -> dict[str, Any]:
+    """The column `gates_passed`; none where there are no gates."""
+    return {"gates_passed": verdict.gates_passed.cpu().numpy()} if has_gates(problem) else {}
+
+
 def columns(problem: Problem, U: Tensor, start: Tensor | None = None, times: Tensor | None = None) -> dict[str, Any]:
     """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
 
@@ -395,9 +400,8 @@ def columns(problem: Problem, U: Tensor, start: Tensor | None = None, times: Ten
         return {}
     names = ["clearance"] if any(isinstance(c, tuple(CLEARANCES)) for c in problem.constraints) else []
     names += ["reached"] if problem.goal is not None else []
-    gated = [part for part in problem.constraints if isinstance(innermost(part), GateBalls | GateSquares)]
-    if not names and not gated:
+    if not names and not has_gates(problem):
         return {}
     verdict = judge(problem, U, start=start, times=times)
     found = {name: getattr(verdict, name).cpu().numpy() for name in names}
-    return found | ({"gates_passed": verdict.gates_passed.cpu().numpy()} if gated else {})
+    return found | gates_passed(problem, verdict)

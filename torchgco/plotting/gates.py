@@ -9,10 +9,9 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
-from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.constraints.gates import GateBalls, GateSquares, gates_of
 from torchgco.plotting.style import INK
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.scene import gates_of
 
 Outline = tuple[np.ndarray, float]  # corners (V, d), m; one corner and a radius of a ball
 

@@ -18,6 +18,7 @@ from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.bodies import ABOVE, Ball, Body, Plane
+from torchgco.plotting.gates import draw_gates
 from torchgco.plotting.grid import grid, put_head
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
@@ -301,11 +302,14 @@ def marker(kind: str, angle: float = 0.0) -> dict[str, Any]:
 
 
 def draw_targets(ax: Axes, scene: Scene, i: int, plane: Plane) -> None:
-    """The start under the flights' marks, the goal over them."""
+    """The start under the flights' marks, the goal over them; gates with their numbers."""
     start, goal = scene.start[i][list(plane)], scene.goal[i][list(plane)]
     look: dict[str, Any] = {"color": INK, "linestyle": "none", "markeredgecolor": "white", "markeredgewidth": 0.5}
     ax.plot(*start, marker="s", markersize=5, zorder=2.5, **look)
     ax.plot(*goal, marker="*", markersize=10, zorder=6, **look)
+    if scene.gates is not None:
+        balls = scene.gates[i][np.isfinite(scene.gates[i]).all(axis=1)]
+        draw_gates(ax, [(ball[None, :-1], float(ball[-1])) for ball in balls], plane)
     if np.isfinite(scene.goal_radius):
         ring: dict[str, Any] = {"fill": False, "color": INK, "linestyle": "--", "linewidth": 0.8}
         ax.add_patch(Circle((goal[0], goal[1]), scene.goal_radius, **ring))

@@ -32,6 +32,7 @@ class Scene:
         dt: s, 0 where unknown: moving obstacles are then drawn where they start.
         ids: (L,) index of each layout in its file or generator.
         map: of all layouts, or one of each, or None.
+        gates: (L, G, d+1) centres and radii of balls to be passed in this order, nan where absent; or None.
     """
 
     bodies: tuple[tuple[Body, ...], ...]
@@ -42,6 +43,7 @@ class Scene:
     dt: float
     ids: np.ndarray
     map: DistanceField | None = None
+    gates: np.ndarray | None = None
 
     @property
     def dimension(self) -> int:
@@ -77,7 +79,15 @@ def scene_of(layouts: Arrays) -> Scene:
         dt=float(layouts.get("dt", 0.0)),
         ids=np.asarray(layouts.get("layout", np.arange(count))),
         map=map_of(layouts),
+        gates=gates_in(layouts),
     )
+
+
+def gates_in(layouts: Arrays) -> np.ndarray | None:
+    """Centres and radii (L, G, d+1) of gates; None where there are none."""
+    if layouts.get("gate_centers") is None:
+        return None
+    return np.concatenate((layouts["gate_centers"], np.asarray(layouts["gate_radii"])[..., None]), axis=-1)
 
 
 def flown(path: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ def paths_through(roadmap: Roadmap, scene: Scene, count: int, rows: Tensor, know
 def timed(path: Tensor, places: Tensor, stages: Tensor, N: int) -> Tensor:
     """Positions (R, N+1, d) on paths (R, P, d) of G + 1 legs, which are at gate g at the knots places (R, G).
 
-    They move slowly at both ends, and rest at the last from knot `stages` (R,) on.
+    They move slowly at both ends, and rest at the last from knot `stages` (R,) on, which need not be whole.
     """
     legs = places.shape[1] + 1
     along = torch.cat((torch.zeros_like(path[:, :1, 0]), path.diff(dim=1).norm(dim=-1).cumsum(-1)), dim=1)

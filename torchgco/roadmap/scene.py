@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import LastTaken
-from torchgco.constraints.base import innermost
-from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import Cost
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles, Solids
@@ -50,12 +49,6 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     gates = gates_of(problem)
     centers = None if gates is None else gates.centers
     return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost, centers)
-
-
-def gates_of(problem: Problem) -> GateBalls | GateSquares | None:
-    """The first gates that a trajectory has to pass; None where there are none."""
-    bare = (innermost(part) for part in problem.constraints)
-    return next((part for part in bare if isinstance(part, GateBalls | GateSquares)), None)
 
 
 def has_paths(problem: Problem) -> bool:

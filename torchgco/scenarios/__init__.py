@@ -5,6 +5,7 @@ from torchgco.scenarios.crossing import Crossing
 from torchgco.scenarios.cylinders import Cylinders
 from torchgco.scenarios.files import LayoutFile
 from torchgco.scenarios.floors import Floors
+from torchgco.scenarios.gates import GateForest, Race
 from torchgco.scenarios.layouts import Layouts, concatenate
 from torchgco.scenarios.maps import MapFile
 from torchgco.scenarios.mazes import Mazes
@@ -22,12 +23,14 @@ __all__ = [
     "Floors",
     "Forest",
     "ForestMoving",
+    "GateForest",
     "LayoutFile",
     "Layouts",
     "MapFile",
     "Mazes",
     "PlanarRandom",
     "PlanarTrap",
+    "Race",
     "Rooms",
     "Scenario",
     "Task",

@@ -237,6 +237,46 @@ def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
     return given
 
 
+def gates(centers: Any, radii: Any, like: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Centres (L, G, d) and radii (L, G) of gates that are present or absent together, absent ones last; or None.
+
+    `like` are the obstacles' centres (L, M, d).
+    """
+    if centers is None:
+        if radii is not None:
+            raise InputError("layouts.gate_radii", "none without gate_centers", "some")
+        return None, None
+    middle, (count, _, d) = array(centers, "layouts.gate_centers"), like.shape
+    if middle.ndim != 3 or middle.shape[0] != count or middle.shape[2] != d or middle.shape[1] < 1:
+        raise InputError("layouts.gate_centers", f"shape ({count}, G, {d}), G >= 1", f"shape {middle.shape}")
+    absent = np.asarray(np.isnan(middle).all(axis=2))
+    _none_of(~absent & ~np.isfinite(middle).all(axis=2), "layouts.gate_centers", "finite rows or rows of NaN", middle)
+    _none_of(absent[:, :-1] & ~absent[:, 1:], "layouts.gate_centers", "absent gates behind all others", middle)
+    _bounded(middle, "layouts.gate_centers")
+    if radii is None:
+        raise InputError("layouts.gate_radii", "this array with gate_centers", "none")
+    sizes = array(radii, "layouts.gate_radii")
+    if sizes.shape != middle.shape[:2]:
+        raise InputError("layouts.gate_radii", f"shape (L, G) = {middle.shape[:2]} as in gate_centers", sizes.shape)
+    sound = np.where(absent, np.isnan(sizes), np.isfinite(sizes) & (sizes > 0))
+    _none_of(~sound, "layouts.gate_radii", "radii above 0, NaN where the centre is NaN", sizes)
+    _bounded(sizes, "layouts.gate_radii")
+    return middle, sizes
+
+
+def free_time(value: Any) -> np.ndarray | None:
+    """(least, most, weight): factors of the stages' length, and the cost of a second."""
+    if value is None:
+        return None
+    given = array(value, "layouts.free_time")
+    if given.shape != (3,) or not np.isfinite(given).all():
+        raise InputError("layouts.free_time", "three numbers: least, most, weight", given.tolist())
+    least, most, weight = given.tolist()
+    if not 0 < least <= most or weight < 0:
+        raise InputError("layouts.free_time", "0 < least <= most, and a weight of at least 0", given.tolist())
+    return given
+
+
 def control_bounds(lower: Any, upper: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Bounds (m,) of the controls, either of them possibly None, infinite where unbounded."""
     bounds: list[np.ndarray | None] = []

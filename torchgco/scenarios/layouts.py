@@ -29,7 +29,21 @@ REQUIRED = ("centers", "radii")
 CONTROLS = ("control_lower", "control_upper")
 BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 SINES = ("box_amplitudes", "box_rates", "box_phases")
-NAMED = (*REQUIRED, "velocities", *BOXES, *SINES, "start", "goal", *checks.SCALARS, *CONTROLS, "best_cost")
+GATES = ("gate_centers", "gate_radii")
+TIME = "free_time"
+NAMED = (
+    *REQUIRED,
+    "velocities",
+    *BOXES,
+    *SINES,
+    *GATES,
+    "start",
+    "goal",
+    *checks.SCALARS,
+    *CONTROLS,
+    TIME,
+    "best_cost",
+)
 IDS = "layout"
 SHARED = tuple(name for name in checks.SCALARS if name != "stages")  # numbers that all layouts share
 
@@ -56,6 +70,10 @@ class Layouts:
             half sides may be 0: a capsule has one side above 0.
         box_amplitudes, box_rates, box_phases: (L, K, S, d) m, rad/s and rad of S sines along each axis: at time t a box
             is at box_centers + sum_s amplitudes sin(rates t + phases). NaN where absent, or None if all boxes rest.
+        gate_centers, gate_radii: (L, G, d) and (L, G) m, balls that the position passes in this order, NaN behind the
+            last of a layout with fewer; or None. They divide the stages into legs of about as many.
+        free_time: (3,) least and most length of a stage, as multiples of dt, and the cost of a second: the duration is
+            free, of each leg by itself, and time is the cost; or None.
         map: the distance field of a map that all layouts share, or of L grids of the same size, one for each; or None.
             In a file: the arrays `map_occupied`, `map_origin` and `map_resolution`, or `map_points` and `map_radius`,
             and `map_unknown`.
@@ -84,6 +102,9 @@ class Layouts:
     box_amplitudes: np.ndarray | None = None
     box_rates: np.ndarray | None = None
     box_phases: np.ndarray | None = None
+    gate_centers: np.ndarray | None = None
+    gate_radii: np.ndarray | None = None
+    free_time: np.ndarray | None = None
     map: DistanceField | None = None
     name: str = "layouts"
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
@@ -102,6 +123,9 @@ class Layouts:
         sines = checks.sines([getattr(self, name) for name in SINES], self.box_centers)
         for name, value in zip(SINES, sines, strict=True):
             put(name, value)
+        for name, value in zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True):
+            put(name, value)
+        put(TIME, checks.free_time(self.free_time))
         for name in ("start", "goal"):
             put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
         lengths = {state.shape[1] for state in (self.start, self.goal) if state is not None} - {centers.shape[2]}
@@ -130,10 +154,27 @@ class Layouts:
         return field.single(0) if count == 1 else field
 
     def alike(self) -> list[np.ndarray]:
-        """The places of layouts that have as many stages, (L',) each: they can be solved together as one batch."""
-        if not isinstance(self.stages, np.ndarray):
+        """The places of layouts with as many stages and gates, (L',) each: they can be solved together as one batch."""
+        if not isinstance(self.stages, np.ndarray) and self.gate_counts is None:
             return [np.arange(self.count)]
-        return [np.flatnonzero(self.stages == number) for number in np.unique(self.stages)]
+        stages = np.broadcast_to(0 if self.stages is None else self.stages, self.count)
+        gates = np.zeros(self.count, np.int64) if self.gate_counts is None else self.gate_counts
+        kinds, of_each = np.unique(np.column_stack((stages, gates)), axis=0, return_inverse=True)
+        return [np.flatnonzero(of_each.ravel() == kind) for kind in range(len(kinds))]
+
+    def together(self, most: int | None = None) -> list[np.ndarray]:
+        """The places of layouts that a batch of problems can hold, at most so many: those with as many gates."""
+        counts = np.zeros(self.count, np.int64) if self.gate_counts is None else self.gate_counts
+        kinds = [np.flatnonzero(counts == count) for count in np.unique(counts)]
+        if self.free_time is not None:
+            kinds = self.alike()
+        size = most or self.count
+        return [some[first : first + size] for some in kinds for first in range(0, len(some), size)]
+
+    @property
+    def gate_counts(self) -> np.ndarray | None:
+        """How many gates each layout has, (L,); None where none has any."""
+        return None if self.gate_radii is None else (~np.isnan(self.gate_radii)).sum(axis=1)
 
     @property
     def count(self) -> int:
@@ -169,7 +210,7 @@ class Layouts:
         index = checks.indices(indices, "layouts.take")
         if index.max() >= self.count:
             raise InputError("layouts.take", f"positions in 0..{self.count - 1}", int(index.max()))
-        rows = ("centers", "radii", "velocities", *BOXES, *SINES, "start", "goal", "best_cost", "ids")
+        rows = ("centers", "radii", "velocities", *BOXES, *SINES, *GATES, "start", "goal", "best_cost", "ids")
         held = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
         held = {name: value[index] for name, value in held.items()}
         if isinstance(self.stages, np.ndarray):
@@ -246,7 +287,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
     if not parts:
         raise InputError("layouts", "at least one part to concatenate", "none")
     _same("dimension", [part.dimension for part in parts])
-    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SHARED, *CONTROLS)}
+    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SHARED, *CONTROLS, TIME)}
     width = max(part.radii.shape[1] for part in parts)
     parts = [part.pad(width) for part in parts]
     joined = ("start", "goal", "velocities", "best_cost")
@@ -261,7 +302,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
         columns["best_cost"] = [
             np.full(part.count, np.nan) if part.best_cost is None else part.best_cost for part in parts
         ]
-    columns |= _joined_boxes(parts) | _joined_sines(parts)
+    columns |= _joined_boxes(parts) | _joined_sines(parts) | _joined_gates(parts)
     return Layouts(
         centers=np.concatenate([part.centers for part in parts]),
         radii=np.concatenate([part.radii for part in parts]),
@@ -326,6 +367,21 @@ def _joined_sines(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
             value = np.pad(value, [(0, 0), (0, 0), (0, sines - value.shape[2]), (0, 0)])
             columns[name].append(np.pad(value, _behind(value, max(counts) - count), constant_values=np.nan))
     return columns if sines and max(counts) else {name: [None] for name in SINES}
+
+
+def _joined_gates(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
+    """The gates of all parts, as many for each; None where no part has any."""
+    if all(part.gate_centers is None for part in parts):
+        return {name: [None] for name in GATES}
+    most = max(0 if part.gate_centers is None else part.gate_centers.shape[1] for part in parts)
+    columns: dict[str, list[Any]] = {name: [] for name in GATES}
+    for part in parts:
+        none = np.empty((part.count, 0, part.dimension)), np.empty((part.count, 0))
+        centers = none[0] if part.gate_centers is None else part.gate_centers
+        radii = none[1] if part.gate_radii is None else part.gate_radii
+        for name, value in zip(GATES, (centers, radii), strict=True):
+            columns[name].append(np.pad(value, _behind(value, most - radii.shape[1]), constant_values=np.nan))
+    return columns
 
 
 def _behind(value: np.ndarray, missing: int) -> list[tuple[int, int]]:

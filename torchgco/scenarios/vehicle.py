@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import inf, nan
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -11,10 +12,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import AtLeast, Count, Extended, Meters, check_options, check_value
+from torchgco.base.options import AtLeast, Count, Extended, Meters, Natural, check_options, check_value
 from torchgco.base.shapes import check_device
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.gates import Gates
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
@@ -22,6 +24,7 @@ from torchgco.maps.field import Field
 from torchgco.obstacles.boxes import Boxes
 from torchgco.obstacles.oscillating import OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres
+from torchgco.problem.free_time import FreeTime
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
 from torchgco.scenarios.base import Family, Scenario
@@ -31,7 +34,10 @@ STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one
 LIMITS = ("control_lower", "control_upper")
 CONTROLS = ("control_weight", "control_reference", *LIMITS)
 # The models of conf/model: dimension of space and number of states.
-BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "quadrotor": (3, 14)}
+BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "quadrotor": (3, 14), "rotors": (3, 13)}
+# Share of the control weights that is left, per second, where time is the cost: without any, controls that time doesn't
+# ask for would be anything.
+BESIDE_TIME = 1e-4
 
 
 @dataclass(frozen=True)
@@ -60,10 +66,14 @@ class Vehicle:
         radius: r_veh, m.
         goal_radius: m.
         stages: N.
+        state_lower, state_upper: (n,), bounds on the states at all knots but the first; None for a state, or for all:
+            no bound.
+        arrives: which states must be those of the goal at the end, where layouts leave the time free; None: the
+            position, within the goal's radius.
 
     Raises:
-        InputError: a field of another kind, length or out of its range; on `task`: layouts of another dimension or with
-            states of another length.
+        InputError: a field of another kind, length or out of its range; on `task`: layouts of another dimension, with
+            states of another length, or with different numbers of gates (see `Layouts.alike`).
     """
 
     name: str
@@ -79,10 +89,18 @@ class Vehicle:
     radius: Annotated[float, AtLeast(0, "m")]
     goal_radius: Meters
     stages: Count
+    state_lower: Sequence[Extended | None] | None = None
+    state_upper: Sequence[Extended | None] | None = None
+    arrives: Sequence[Natural] | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "vehicle")
         n, m = self.dynamics.n, self.dynamics.m
+        for name in ("state_lower", "state_upper"):
+            if getattr(self, name) is not None and len(getattr(self, name)) != n:
+                raise InputError(f"vehicle.{name}", f"{n} numbers", repr(getattr(self, name)))
+        if self.arrives is not None and not all(i < n for i in self.arrives):
+            raise InputError("vehicle.arrives", f"some of the states 0..{n - 1}", repr(self.arrives))
         for names, length in ((STATES, n), (CONTROLS, m)):
             for name in names:
                 if len(getattr(self, name)) != length:
@@ -193,16 +211,42 @@ class Vehicle:
             constraints.append(boxes if sines[0] is None else OscillatingBoxes(boxes, *map(tensor, sines)))
         if layouts.map is not None:
             constraints.append(Field(layouts.map, _given(layouts.vehicle_radius, self.radius)))
+        constraints += self._state_bounds
+        gates, legs = gates_of(layouts, longest)
+        constraints += [] if gates is None else [replace(gates, centers=tensor(gates.centers))]
+        time = free_time(layouts, legs)
+        rest, moving = (1.0, 1.0) if time is None else (0.0, BESIDE_TIME * dynamics.dt)
         cost = QuadraticCost(
-            Q=tensor(list(self.state_weight)), R=tensor(list(self.control_weight)),
-            Qf=tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
+            Q=rest * tensor(list(self.state_weight)), R=moving * tensor(list(self.control_weight)),
+            Qf=rest * tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
             u_ref=tensor(list(self.control_reference)),
         )  # fmt: skip
         goal_radius = _given(layouts.goal_radius, self.goal_radius)
         center = tensor(goal)[:, dynamics.position]
-        problem = Problem(dynamics, cost, constraints, tensor(start), longest, Goal(center, goal_radius), horizon)
+        end = Goal(center, goal_radius) if time is None else self._required(tensor(goal), center, goal_radius)
+        problem = Problem(dynamics, cost, constraints, tensor(start), longest, end, horizon, time=time)
         U0 = tensor(list(self.control_reference)).expand(layouts.count, longest, -1).contiguous()
         return Task(problem, U0, center, goal_radius, layouts)
+
+    @property
+    def _state_bounds(self) -> list[StateBounds]:
+        """Bounds on the states, where there are any."""
+        if self.state_lower is None and self.state_upper is None:
+            return []
+        given = (self.state_lower, -inf), (self.state_upper, inf)
+        sides = [
+            [none] * self.dynamics.n if side is None else [none if bound is None else bound for bound in side]
+            for side, none in given
+        ]
+        return [StateBounds(sides[0], sides[1])]
+
+    def _required(self, goal: Tensor, center: Tensor, radius: float) -> Goal:
+        """The goal that has to be met, at states (B, n), where time is the cost."""
+        if self.arrives is None:
+            return Goal(center, radius, required=True)
+        free = torch.ones_like(goal[0], dtype=torch.bool)
+        free[list(self.arrives)] = False
+        return Goal(state=goal.masked_fill(free, nan), radius=radius, required=True)
 
     def at_rest(self, layouts: Layouts) -> Layouts:
         """The layouts with states where they give positions alone: the vehicle's own start or goal, moved there."""
@@ -223,6 +267,31 @@ class Vehicle:
             wanted = f"{self.dynamics.n} states of model={self.name}, or {self.dimension} coordinates"
             raise InputError(f"layouts.{name}", wanted, states.shape[1])
         return states
+
+
+def gates_of(layouts: Layouts, stages: int) -> tuple[Gates | None, list[int]]:
+    """The gates of layouts, and the knots of a free time's legs, which have as many stages but for rounding.
+
+    Raises:
+        InputError: different numbers of gates.
+    """
+    counts = layouts.gate_counts
+    if counts is None or layouts.gate_centers is None or layouts.gate_radii is None or not counts.any():
+        return None, []
+    count = int(counts[0])
+    if (counts != count).any():
+        raise InputError("layouts.gate_centers", "as many gates in all layouts of a batch", counts.tolist())
+    legs = [round(stages * (leg + 1) / (count + 1)) for leg in range(count)]
+    knots = None if layouts.free_time is None else legs
+    return Gates(layouts.gate_centers[:, :count], layouts.gate_radii[:, :count].tolist(), knots=knots), legs
+
+
+def free_time(layouts: Layouts, legs: list[int]) -> FreeTime | None:
+    """The free time of layouts, with a duration for each leg; None where the time is given."""
+    if layouts.free_time is None:
+        return None
+    least, most, weight = layouts.free_time.tolist()
+    return FreeTime(least, most, weight, segments=legs or None)
 
 
 def fitting(dimension: int, states: int | None) -> str:

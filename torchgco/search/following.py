@@ -15,7 +15,7 @@ from torchgco.base.shapes import check_shape, tensor
 from torchgco.base.tree import take
 from torchgco.constraints.base import innermost
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.constraints.gates import GateBalls, GateSquares
+from torchgco.constraints.gates import GateBalls, GateSquares, gates_of
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
 from torchgco.obstacles.base import Obstacles
@@ -194,13 +194,17 @@ class Follow:
         return candidates
 
     def _centers(self, path: Tensor, arrive: Tensor, problem: Problem, paths: Paths) -> Tensor:
-        """Where the candidates are at every knot, (B K, N+1, d): along each path within the horizon of its problem."""
+        """Where the candidates are at every knot, (B K, N+1, d): along each path within the horizon of its problem.
+
+        Where there are gates, `arrive` is a share of the stages after the last of them.
+        """
         N, each = problem.N, path.shape[0] // max(1, problem.B)
-        gates = seen.gates_of(problem)
-        if gates is not None:  # which say when
+        gates = gates_of(problem)
+        if gates is not None:  # which say when; a pace is that of the last leg
             assert gates.places is not None
             places, stages = (part.repeat_interleave(each, dim=0) for part in (gates.places, problem.stages))
-            return timed(path, places, stages, N)
+            last = places[:, -1]
+            return timed(path, places, last + arrive.clamp(SHORTEST, 1.0) * (stages - last), N)
         center = path[:, -1:].repeat(1, N + 1, 1)
         for horizon in problem.stages.unique().tolist():
             rows = (problem.stages == horizon).nonzero().flatten()

@@ -11,6 +11,7 @@ from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.kernels import expect_interior
+from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.attempts import Late, Search
@@ -99,7 +100,8 @@ class Restarts(Solver):
 
     def choosing_time(self, problem: Problem) -> Chooser:
         """The interior point; among obstacles the passes where the time is held, and the interior point from there."""
-        if not problem.geometric:
+        bodies = (part.absent.shape[1] > 0 if isinstance(part, Obstacles) else True for part in problem.geometric)
+        if not any(bodies):
             return self.interior.choosing_time(problem)
         return Chooser(self, self.interior, self.local.violation_tolerance, paces=PACES)
 

@@ -54,10 +54,27 @@ class Recorder:
             else {}
         )
         frame = pd.DataFrame(columns)
-        if self._passes:
-            scale = unit.cpu().numpy()[frame["element"]]
-            for name in ("cost", "merit", "regularisation"):
-                frame[name] *= scale
-            for name in ("cost", "merit"):
-                frame[name] += constant.cpu().numpy()[frame["element"]]
-        return frame.sort_values(["element", "attempt", "iteration"], ignore_index=True) if self._passes else frame
+        if not self._passes:
+            return frame
+        return in_units(frame, unit, constant).sort_values(["element", "attempt", "iteration"], ignore_index=True)
+
+
+def in_units(trace: pd.DataFrame, unit: Tensor, constant: Tensor) -> pd.DataFrame:
+    """A trace with costs times a unit, plus a constant, both by place in the batch."""
+    if trace.empty:
+        return trace
+    scale, more = unit.cpu().numpy()[trace["element"]], constant.cpu().numpy()[trace["element"]]
+    costs = {name: trace[name] * scale for name in ("cost", "merit", "regularisation")}
+    return trace.assign(**costs | {name: costs[name] + more for name in ("cost", "merit")})
+
+
+def appended(trace: pd.DataFrame | None, later: pd.DataFrame | None) -> pd.DataFrame | None:
+    """Two traces as one, in which each problem's attempts of the later one are numbered on."""
+    if trace is None or later is None or trace.empty or later.empty:
+        return later if trace is None or trace.empty else trace
+    import pandas as pd
+
+    before = trace.groupby("element")["attempt"].max()
+    own = later.assign(attempt=later["attempt"] + later["element"].map(before).fillna(0).astype(int))
+    whole = pd.concat((trace, own))
+    return whole.sort_values(["element", "attempt", "iteration"], ignore_index=True)

@@ -18,15 +18,16 @@ from torch import Tensor
 
 from torchgco.base.errors import HorizonWarning
 from torchgco.base.status import Status
-from torchgco.base.tree import put, take
+from torchgco.base.tree import put, spread, take
 from torchgco.costs.base import WrappedCost
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.problem.in_time import factors_in, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
+from torchgco.solvers.history import appended, in_units
 from torchgco.solvers.steering import Steering
-from torchgco.solvers.straight import straight_line
+from torchgco.solvers.straight import Legs, straight_line
 
 LONG = 1.5  # the first time that is held, as a multiple of an estimate
 LONGER = 2.0  # the next one, of the one before
@@ -74,13 +75,18 @@ class Timed:
         self.chooser, self.problem, self.call = chooser, problem, call
         assert problem.time is not None
         self.time, line = problem.time, straight_line(problem)
-        steering, U = Steering(problem, line), call.U0[..., : problem.m]
+        legs, U, N = Legs.of(problem, line[:, -1]), call.U0[..., : problem.m], problem.N
+        steering = Steering(problem, line if legs is None else _to_the_farthest(problem, line, legs))
         estimate = steering.factors().unsqueeze(-1)
+        if legs is not None:
+            each = legs.stage_factors(torch.where(estimate.isnan(), 1.0, estimate), N)
+            of_stages = torch.nn.functional.one_hot(self.time.of_stages(N), self.time.count).to(each)
+            estimate = each @ of_stages / of_stages.sum(0)
         own = LONG * torch.where(estimate.isnan(), 1.0, estimate)
         self.own = own.clamp(self.time.least, self.time.most)
         self.first = self._first(estimate)
-        X, U = (line, U) if call.X0 is not None else steering.guess(self.first.amax(-1), U)
-        self.X, self.U = X, U  # of the user's problem
+        X, U = (line, U) if call.X0 is not None or legs is not None else steering.guess(self.first.amax(-1), U)
+        self.X, self.U, self.through_gates = X, U, legs is not None  # of the user's problem
         self.best: Solution | None = None
 
     def run(self) -> Solution:
@@ -106,7 +112,7 @@ class Timed:
         return self._found
 
     def _first(self, estimate: Tensor) -> Tensor:
-        """The factors (B, S) to begin with: the guess, or `LONG` times the estimate (B, 1), which may be NaN.
+        """The factors (B, S) to begin with: the guess, or `LONG` times the estimate (B, 1 or S), which may be NaN.
 
         A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end; beside
         states to begin with it counts all the same.
@@ -128,7 +134,8 @@ class Timed:
             self._keep(rows, self.chooser.free.run(call))
             return
         if self.chooser.first is not None:
-            at_once = self.chooser.free if given else self.chooser.first  # states that were chosen are worth the while
+            # States that were chosen, and those through gates, are worth the while.
+            at_once = self.chooser.free if given or self.through_gates else self.chooser.first
             found = at_once.run(replace(call, warm=None))
             self._keep(rows, found)
             left = (found.status != Status.CONVERGED) | self._is_short(rows, found)
@@ -139,7 +146,7 @@ class Timed:
 
     def _held(self, rows: Tensor, call: Any) -> None:
         """Find trajectories at the time of the call's starts, and free it."""
-        held = replace(call, problem=call.problem.held_at(call.problem.x0), warm=None)
+        held = replace(call, problem=_at_held_times(call.problem, self.problem.n), warm=None)
         solver = self.chooser.held
         first = solver.run(held if solver.take_states(held.problem) else replace(held, X0=None))
         does = first.violation <= self.chooser.limit
@@ -185,7 +192,9 @@ class Timed:
         if not self.chooser.paces:
             return
         far = ((self.first / self.own - 1.0).abs() > NEAR).any(-1)
-        for pace in (None, *self.chooser.paces):
+        # Where legs between gates have times of their own, other paces of all of them have found nothing better.
+        alone = self.through_gates and self.time.count > 1
+        for pace in (None, *(() if alone else self.chooser.paces)):
             found = self._found.violation <= self.chooser.limit
             rows = (found & far if pace is None else found).nonzero().flatten()
             factors = self.own if pace is None else pace * factors_in(self.problem, self._found.X)
@@ -202,9 +211,9 @@ class Timed:
         return replace(call, problem=call.problem._with({"x0": x0}, call.problem.known), X0=X, U0=U)
 
     def _keep(self, rows: Tensor, found: Solution) -> None:
-        """Keep what is better than before; iterations add up."""
+        """Keep what is better than before; iterations add up, and so do records."""
         if self.best is None:
-            self.best = replace(found, trace=None, search=None)
+            self.best = found
             return
         best, old = self.best, self.best.take(rows)
         better = is_better(found.cost, found.violation, old.cost, old.violation, self.chooser.limit)
@@ -215,6 +224,25 @@ class Timed:
             put(getattr(best, name), rows[where], take(getattr(found, name), where))
         for name in ("iterations", "outer_iterations", "guided"):
             getattr(best, name)[rows] += getattr(found, name)
+        searches = [record for record in (best.search, found.search) if record is not None]
+        search = searches[0].followed_by(searches[1]) if len(searches) == 2 else next(iter(searches), None)
+        self.best = replace(best, trace=appended(best.trace, found.trace), search=search)
+
+
+def _to_the_farthest(problem: Problem, line: Tensor, legs: Legs) -> Tensor:
+    """States (B, N+1, n) as on a line, of which the last is at the stop that is farthest from the start."""
+    line = line.clone()
+    line[:, -1, problem.position] = legs.farthest
+    return line
+
+
+def _at_held_times(problem: Problem, n: int) -> Problem:
+    """Problems `in_time` whose factor, their state n, is held at x0, and whose own starts stay as free as they are."""
+    free = problem.free_start
+    assert free is not None
+    own = free.clone()
+    own[:, n] = False
+    return problem._with({"free_start": own}, problem.known) if bool(own.any()) else problem.held_at(problem.x0)
 
 
 def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | None) -> Solution:
@@ -237,7 +265,10 @@ def _found(chooser: Chooser, problem: Problem, call: Any) -> Solution:
     scaled, unit = call.in_cost_units()
     found = Timed(chooser, problem, scaled).run()
     cost, multipliers = call.problem.cost.total(found.X, found.U), found.multipliers.scaled(unit)
-    return replace(found, cost=cost, multipliers=multipliers)
+    units = spread(unit, call.rows), spread(call.problem.cost_scale.constant, call.rows)
+    trace = None if found.trace is None else in_units(found.trace, *units)
+    search = None if found.search is None else found.search.in_costs(*units)
+    return replace(found, cost=cost, multipliers=multipliers, trace=trace, search=search)
 
 
 def of_user(problem: Problem, found: Solution, needed: Tensor | None = None) -> Solution:
@@ -247,7 +278,8 @@ def of_user(problem: Problem, found: Solution, needed: Tensor | None = None) -> 
     multipliers = Multipliers(found.multipliers.lam[:count], found.multipliers.mu)
     X, K = found.X[..., :n].contiguous(), found.K[..., :m, :n].contiguous()
     U, d = found.U[..., :m].contiguous(), found.d[..., :m].contiguous()
-    return replace(found, X=X, U=U, K=K, d=d, multipliers=multipliers, times=times, needed=needed)
+    search = None if found.search is None else found.search.of_first_states(n)
+    return replace(found, X=X, U=U, K=K, d=d, multipliers=multipliers, times=times, needed=needed, search=search)
 
 
 def lifted_multipliers(problem: Problem, whole: Problem, warm: Multipliers) -> Multipliers:

@@ -15,6 +15,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
 from torchgco.view.flights import Flight
+from torchgco.view.outlines import outlines_of
 from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
 from torchgco.view.vehicles import Look
@@ -74,7 +75,7 @@ class Document:
         part: dict[str, Any] = {
             "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
             "goal_radius": None if problem.goal is None else number(problem.goal.radius[b]),
-            "map": _extent(problem, b),
+            "map": _extent(problem, b), "gates": outlines_of(problem, b),
             "obstacles": [self._placed(packing, shape, middle) for shape in self._shapes(problem.obstacles, b)],
             "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
             "search": None if search is None else search.packed(packing),
@@ -82,6 +83,10 @@ class Document:
         }  # fmt: skip
         self.labels.append({"label": label, "results": {flight.solver: flight.result for flight in flights}})
         self.parts.append(packing.sealed(part))
+
+    def ordered(self, places: Sequence[int]) -> None:
+        """Put the layouts in another order: first the one at the first of these places."""
+        self.labels, self.parts = [self.labels[i] for i in places], [self.parts[i] for i in places]
 
     def _placed(self, packing: Packing, shapes: Shapes, middle: np.ndarray) -> dict[str, Any]:
         """Obstacles in the layout's part; many of them, as of a map, in a part that layouts of equal ones share."""

@@ -15,7 +15,7 @@ STATIC, THREE = HERE / "static", HERE / "vendor" / "three"
 # In the order in which each is loaded; a module imports only from those before it.
 BUILT = {"three.core.min.js": THREE / "three.core.min.js", "three.module.min.js": THREE / "three.module.min.js"}
 MODULES = (
-    "data.js", "shapes.js", "camera.js", "vehicle.js", "scenery.js", "tubes.js", "missions.js", "flights.js",
+    "data.js", "shapes.js", "camera.js", "vehicle.js", "tubes.js", "scenery.js", "missions.js", "flights.js",
     "search.js", "hover.js", "panel.js", "main.js",
 )  # fmt: skip
 POLICY = "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src data: blob:"

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, Unicycle
+from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
 from torchgco.dynamics.names import states_of
 
 QUATERNION = ["qw", "qx", "qy", "qz"]
@@ -50,6 +50,7 @@ class Look:
 VEHICLES: dict[type[Dynamics], Look] = {
     QuadrotorPlanning: Look("quadrotor", quaternion=slice(6, 10)),
     QuadrotorPlant: Look("quadrotor", quaternion=slice(6, 10)),
+    QuadrotorThrusts: Look("quadrotor", quaternion=slice(6, 10)),
     Unicycle: Look("car", heading=2),
 }
 

@@ -27,7 +27,7 @@ from torchgco.experiments.results.identity import plain
 from torchgco.kernels import use_native
 from torchgco.missions import Mission
 from torchgco.missions.plant import Plant, flown
-from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
+from torchgco.scenarios import GateForest, Layouts, Race, Scenario, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.solvers.memory import least_bytes
 
@@ -212,7 +212,7 @@ def _mission(setup: Setup) -> Mission | None:
         raise InputError("plant", "the vehicle that flies the mission: plant=rotors", "none")
     if setup.device.type != "cpu" or setup.dtype != torch.float64:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
-    if setup.scenario.dimension != 3:
+    if setup.scenario.dimension != 3 or isinstance(setup.scenario, GateForest | Race):
         raise InputError("scenario", FLOWN, setup.scenario.name)
     made, plant = _instantiate(node, "mission"), _instantiate(setup.config.plant, "plant")
     mission = _closed_loop(made, plant, setup.solver, setup.vehicle)

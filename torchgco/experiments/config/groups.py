@@ -31,11 +31,13 @@ from torchgco.scenarios import (
     Floors,
     Forest,
     ForestMoving,
+    GateForest,
     LayoutFile,
     MapFile,
     Mazes,
     PlanarRandom,
     PlanarTrap,
+    Race,
     Rooms,
     Trefoils,
     Walls,
@@ -48,7 +50,7 @@ from torchgco.search import Passes
 
 FAMILIES: tuple[type[Any], ...] = (
     Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
-    Floors,
+    Floors, GateForest, Race,
 )  # fmt: skip
 ANYWHERE = {2: "unicycle", 3: "quadrotor"}  # the model for layouts that give positions alone
 BY_DIMENSION = "torchgco.by_dimension"
@@ -112,6 +114,7 @@ def register() -> None:
     register_resolver("torchgco.drawn", _drawn)
     register_resolver("torchgco.options", _help)
     register_resolver("torchgco.radius", _radius)
+    register_resolver("torchgco.hover", lambda _root_: _root_.vehicle.mass * _root_.vehicle.gravity / 4.0)
     # Hydra copies the whole store for each composition, 40 % of its time, and copies again what it takes from it.
     setattr(ConfigStore, "__deepcopy__", lambda store, memo: store)  # noqa: B010
     _store("scenario", "layouts", _fields_of(LayoutFile))

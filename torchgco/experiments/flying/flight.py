@@ -21,9 +21,10 @@ from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import MAX_PROCESSES, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
 from torchgco.experiments.flying.progress import Bar
+from torchgco.experiments.results.durations import durations, with_lengths
 from torchgco.judging.certificate import certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
-from torchgco.judging.judge import frame_columns, judge
+from torchgco.judging.judge import frame_columns, gates_passed, judge
 from torchgco.kernels import kernels_of, use_native
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts
@@ -116,7 +117,8 @@ class Flight:
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
         """Rows (without success) and controls (L, N, m), NaN where nothing was flown.
 
-        Layouts with as many stages are solved together; their controls end with those at rest.
+        Layouts with as many stages and gates are solved together; their controls end with those at rest. Where the time
+        is free the lengths of the stages are a column more (`durations`).
         """
         places = self.layouts.alike()
         if len(places) == 1:
@@ -131,10 +133,11 @@ class Flight:
     def _lengthened(self, U: np.ndarray, stages: int) -> np.ndarray:
         """Controls (L, N, m) with those at rest after them, up to so many stages."""
         rest = np.array(self.setup.vehicle.control_reference, np.float64)
+        rest = np.pad(rest, (0, U.shape[-1] - len(rest)))  # further stages take no time
         return np.concatenate((U, np.broadcast_to(rest, (len(U), stages - U.shape[1], len(rest)))), axis=1)
 
     def _fly(self, layouts: Layouts) -> tuple[pd.DataFrame, np.ndarray]:
-        """The same of layouts with as many stages."""
+        """The same of layouts with as many stages and gates."""
         setup, self.shown = self.setup, 0
         task = setup.vehicle.task(layouts, setup.device, setup.dtype)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
@@ -146,12 +149,16 @@ class Flight:
         U = solution.U.detach().to("cpu", torch.float64)
         U[[status in NOT_FLOWN for status in statuses]] = torch.nan
         checked = setup.vehicle.task(layouts)
-        verdict = judge(checked.problem, U, checked.goal, checked.goal_radius)
-        certificate = certify(checked.problem, solution.X.detach().to("cpu", torch.float64), U, verdict.feasible)
+        free = checked.problem.time is not None
+        times = solution.t.detach().to("cpu", torch.float64) if free else None
+        verdict = judge(checked.problem, U, checked.goal, checked.goal_radius, times=times)
+        X = solution.X.detach().to("cpu", torch.float64)
+        certificate = certify(checked.problem, X, U, verdict.feasible, times=times)
         rows = pd.DataFrame(
             {
                 "scenario": layouts.name, "layout": layouts.ids, "seed": setup.seed, "model": setup.vehicle.name,
                 "solver": self.name, "status": statuses, **frame_columns(verdict), "sound": verdict.sound.numpy(),
+                **durations(times), **gates_passed(checked.problem, verdict),
                 **certificate_columns(certificate),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
@@ -161,7 +168,7 @@ class Flight:
                 "kernels": (solution.account and solution.account.kernels) or "", "version": VERSION,
             }
         )  # fmt: skip
-        return rows, U.numpy()
+        return rows, U.numpy() if times is None else with_lengths(U.numpy(), times.numpy())
 
     def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, np.ndarray]:
         """The solution, seconds per problem, and how many problems at most ran at the same time as each of them (L,).

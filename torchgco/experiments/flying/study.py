@@ -17,7 +17,6 @@ from tqdm import tqdm
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
-from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
@@ -28,6 +27,7 @@ from torchgco.experiments.reports.explained import advised, explained, where_to_
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.reports.view import write_view
+from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,
@@ -44,7 +44,6 @@ from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.results.success import sound, with_success
 from torchgco.kernels import native
 from torchgco.missions import Mission
-from torchgco.problem.horizons import within_horizons
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.
@@ -290,11 +289,15 @@ def _update_success(study: _Study, records: Records, show: Callable[[str], None]
 
 
 def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """States (L, N+1, n) of every solver, for the pictures."""
-    problem = study.setup.vehicle.task(study.layouts).problem
-    dynamics = within_horizons(problem).dynamics
-    names: Sequence[str] = flown["solver"].tolist()
-    return {
-        name: open_loop(dynamics, problem.x0, torch.from_numpy(U)).numpy()
-        for name, U in zip(names, flown["U"], strict=True)
-    }
+    """States (L, N+1, n) of every solver, for the pictures; those with fewer stages stay where they end."""
+    names, every, times = flown["solver"].tolist(), flown["U"], flown.get("times")
+    found = {name: np.full((*U.shape[:1], U.shape[1] + 1, study.setup.vehicle.dynamics.n), np.nan)
+             for name, U in zip(names, every, strict=True)}  # fmt: skip
+    for places in study.layouts.together():
+        problem = study.setup.vehicle.task(study.layouts.take(places)).problem
+        for i, name in enumerate(names):
+            U = torch.from_numpy(every[i][places, : problem.N])
+            t = times_at(None if times is None else times[i], places, problem.N)
+            X = states_of(problem, U, t).numpy()
+            found[name][places, : problem.N + 1], found[name][places, problem.N + 1 :] = X, X[:, -1:]
+    return found

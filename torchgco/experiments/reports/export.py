@@ -15,16 +15,15 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Positive, check_value
 from torchgco.dynamics import QuadrotorPlant
 from torchgco.dynamics.names import controls_of, states_of
-from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.bags import Storage, write_bag
 from torchgco.experiments.reports.finished import TRUST, Study
 from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
+from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import damaged, write
 from torchgco.experiments.results.limits import read_table
 from torchgco.experiments.results.records import SOLUTIONS
-from torchgco.problem.horizons import within_horizons
 from torchgco.problem.sampled import TIME, sampled
 from torchgco.problem.times import times
 
@@ -89,11 +88,13 @@ def _position(study: Study) -> list[str]:
 
 def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
     """Single trajectories, rolled out from the controls that the study kept."""
+    held = study.times
     for places, problem in study.batches():
         for name, controls in study.flown(SOLUTIONS, "U").items():
             U = torch.from_numpy(controls[places, : problem.N])
-            X = open_loop(within_horizons(problem).dynamics, problem.x0, U)
-            t = times(problem).expand(problem.B, -1)
+            own = durations.times_at(None if held is None else held[name], places, problem.N)
+            X = durations.states_of(problem, U, own)
+            t = times(problem).expand(problem.B, -1) if own is None else own
             for b, number in enumerate(study.layouts.ids[places].tolist()):
                 last = problem.N if problem.horizon is None else int(problem.horizon[b])
                 if wanted(name, number) and bool(torch.isfinite(U[b, :last]).all()):

@@ -15,7 +15,15 @@ from torchgco.experiments.config.build import mission_from, solver_from, vehicle
 from torchgco.experiments.results.files import damaged
 from torchgco.experiments.results.identity import Manifest
 from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
-from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, MISSION, TRIALS, read_manifest
+from torchgco.experiments.results.records import (
+    DONE,
+    LAYOUTS,
+    MANIFEST,
+    MISSION,
+    SOLUTIONS,
+    TRIALS,
+    read_manifest,
+)
 from torchgco.experiments.results.runs import read_trials
 from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
@@ -105,11 +113,15 @@ class Study:
         """The rows of the table by solver and layout."""
         return {(row["solver"], row["layout"]): row for row in self.trials.to_dict("records")}  # type: ignore[misc]
 
-    def batches(self) -> Iterator[tuple[slice, Problem]]:
+    def batches(self) -> Iterator[tuple[np.ndarray, Problem]]:
         """Problems of some layouts at a time, and their places."""
-        for first in range(0, self.layouts.count, BATCH):
-            places = slice(first, min(first + BATCH, self.layouts.count))
-            yield places, self.vehicle.task(self.layouts.take(range(places.start, places.stop))).problem
+        for places in self.layouts.together(BATCH):
+            yield places, self.vehicle.task(self.layouts.take(places)).problem
+
+    @property
+    def times(self) -> dict[str, np.ndarray] | None:
+        """The times (L, N+1) of the knots by solver, s, where the time is free; else None."""
+        return None if self.layouts.free_time is None else self.flown(SOLUTIONS, "times")
 
     def mission(self, solver: str) -> Mission:
         """The closed loop of a study of missions, as a solver's name flew it."""

@@ -23,6 +23,7 @@ import torch
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import vehicle_of
 from torchgco.experiments.flying.mission_flight import LOST
+from torchgco.experiments.results.durations import durations, times_at
 from torchgco.experiments.results.files import checksum, damaged
 from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
@@ -39,7 +40,7 @@ from torchgco.experiments.results.records import (
 )
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.tables import aligned, csv_text
-from torchgco.judging.judge import frame_columns, judge
+from torchgco.judging.judge import frame_columns, gates_passed, judge
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.tables import step_columns
@@ -208,15 +209,18 @@ def _trajectories(
     parts = []
     for name in manifest.solvers:
         controls = torch.from_numpy(arrays["U"][names.index(name)])
-        for first in range(0, layouts.count, BATCH):
-            some = layouts.take(range(first, min(first + BATCH, layouts.count)))
+        held_times = arrays["times"][names.index(name)] if "times" in arrays else None
+        for places in layouts.together(BATCH):
+            some = layouts.take(places)
             task = vehicle.task(some)
-            U = controls[[place[number] for number in some.ids.tolist()], : task.problem.N]
-            verdict = judge(task.problem, U, task.goal, task.goal_radius)
+            stored = [place[number] for number in some.ids.tolist()]
+            times = times_at(held_times, stored, task.problem.N)
+            verdict = judge(task.problem, controls[stored, : task.problem.N], task.goal, task.goal_radius, times=times)
             columns = {"solver": name, "layout": some.ids, **frame_columns(verdict), "sound": verdict.sound.numpy()}
-            parts.append(pd.DataFrame(columns))
+            more = durations(times) | gates_passed(task.problem, verdict)
+            parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
-    return rows.set_index(ROW)[[*frame_columns(verdict), "success", "best_cost", "best_from"]]
+    return rows.set_index(ROW)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
 
 
 def _missions(

@@ -13,16 +13,15 @@ from tqdm import tqdm
 
 from torchgco.base.errors import InputError
 from torchgco.base.notices import watched
-from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.finished import TRUST, Study, document_of
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.searched import searches
+from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.records import SOLUTIONS
 from torchgco.judging.judge import OTHERS_WITHIN
-from torchgco.problem.horizons import within_horizons
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page
@@ -51,8 +50,8 @@ def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) 
 
 def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
-    controls = study.flown(SOLUTIONS, "U")
-    document, rows = None, study.rows
+    controls, held_times = study.flown(SOLUTIONS, "U"), study.times
+    document, rows, order = None, study.rows, list[np.ndarray]()
     hidden = study.layouts.count < SLOW or not watched()
     bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=hidden)
     for places, problem in study.batches():
@@ -61,17 +60,22 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
         ids, flown = study.layouts.ids[places].tolist(), []
         for name in document.solvers:
             U = torch.from_numpy(controls[name][places, : problem.N])
-            X = open_loop(within_horizons(problem).dynamics, problem.x0, U)
+            t = times_at(None if held_times is None else held_times[name], places, problem.N)
+            X = states_of(problem, U, t)
             here = [rows[name, number] for number in ids]
             touching = np.array([not row["clearance"] >= 0 for row in here])
             said = [result_of(row) for row in here], [told(row) for row in here]
             flown.append(flights_of(problem, look, X, U, name, *said, OTHERS_WITHIN, touching))
         for b, number in enumerate(ids):
             held = [flights[b] for flights in flown if len(flights[b].path)]
-            document.add(f"layout {number}", problem, b, held, found.get(number))
+            # The knots' times are those of the solver under study; others are shown at the same knots.
+            own = None if held_times is None else held_times[document.solvers[0]][places[b], : problem.N + 1]
+            document.add(f"layout {number}", problem, b, held, found.get(number), own)
         bar.update(len(ids))
+        order.append(places)
     bar.close()
     assert document is not None
+    document.ordered(np.argsort(np.concatenate(order)).tolist())
     return document
 
 

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
-from torchgco.scenarios.layouts import BOXES, SINES
+from torchgco.scenarios.layouts import BOXES, GATES, SINES, TIME
 from torchgco.scenarios.stored_maps import map_arrays
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
@@ -183,6 +183,11 @@ def layout_digests(
         for name in ("start", "goal"):
             if getattr(layouts, name) is not None:
                 own[name] = getattr(layouts, name)[i]
+        if layouts.gate_centers is not None and layouts.gate_radii is not None:
+            here = ~np.isnan(layouts.gate_radii[i])
+            own |= {name: getattr(layouts, name)[i][here] for name in GATES}
+        if layouts.free_time is not None:
+            own[TIME] = layouts.free_time
         if isinstance(layouts.stages, np.ndarray):
             own["stages"] = int(layouts.stages[i])
         if alone and layouts.map is not None:

@@ -23,6 +23,7 @@ import pandas as pd
 
 from torchgco.base.errors import InputError
 from torchgco.base.files import PART, regular
+from torchgco.experiments.results.durations import parted
 from torchgco.experiments.results.files import checksum, create, damaged, write
 from torchgco.experiments.results.identity import Manifest, difference
 from torchgco.experiments.results.limits import read_npz, read_table
@@ -159,13 +160,17 @@ class Records:
         return rows.loc[order].reset_index(drop=True), np.concatenate([U for _, U in held])[order.to_numpy()]
 
     def finish(self, trials: pd.DataFrame, flown: np.ndarray | pd.DataFrame, layouts: Layouts) -> None:
-        """Write trials.parquet, layouts.npz, and solutions.npz from controls or mission.parquet from a table."""
+        """Write trials.parquet, layouts.npz, and solutions.npz from controls or mission.parquet from a table.
+
+        Where the time is free the last of the controls is the length of each stage.
+        """
         solvers = np.array(list(self.manifest.solvers))
         write(self.folder / TRIALS, _table(trials))
         if isinstance(flown, pd.DataFrame):
             write(self.folder / MISSION, _table(flown))
         else:
-            write(self.folder / SOLUTIONS, _arrays({"U": flown, "solver": solvers, "layout": layouts.ids}))
+            own = {"U": flown} if layouts.free_time is None else parted(flown)
+            write(self.folder / SOLUTIONS, _arrays({**own, "solver": solvers, "layout": layouts.ids}))
         write(self.folder / LAYOUTS, _arrays(layouts.arrays()))
 
     def replace(self, trials: pd.DataFrame, layouts: Layouts) -> None:

@@ -2,6 +2,7 @@
 import * as THREE from "./three.module.min.js";
 import { point } from "./data.js";
 import { SUN } from "./shapes.js";
+import { tube } from "./tubes.js";
 
 const SIDEWAYS = 0.25; // shares of the scene's size that are kept around the trajectories
 const UPWARDS = 0.1;
@@ -75,6 +76,7 @@ export function surroundings(layout, space, colours, still) {
     group.add(mark(layout.goal, space, new THREE.OctahedronGeometry(0.8), colours));
     if (layout.goal_radius) group.add(target(layout.goal, layout.goal_radius, space));
   }
+  for (const corners of layout.gates) group.add(gate(corners, space));
   return group;
 }
 
@@ -99,6 +101,12 @@ function mark(place, space, geometry, colours) {
   made.scale.setScalar(0.012 * space.size);
   made.position.set(place[0], place[1], space.flat ? 0.5 * space.height : place[2]);
   return made;
+}
+
+/** A closed line through corners. */
+function gate(corners, space) {
+  const places = [...corners, corners[0]].map(([x, y, z]) => new THREE.Vector3(x, y, z ?? 0.5 * space.height));
+  return tube(places, 0.003 * space.size, new THREE.MeshLambertMaterial({ color: 0xd55e00 }));
 }
 
 function target(place, radius, space) {
