@@ -271,3 +271,18 @@ def test_branches_not_taken_end_as_with_native_kernels(place: str) -> None:
         native, eager = both(problem, solver=solver)
         assert eager.statuses == native.statuses == [Status.CONVERGED] * 3
         torch.testing.assert_close(eager.cost, native.cost, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_affine_code_with_weights_that_ask_for_gradients(count: int) -> None:
+    """Its slopes ask for gradients, by the weights, and depend on no state."""
+    torch.manual_seed(0)
+    net = torch.nn.Linear(6, 4).double()
+    x0 = torch.tensor([[0.1, 0.3, -0.2, 0.15], [0.2, -0.4, 0.1, 0.6]], dtype=D)[:count]
+    cost = QuadraticCost([1.0] * 4, [0.1] * 2, [20.0] * 4)
+    model = FunctionDynamics(lambda x, u: net(torch.cat((x, u), -1)), 4, 2, 0.2)
+    problem = Problem(model, cost, [ControlBounds(-1.0, 1.0)], x0, 8)
+    native = torchgco.solve(problem, solver="interior_point").detach()
+    with by_pytorch():
+        eager = torchgco.solve(problem, solver="interior_point").detach()
+    assert_same(native, eager)

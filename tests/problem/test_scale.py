@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 from torch import Tensor
@@ -196,3 +198,24 @@ def test_constants_hide_no_cost_where_one_control_is_in_small_units() -> None:
     found = torchgco.solve(problem([1e-3, 1.0], 1e4))
     assert found.statuses == [Status.CONVERGED]
     assert bool((found.cost - 1e5 - expected).abs() < 1e-3 * expected)
+
+
+@pytest.mark.parametrize("pressure", [1.0, 1e5, 1e7])
+@pytest.mark.parametrize("solver", ["gco", "al_ilqr"])
+def test_a_row_is_small_whatever_the_size_of_other_states(solver: str, pressure: float) -> None:
+    """A vessel drains through a pipe, whose flow of some 1e-4 m^3/s passes its limit whatever the pump does."""
+    flow = 1e-4
+
+    def rates(x: Tensor, u: Tensor) -> Tensor:
+        p, q = x[..., :1], x[..., 1:]
+        return torch.cat((-0.1 * pressure * q / flow + 0.01 * pressure * u, 2.0 * (flow * p / pressure - q)), -1)
+
+    cost = FunctionCost(lambda x, u: 0.1 * u.square().sum(-1), lambda x: 0.0 * x[..., 0])
+    limit = FunctionConstraint(lambda x: x[..., 1:] - 0.3 * flow, knots=[8])
+    model = FunctionDynamics(rates, 2, 1, 0.2, "rk4")
+    problem = Problem(model, cost, [ControlBounds(-1.0, 1.0), limit], [[pressure, 0.0]], 15)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = torchgco.solve(problem, solver=solver, verbose=False)
+    claims = found.statuses[0] in (Status.CONVERGED, Status.FEASIBLE)
+    assert not claims or any(issubclass(one.category, ScaleWarning) for one in said)

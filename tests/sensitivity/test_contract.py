@@ -139,3 +139,19 @@ def test_a_thousand_gradients_take_no_memory() -> None:
             gc.collect()
             used.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     assert used[-1] - used[1] < 4096  # kB in 800 solves
+
+
+@pytest.mark.parametrize("step", [0.01, 0.5])
+def test_numbers_that_change_before_backward_change_no_gradient(step: float) -> None:
+    """An optimizer steps between a solve and its gradient."""
+
+    def slopes(by: float) -> Tensor:
+        aim = torch.tensor([1.0, 0.2], dtype=D, requires_grad=True)
+        cost = QuadraticCost([1.0, 0.1], [0.1], [5.0, 1.0], x_ref=aim)
+        x0 = torch.tensor([[0.3, 0.0], [-0.4, 0.2]], dtype=D)
+        found = torchgco.solve(Problem(MODEL, cost, [ControlBounds(-3.0, 3.0)], x0, 10), verbose=False)
+        with torch.no_grad():
+            aim += by
+        return torch.autograd.grad(found.X.square().sum(), aim)[0]
+
+    torch.testing.assert_close(slopes(step), slopes(0.0), rtol=1e-12, atol=0.0)

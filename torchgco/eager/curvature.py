@@ -56,8 +56,9 @@ def _rows(values: Tensor, z: Tensor) -> Tensor:
     parts = []
     for some in basis.split(max(1, AT_ONCE // max(1, z.numel()))):
         many = some.expand(-1, *values.shape)
-        found = torch.autograd.grad(values, z, many, retain_graph=True, is_grads_batched=True, materialize_grads=True)
-        parts.append(found[0])
+        found = torch.autograd.grad(values, z, many, retain_graph=True, is_grads_batched=True, allow_unused=True)[0]
+        # Slopes of an affine function depend on its weights, which may ask for gradients, and not on z.
+        parts.append(z.new_zeros(len(some), *z.shape) if found is None else found)
     return torch.cat(parts).movedim(0, -2)
 
 

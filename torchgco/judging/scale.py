@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import scattered
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.judging.worst import NONE
@@ -12,13 +13,15 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
 
 SHARE = 0.05  # of a row's values: a larger violation leaves little of the row
-NOISE = 1e-9  # of the largest state or control: values up to this are rounding, and say nothing of a row's size; ...
-ROUGH = 1e-6  # ... where a row has no others, no violation up to this counts as large, which solves may leave
+NOISE = 1e-9  # of states and controls: what this changes a row by is rounding, and doesn't say the row's size
+ROUGH = 1e-6  # where a row has no others, no violation up to this counts as large, which solves may leave
 
 
 def noise(X: Tensor, U: Tensor) -> Tensor:
-    """Violations (B,) up to which rounding may be all, of trajectories X (B, N+1, n), U (B, N, m)."""
-    return NOISE * torch.maximum(X.abs().flatten(1).amax(-1), U.abs().flatten(1).amax(-1))
+    """Violations (B,) up to which no row's can be large, of trajectories X (B, N+1, n), U (B, N, m)."""
+    sizes = torch.cat((X.abs().amax(1), U.abs().amax(1)), dim=-1)
+    least = torch.where(sizes > 0, sizes, torch.inf).amin(-1)
+    return NOISE * torch.where(torch.isinf(least), 0.0, least)
 
 
 def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -33,13 +36,14 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """
     place = torch.full((problem.B,), NONE, device=problem.x0.device)
     problem = within_horizons(problem.held_at(X[:, 0]))
-    least = noise(X, U).view(-1, 1, 1)
+    moved = tuple(z * (1.0 + NOISE * scattered(z[:1])) for z in (X, U))
     for number, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             continue
         before, now = constraint.value(*problem.at_rest), constraint.value(X, U)
         if before.numel() == 0:
             continue
+        least = (constraint.value(*moved) - now).abs().amax(1, keepdim=True)
         sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
         rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
         size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))

@@ -14,7 +14,8 @@ from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import computing_on
-from torchgco.base.tree import is_users
+from torchgco.base.tree import copied, is_users
+from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
@@ -140,7 +141,11 @@ def _step_left(at: Points, of: Residual) -> Tensor:
 
 def _system(at: Points) -> System:
     found = at.solution
-    return System(at.problem, found.X, found.U, found.multipliers.lam, at.active, at.give)
+    problem = at.problem
+    if type(problem.cost) is BoundQuadratic:
+        # Its numbers may be the user's own tensors, which a step of an optimizer changes before `backward`.
+        problem = problem._with({"cost": copied(problem.cost)}, problem.known)
+    return System(problem, found.X, found.U, found.multipliers.lam, at.active, at.give)
 
 
 def _values(live: Problem, at: Points, of: Residual) -> tuple[Tensor, ...]:
