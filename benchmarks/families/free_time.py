@@ -288,12 +288,12 @@ def races(stages: Sequence[int], margin: float, tracks: int, seed: int) -> str:
 
 
 def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> list[list[object]]:
-    """A row for each number of stages a leg, and two for the last aimed at where its flight shall be, and once more.
+    """A row for each number of stages a leg, and one for the last aimed at where its flight shall be.
 
     All but the first begin with the solution before. Batches: the worst.
     """
-    rows, before, spent, aims = list[list[object]](), None, 0.0, 0
-    for size in (*stages, stages[-1], stages[-1]):
+    rows, before, spent = list[list[object]](), None, 0.0
+    for size in (*stages, stages[-1]):
         problem, X0, U0 = race(size, gates, 0.3)
         solver, label = RACE, f"{problem.N}"
         if before is not None and size > before[0]:
@@ -301,9 +301,9 @@ def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> li
             solver = replace(RACE, initial_barrier=FINER)
         elif before is not None:
             began = time.process_time()
-            problem, X0, U0 = aimed(before[1], before[2], size, gates, 0.3 - margin)
-            spent, aims = spent + time.process_time() - began, aims + 1
-            solver, label = replace(RACE, initial_barrier=FINER), f"{problem.N}, aimed{' twice' * (aims > 1)}"
+            problem, X0, U0 = aimed(before[1], size, gates, 0.3 - margin)
+            spent += time.process_time() - began
+            solver, label = replace(RACE, initial_barrier=FINER), f"{problem.N}, aimed"
         solver.solve(problem, U0, X0=X0, max_seconds=1e-3)
         began = time.process_time()
         found = solver.solve(problem, U0, X0=X0)
@@ -315,7 +315,7 @@ def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> li
             f"{int(found.iterations.median())} ({int(found.iterations.max())})", f"{spent / problem.B:.2f}",
             *(f"{float(there[key].max()):.4f}" for key in ("gate", "end", "rate")),
         ])  # fmt: skip
-        before = size, found, problem
+        before = size, found
     return rows
 
 

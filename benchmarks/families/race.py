@@ -66,11 +66,7 @@ def rates(x: Tensor, u: Tensor) -> Tensor:
 
 
 def race(
-    stages: int,
-    gates: Tensor | None = None,
-    within: float = WITHIN,
-    rest: Tensor | None = None,
-    fastest: Tensor | None = None,
+    stages: int, gates: Tensor | None = None, within: float = WITHIN, rest: Tensor | None = None
 ) -> tuple[Problem, Tensor, Tensor]:
     """The race with so many stages a leg, and states and controls on straight lines at `PACE`.
 
@@ -78,7 +74,6 @@ def race(
         gates: (B, G, 3), m; None: those of the track.
         within: m, of each gate's centre.
         rest: (B, 6), position and velocity at the end; None: at rest at that of the track.
-        fastest: (B, 3), limits of the rates of turn, rad/s; None: those of the vehicle.
     """
     places = torch.tensor([GATES], dtype=D) if gates is None else gates
     (B, legs), ends = (len(places), places.shape[1] + 1), [torch.tensor(p, dtype=D) for p in (START, END)]
@@ -87,13 +82,11 @@ def race(
     at_knots = torch.zeros(B, N + 1, 3, dtype=D)
     at_knots[:, firsts] = places
     rest = torch.cat((ends[1], torch.zeros(3, dtype=D))).expand(B, -1) if rest is None else rest
-    fastest = torch.tensor(FASTEST, dtype=D).expand(B, -1) if fastest is None else fastest
-    free = torch.full((B, 10), math.inf, dtype=D)
     lengths = way.diff(dim=1).norm(dim=-1)
     dt = MEAN / PACE / stages  # of all tracks: with another one code would be compiled again
     rows = [
         ControlBounds(0.0, STRONGEST),
-        StateBounds(torch.cat((-free, -fastest), dim=1), torch.cat((free, fastest), dim=1)),
+        StateBounds([-math.inf] * 10 + [-w for w in FASTEST], [math.inf] * 10 + list(FASTEST)),
         FunctionConstraint(
             lambda x, place: (x[..., :3] - place).square().sum(-1, keepdim=True) - within**2,
             knots=firsts, name="gates", knot_values={"place": at_knots},
@@ -127,27 +120,37 @@ def finer(problem: Problem, coarse: Solution, factor: int) -> tuple[Problem, Ten
     return guessing_times(problem, within(t).squeeze(-1)), within(X), U
 
 
-def aimed(
-    solution: Solution, problem: Problem, stages: int, gates: Tensor, within: float
-) -> tuple[Problem, Tensor, Tensor]:
-    """The race again, with gates, end and rates moved by what the plan's flight misses, from the plan itself.
+def aimed(solution: Solution, stages: int, gates: Tensor, within: float) -> tuple[Problem, Tensor, Tensor]:
+    """The race again, with gates and end moved by what the plan's flight misses them, from the plan itself.
 
     The steps of the plan are longer than those of its flight, and open loop their errors add up over the race: at
     13 ms to some centimetres. What a flight misses changes little from this plan to the next, so the next one's flight
-    is closer to where it should be.
-
-    Args:
-        solution, problem: the plan, and the race that it is of.
+    is where it should be.
     """
-    flight = flown(solution, gates)
-    off = flight["off"]
+    off = drift(solution)[..., :6]
     moved = gates - off[:, stages::stages, :3][:, : gates.shape[1]]
-    rest = torch.tensor((*END, 0.0, 0.0, 0.0), dtype=D) - off[:, -1, :6]
-    limits = problem.constraints[1]
-    assert isinstance(limits, StateBounds)
-    slower = limits.upper[:, 10:] / (1.0 + flight["rate"].clamp(min=0.0).unsqueeze(-1))
-    again, _, _ = race(stages, moved, within, rest, slower)
-    return guessing_times(again, solution.t), solution.X, solution.U
+    rest = torch.tensor((*END, 0.0, 0.0, 0.0), dtype=D) - off[:, -1]
+    problem, _, _ = race(stages, moved, within, rest)
+    return guessing_times(problem, solution.t), solution.X, solution.U
+
+
+def drift(solution: Solution, dt: float = 1e-3) -> Tensor:
+    """How far flights are from their plans at the knots, (B, N+1, 13), to first order.
+
+    Each stage's own error is that of its step beside finer ones of about `dt`; by the model's derivatives along the
+    plan it is carried on to all later knots.
+    """
+    X, U, h = solution.X[:, :-1], solution.U, solution.t.diff(dim=1).unsqueeze(-1)
+    count = max(1, math.ceil(float(h.max()) / dt))
+    fine = X
+    for _ in range(count):
+        fine = stepped(fine, U, h / count)
+    own = fine - torch.cat((solution.X[:, 1:, :6], _unit(solution.X[:, 1:, 6:10]), solution.X[:, 1:, 10:]), dim=-1)
+    by_x = torch.func.vmap(torch.func.vmap(torch.func.jacfwd(stepped)))(X, U, h)
+    off = [torch.zeros_like(X[:, 0])]
+    for k in range(X.shape[1]):
+        off.append((by_x[:, k] @ off[-1].unsqueeze(-1)).squeeze(-1) + own[:, k])
+    return torch.stack(off, dim=1)
 
 
 def _unit(q: Tensor) -> Tensor:
@@ -167,14 +170,13 @@ def flown(solution: Solution, gates: Tensor, dt: float = 1e-3) -> dict[str, Tens
     """The plans flown open loop by RK4 at about `dt`, q renormalised at each step, as numbers (B,).
 
     `gate`: the largest of the smallest distances to the gates, each within 0.15 s of its knot, m; `end`: how far from
-    the end the flight ends, m; `rate`: by how much a rate of turn passes its limit, as a share; `off`: the flight's
-    states less the plan's at the knots, (B, N+1, 13).
+    the end the flight ends, m; `rate`: by how much a rate of turn passes its limit, as a share.
     """
     (B, N, _), legs = solution.U.shape, gates.shape[1] + 1
     stages, t = N // legs, solution.t
     x, nearest = solution.X[:, 0], torch.full((B, legs - 1), torch.inf, dtype=D)
     knots, rate = t[:, stages::stages][:, : legs - 1], torch.zeros(B, dtype=D)
-    count, off = max(1, math.ceil(float(t.diff(dim=1).max()) / dt)), [torch.zeros_like(x)]
+    count = max(1, math.ceil(float(t.diff(dim=1).max()) / dt))
     for k in range(N):
         h, u = (t[:, k + 1] - t[:, k]).unsqueeze(-1) / count, solution.U[:, k]
         for j in range(count):
@@ -182,6 +184,5 @@ def flown(solution: Solution, gates: Tensor, dt: float = 1e-3) -> dict[str, Tens
             away = (x[:, None, :3] - gates).norm(dim=-1)
             nearest = torch.where((now - knots).abs() < 0.15, torch.minimum(nearest, away), nearest)
             rate = torch.maximum(rate, (x[:, 10:].abs() / torch.tensor(FASTEST, dtype=D)).amax(-1) - 1.0)
-        off.append(x - solution.X[:, k + 1])
     end = (x[:, :3] - torch.tensor(END, dtype=D)).norm(dim=-1)
-    return {"gate": nearest.amax(-1), "end": end, "rate": rate, "off": torch.stack(off, dim=1)}
+    return {"gate": nearest.amax(-1), "end": end, "rate": rate}
