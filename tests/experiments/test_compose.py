@@ -126,10 +126,10 @@ def test_a_vehicle_is_chosen_by_its_name_and_gives_all_parts_its_size(tmp_path: 
     """Also one of a folder of one's own, which says what differs."""
     mine = tmp_path / "vehicle"
     mine.mkdir()
-    (mine / "racer.yaml").write_text("defaults: [paper, _self_]\nmass: 0.8\nthrust_max: 9.0\nradius: 0.2\n")
-    racer = build(compose_config(["vehicle=racer", "scenario=walls"], [f"file://{tmp_path}"]))
+    (mine / "mine.yaml").write_text("defaults: [paper, _self_]\nmass: 0.8\nthrust_max: 9.0\nradius: 0.2\n")
+    own = build(compose_config(["vehicle=mine", "scenario=walls"], [f"file://{tmp_path}"]))
     small = compose(["vehicle=crazyflie", "experiment=mission_unknown"])
-    for setup, mass, radius in ((racer, 0.8, 0.2), (small, 0.0319, 0.07)):
+    for setup, mass, radius in ((own, 0.8, 0.2), (small, 0.0319, 0.07)):
         frame = setup.vehicle.dynamics.airframe  # type: ignore[attr-defined]
         assert (frame.mass, frame.radius, setup.vehicle.radius) == (mass, radius, radius)
         assert setup.layouts(1).vehicle_radius == radius  # which obstacles are grown by, unless a command says another
@@ -140,7 +140,7 @@ def test_a_vehicle_is_chosen_by_its_name_and_gives_all_parts_its_size(tmp_path: 
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["vehicle=nano"], "vehicle: expected one of crazyflie, paper, got nano"),
+        (["vehicle=nano"], "vehicle: expected one of crazyflie, paper, racer, got nano"),
         (["vehicle.masse=1"], "vehicle.masse: expected a key that the configuration has, such as mass, got masse"),
         (["vehicle.mass=-1"], "vehicle.mass: expected a number above 0 kg, got -1"),
         (["vehicle.thrust_min=7"], "vehicle.thrust_min: expected less than thrust_max 6.0, got 7"),

@@ -194,7 +194,7 @@ def test_full_steps_near_the_circle_of_maratos(monkeypatch) -> None:
 def test_convergence_with_equalities_alone_is_quadratic(monkeypatch) -> None:
     problem, U0 = circle(torch.tensor([0.8], dtype=D))
     errors = []
-    monkeypatch.setattr(InteriorPoint, "no_worse", lambda self, call, end: end)
+    monkeypatch.setattr(InteriorPoint, "no_worse", lambda self, call, guess, end: end)
     for K in range(1, 12):
         u = solved(problem, U0, tolerance=1e-14, max_iterations=K).U[0, 0]
         errors.append(float(torch.linalg.vector_norm(u - torch.tensor([1.0, 0.0], dtype=D))))

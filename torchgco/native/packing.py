@@ -117,7 +117,12 @@ def _bounds(constraint: ControlBounds | StateBounds, problem: Problem) -> dict[s
 
 
 def _spheres(parts: Sequence[BoundSpheres]) -> dict[str, Any]:
-    joined = lambda rows: array(torch.cat([row.flatten(1) for row in rows], dim=-1), knots=False)
+    def joined(rows: list[Tensor]) -> c.Array:
+        """Of one part its own memory, which a compiled problem writes into."""
+        return array(
+            rows[0].flatten(1) if len(rows) == 1 else torch.cat([row.flatten(1) for row in rows], -1), knots=False
+        )
+
     squares = [marked(part.inflated_radii.square(), part.absent) for part in parts]
     own = {"bound": joined([part.centers for part in parts]), "squares": joined(squares)}
     velocities = [part.velocities for part in parts if part.velocities is not None]
