@@ -23,6 +23,7 @@ from torchgco.search.candidates import Candidates
 from torchgco.search.converge import mapped
 from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Follow, Free, Paths
+from torchgco.search.manoeuvres import manoeuvre
 from torchgco.search.proposals import Part
 from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
 from torchgco.search.row import Row
@@ -94,6 +95,10 @@ class Tube(Row):
                     pursue(search, some)
             rows = search.rows("unarrived")
         rows = rows[~search.steered[rows]]
+        if rows.numel() > 0 and not search.call.late:
+            manoeuvre(search, rows)
+            rows = search.rows("unarrived")
+            rows = rows[~search.steered[rows]]
         if rows.numel() == 0:
             return
         each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
