@@ -62,10 +62,9 @@ class _Wave:
         self.space, self.target = space, target
         self.poses, self.parents = [root[None]], [np.array([-1])]
         self.count = 1
-        self.seen = np.empty(0, np.int64)
         self.open: dict[int, list[tuple[Array, Array, Array, NDArray[np.int64]]]] = {}
         zero = np.zeros(1)
-        self.seen = self._cell(root[None], zero)
+        self.seen = set(self._cell(root[None], zero).tolist())
         self._push(root[None], zero, zero, np.zeros(1, np.int64))
 
     def expand(self) -> int | None:
@@ -88,12 +87,12 @@ class _Wave:
         cells = self._cell(new, ds)
         order = np.argsort(far, kind="stable")
         cells, first = np.unique(cells[order], return_index=True)
-        fresh = ~np.isin(cells, self.seen, assume_unique=True)
-        cells, some = cells[fresh], order[first[fresh]]
+        names = cells.tolist()
+        some = order[first[[cell not in self.seen for cell in names]]]
         if len(some) == 0:
             return None
         good = self.space.clear(new[some])
-        self.seen = np.union1d(self.seen, cells)
+        self.seen.update(names)
         some = some[good]
         if len(some) > 0:
             at = self.count + np.arange(len(some))
