@@ -12,16 +12,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.tree import LastTaken
+from torchgco.kernels import chord_clearance
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
+from torchgco.roadmap.scene import scales, scene_of
 from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
+from torchgco.search.chords import MARGIN
 from torchgco.search.directly import solved
 from torchgco.search.poses import STEP, Poses, clear_at
-from torchgco.search.proposals import Part
 from torchgco.search.steering import SAME, alike, heading_and_speed, sampled
 
+ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
 PACES = 0.6, 0.8, 1.0  # shares of the horizon in which a path is driven: each is a start of the interior point
 
 
@@ -69,28 +73,66 @@ def car(problem: Problem) -> Car | None:
     return Car(heading, speed, curvature, radius) if curvature > 0.0 and radius > 0.0 else None
 
 
-def manoeuvre(search: Search, rows: Tensor) -> None:
-    """Solve the problems in `rows` that are of cars with a body from manoeuvres; the best are kept."""
+def manoeuvre(search: Search) -> None:
+    """Solve the problems of cars with a body that haven't arrived, or touch between knots, from manoeuvres.
+
+    Where every trajectory from these touches between knots, too, they are solved again among obstacles that have grown.
+    """
+    if not any(isinstance(part, BoundBody) for part in search.call.problem.obstacles):
+        return
+    best, limit = search.best.end.best, search.solver.violation_tolerance
+    left = (best.violation <= limit) & (chord_clearance(search.call.problem, best.X) < 0.0)
+    left[search.rows("unarrived")] = True
+    rows = left.nonzero().flatten()
+    if rows.numel() == 0:
+        return
+    made = _made(search, rows)
+    if made is None:
+        return
+    rows, made = made
+    grown = torch.zeros_like(made.R[:: made.count])
+    for number in range(ROUNDS):
+        ends = solved(search, rows, made, grown if number > 0 else None)
+        good = ends.cost.isfinite()
+        clearance = torch.full_like(ends.cost, torch.inf)
+        some = good.nonzero().flatten()
+        clearance[some] = chord_clearance(made.of(some), ends.candidates.X[some])
+        lacks = torch.where(good, clearance, -torch.inf).view(-1, made.count).amax(1)
+        again = ((lacks < 0.0) & torch.isfinite(lacks)).nonzero().flatten()
+        if again.numel() == 0 or search.call.late:
+            return
+        grown = grown[again] - MARGIN * lacks[again]
+        rows, made = rows[again], take_problems(made, again)
+
+
+def take_problems(candidates: Candidates, rows: Tensor) -> Candidates:
+    """The candidates of the problems in `rows` alone."""
+    c = candidates
+    each = (rows.unsqueeze(1) * c.count + torch.arange(c.count, device=rows.device)).flatten()
+    problem = c.problem.take(rows)
+    return replace(
+        c, problem=problem, X=c.X[each], U=c.U[each], R=c.R[each], unit=c.unit[each], live=c.live[each],
+        number=c.number[each], iterations=torch.zeros_like(c.iterations[rows]), selected=LastTaken(problem),
+    )  # fmt: skip
+
+
+def _made(search: Search, rows: Tensor) -> tuple[Tensor, Candidates] | None:
+    """Those of the problems in `rows` that have manoeuvres, and these as candidates; None without any."""
     problem = search.call.problem.take(rows)
-    if not any(isinstance(part, BoundBody) for part in problem.obstacles):
-        return
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-    part = Part(problem.in_cost_units(), rest, search.call.rows[rows], search.record)
-    if part.scene is None or part.scene.gates is not None:
-        return
+    scene = scene_of(problem, rest)
+    if scene is None or scene.gates is not None:
+        return None
     found = [_driven(problem.take(torch.tensor([b], device=rows.device))) for b in range(problem.B)]
-    live = torch.tensor([one is not None for one in found], device=rows.device)
-    if not bool(live.any()):
-        return
-    search.best.worked[rows[live]] = True
-    R, unit = part.scales
-    U = rest.unsqueeze(1).repeat(1, len(PACES), 1, 1)
-    made = Candidates.begin(part.problem, U, R, unit, live.unsqueeze(1).expand(-1, len(PACES)))
-    X = problem.x0[:, None, None].repeat(1, len(PACES), problem.N + 1, 1)
-    for b, one in enumerate(found):
-        if one is not None:
-            X[b] = one
-    solved(search, rows, replace(made, X=X.flatten(0, 1)))
+    some = [b for b, one in enumerate(found) if one is not None]
+    if not some:
+        return None
+    at = torch.tensor(some, device=rows.device)
+    search.best.worked[rows[at]] = True
+    R, unit = scales(problem, scene, rest)
+    U, live = rest[at].unsqueeze(1).repeat(1, len(PACES), 1, 1), torch.ones_like(R[at].bool())
+    made = Candidates.begin(problem.take(at), U, R[at], unit[at], live.unsqueeze(1).expand(-1, len(PACES)))
+    return rows[at], replace(made, X=torch.cat([one for one in found if one is not None]))
 
 
 def _driven(problem: Problem) -> Tensor | None:

@@ -86,8 +86,11 @@ class Tube(Row):
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
+        if not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
+            return
+        manoeuvre(search)
         rows = search.rows("unarrived")
-        if rows.numel() == 0 or not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
+        if rows.numel() == 0:
             return
         if self.among == "maps":
             for some in rows.split(PURSUED_AT_ONCE):
@@ -95,10 +98,6 @@ class Tube(Row):
                     pursue(search, some)
             rows = search.rows("unarrived")
         rows = rows[~search.steered[rows]]
-        if rows.numel() > 0 and not search.call.late:
-            manoeuvre(search, rows)
-            rows = search.rows("unarrived")
-            rows = rows[~search.steered[rows]]
         if rows.numel() == 0:
             return
         each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
