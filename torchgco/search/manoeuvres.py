@@ -27,6 +27,7 @@ from torchgco.search.steering import SAME, alike, heading_and_speed, sampled
 
 ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
 PACES = 0.6, 0.8, 1.0  # shares of the horizon in which a path is driven: each is a start of the interior point
+DOES = f"a path of poses, forwards and backwards, at {len(PACES)} paces; interior point from each"
 
 
 @dataclass(frozen=True)
@@ -102,10 +103,10 @@ def manoeuvre(search: Search) -> None:
         if again.numel() == 0 or search.call.late:
             return
         grown = grown[again] - MARGIN * lacks[again]
-        rows, made = rows[again], take_problems(made, again)
+        rows, made = rows[again], _of_problems(made, again)
 
 
-def take_problems(candidates: Candidates, rows: Tensor) -> Candidates:
+def _of_problems(candidates: Candidates, rows: Tensor) -> Candidates:
     """The candidates of the problems in `rows` alone."""
     c = candidates
     each = (rows.unsqueeze(1) * c.count + torch.arange(c.count, device=rows.device)).flatten()

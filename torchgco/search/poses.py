@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.constraints.base import CONTACT_FACTOR
+from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
@@ -28,6 +29,7 @@ STEP = 0.5  # length of an arc in radii of the largest ball
 CELL = 0.6  # side of a cell as a share of an arc: each arc leaves its cell
 CUSP = 2.0  # arcs that a change between forwards and backwards costs: the vehicle stops and steers anew
 NEAR = 0.5  # arcs within which a pose counts as that at the end of the path
+AT_ONCE = 2048  # poses that are measured together: bounds the memory
 MOST = 400_000  # poses that are looked at, at most: bounds the time
 
 
@@ -141,24 +143,34 @@ def clear_at(problem: Problem, heading: int) -> Callable[[Array], NDArray[np.boo
     def clear(poses: Array) -> NDArray[np.bool_]:
         states = x0.unsqueeze(1).repeat(1, len(poses), 1)
         states[0, :, at], states[0, :, heading] = x0.new_tensor(poses[:, :2]), x0.new_tensor(poses[:, 2])
-        room = torch.stack([_room(part, states) for part in problem.obstacles]).amin(0)
-        return (room >= 0.0).cpu().numpy()
+        good = torch.ones(len(poses), dtype=torch.bool, device=x0.device)
+        for part in problem.obstacles:
+            for some in good.nonzero().flatten().split(AT_ONCE):
+                good[some] = _clear(part, states[:, some])
+        return good.cpu().numpy()
 
     return clear
 
 
-def _room(part: object, states: Tensor) -> Tensor:
-    """How far (K,), m, the vehicle in states (1, K, n) is from touching."""
-    balls = [(part, states[..., part.position].unsqueeze(2))]
-    if isinstance(part, BoundBody):
-        centers, sizes = part.points.at(states), [float(ball.vehicle_radius[0]) for ball in part.balls]
-        balls = [
-            (part.balls[sizes.index(size)], centers[:, :, [i for i, own in enumerate(sizes) if own == size]])
-            for size in dict.fromkeys(sizes)
-        ]
-    least = []
-    for ball, p in balls:
-        away = ball.signed_distance(p.flatten(1, 2), states.new_zeros(p.shape[1] * p.shape[2]))
-        away = (away + (1.0 - CONTACT_FACTOR) * ball.margins.unsqueeze(1))[0].amin(-1)
-        least.append(away.view(p.shape[1:3]).amin(-1))
-    return torch.stack(least).amin(0)
+def _clear(part: Obstacles, states: Tensor) -> Tensor:
+    """Whether the vehicle in states (1, K, n) touches none of some obstacles, (K,)."""
+    inner = _room(part.inscribed, states[..., part.position])
+    good = inner >= 0.0
+    if not isinstance(part, BoundBody):
+        return good
+    reach = float((part.points.offsets[0].norm(dim=-1) + part.radii[0]).max())
+    near = (good & (inner < reach - part.inner.vehicle_radius[0])).nonzero().flatten()  # others are clear anyhow
+    if near.numel() == 0:
+        return good
+    centers = part.points.at(states[:, near])
+    for size in part.radii[0].unique():
+        own = (part.radii[0] == size).nonzero().flatten()
+        ball, p = part.balls[int(own[0])], centers[:, :, own]
+        good[near] &= (_room(ball, p.flatten(1, 2)) >= 0.0).view(p.shape[1:3]).all(-1)
+    return good
+
+
+def _room(balls: Obstacles, p: Tensor) -> Tensor:
+    """How far (K,), m, a ball at points (1, K, d) is from touching obstacles."""
+    away = balls.signed_distance(p, p.new_zeros(p.shape[1]))[0]
+    return (away + (1.0 - CONTACT_FACTOR) * balls.margins).amin(-1)
