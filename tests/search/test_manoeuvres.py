@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from torchgco import (
 from torchgco.search.manoeuvres import car, timed
 from torchgco.search.poses import NEAR, Poses, clear_at
 
-WHEELBASE, STEERING, SLOT = 1.2, 0.6, 0.34
+WHEELBASE, STEERING = 1.2, 0.6
 BODY = Body([[0.0, 0.0], [0.6, 0.0], [1.2, 0.0]], 0.4)
 TIGHT = math.tan(STEERING) / WHEELBASE
 
@@ -37,15 +38,15 @@ def field(x: Tensor, u: Tensor) -> Tensor:
     return torch.stack((speed * heading.cos(), speed * heading.sin(), turn, u[..., 0], u[..., 1]), dim=-1)
 
 
-def corridor(starts: list[list[float]], vehicle=BODY, dynamics=None) -> Problem:
+def corridor(starts: list[list[float]], vehicle: Any = BODY, dynamics: Any = None) -> Problem:
     """Walls beside the x-axis from x = 3 on, between which the body fits with 5 cm on either side."""
     names = ("x", "y", "heading", "speed", "steering")
     model = dynamics or FunctionDynamics(field, 5, 2, 0.1, "rk4", slice(0, 2), state_names=names)
     n, wide = model.n, [math.inf] * 3
     walls = Boxes([[6.0, 3.45], [6.0, -3.45]], [[3.0, 3.0], [3.0, 3.0]], vehicle)
-    limits = [ControlBounds([-1.5, -1], [1.5, 1])]
+    limits: list[Any] = [ControlBounds([-1.5, -1], [1.5, 1])]
     if n == 5:
-        limits.append(StateBounds([-wide[0]] * 3 + [-2.0, -STEERING], [*wide, 3.0, STEERING]))
+        limits.append(StateBounds([-math.inf] * 3 + [-2.0, -STEERING], [*wide, 3.0, STEERING]))
     end = [7.0, 0.0, 0.0, 0.0, 0.0][:n]
     cost = QuadraticCost([0.01, 0.01, 0, 0.01, 0.01][:n], [0.1, 0.1], [10.0, 10, 1, 1, 1][:n], x_ref=end)
     x0 = torch.tensor([[*start, 0.0, 0.0][:n] for start in starts], dtype=torch.float64)
