@@ -46,7 +46,7 @@ def test_a_page_is_a_question_whose_answer_is_of_the_tables_below(file: Path) ->
     title, answer, *rest = file.read_text().split("\n\n")
     tables = re.findall(r"^<!-- (.*?) -->$(.*?)^<!-- end \1 -->$", "\n\n".join(rest), re.MULTILINE | re.DOTALL)
     assert title.startswith("# ") and title.endswith("?") and not answer.startswith(("Generated", "<!--"))
-    named, flown = re.findall(r"\bcommit (\w{7})\b", answer), re.findall(r"\bcommit (\w{7})\b", str(tables))
+    named, flown = re.findall(r"\bcommit (\w{7,10})\b", answer), re.findall(r"\bcommit (\w{7,10})\b", str(tables))
     assert set(named) & set(flown), f"the answer is of {named}, the tables are of {flown}"
 
 

@@ -227,6 +227,7 @@ class BoundBody(Obstacles):
     margins = property(lambda self: self._joined("margins"))  # type: ignore[assignment]
     sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
     moving = property(lambda self: self.inner.moving)  # type: ignore[assignment]
+    radii = property(lambda self: torch.stack([ball.vehicle_radius for ball in self.balls], dim=-1))  # (B, P), m
     calls_function = property(lambda self: self.points.attitude.calls_function)
 
     def __repr__(self) -> str:

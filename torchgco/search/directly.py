@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgco.base.status import Status
 from torchgco.base.tree import take
-from torchgco.kernels import chord_clearance
+from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.lagrangian.state import SolveEnd
@@ -39,10 +39,10 @@ def in_order(candidates: Candidates) -> Tensor:
     return order.gather(1, last.gather(1, order).argsort(dim=-1, stable=True))
 
 
-def solved(search: Search, rows: Tensor, chosen: Candidates) -> Refined:
+def solved(search: Search, rows: Tensor, chosen: Candidates, grown: Tensor | None = None) -> Refined:
     """Every chosen candidate solved; of each problem in `rows` the best that is feasible and arrives is kept.
 
-    None that steps over an obstacle from one knot to the next counts.
+    None that steps over an obstacle from one knot to the next counts. Obstacles have `grown` (b,), m, for the solves.
     """
     problem, limit = chosen.problem, search.solver.violation_tolerance
     finite = [torch.isfinite(part).flatten(1).all(-1) for part in (chosen.X, chosen.U)]
@@ -52,7 +52,12 @@ def solved(search: Search, rows: Tensor, chosen: Candidates) -> Refined:
     if some.numel() == 0:
         return Refined(chosen, multipliers, some.new_zeros(problem.B), cost)
     call = replace(search.call.take(rows[some // chosen.count]), U0=chosen.U[some], warm=None, callback=None)
-    end = solved_nearby(SOLVER, call, chosen.X[some])
+    if grown is None:
+        end = solved_nearby(SOLVER, call, chosen.X[some])
+    else:
+        larger = replace(call, problem=call.problem.grown(grown[some // chosen.count]))
+        end = solved_nearby(SOLVER, larger, chosen.X[some])
+        end = replace(end, best=replace(end.best, violation=measured(call.problem, end.best.X, end.best.U)))
     made = made.index_add(0, some // chosen.count, end.iterations)
     fits = ((end.best.violation <= limit) & has_arrived(call.problem, end.best.X)).nonzero().flatten()
     clear = cost.clone()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -65,8 +66,18 @@ class Steered:
     fastest: tuple[float, float]
 
 
-def steered(problem: Problem) -> Steered | None:
-    """The vehicle of a batch of one, by its equations at samples of states and controls; None of another kind."""
+class Sampled(NamedTuple):
+    """The equations of a batch of one at samples of states and controls."""
+
+    z: Tensor  # (1, SAMPLES, n + m)
+    box: tuple[Tensor, Tensor]  # (n + m,) each: where these lie
+    ends: tuple[Tensor, Tensor]  # (n + m,) each: the bounds, infinite without any
+    rates: Tensor  # (SAMPLES, n)
+    slopes: Tensor  # (SAMPLES, n, n + m)
+
+
+def sampled(problem: Problem) -> Sampled | None:
+    """None for vehicles that don't move in a plane by differential equations that are the same at all times."""
     model, at = problem.dynamics, problem.dynamics.position
     if at is None or at.stop - at.start != 2 or model.at(0) is not model or problem.m < 2:
         return None
@@ -84,7 +95,18 @@ def steered(problem: Problem) -> Steered | None:
     slopes = torch.stack([torch.cat(parts, dim=-1) for parts in each], dim=-2)[0]
     if not bool(torch.isfinite(slopes).all() & torch.isfinite(rates).all()):
         return None
-    places = _heading_and_speed(x[0], rates[:, at], slopes[:, at])
+    return Sampled(z, (low, high), (ends[0], ends[1]), rates, slopes)
+
+
+def steered(problem: Problem) -> Steered | None:
+    """The vehicle of a batch of one, by its equations at samples of states and controls; None of another kind."""
+    seen = sampled(problem)
+    if seen is None:
+        return None
+    z, (low, high), ends, rates, slopes = seen
+    n, at = problem.n, problem.position
+    x = z[..., :n]
+    places = heading_and_speed(x[0], rates[:, at], slopes[:, at])
     if places is None:
         return None
     heading, speed = places
@@ -94,12 +116,12 @@ def steered(problem: Problem) -> Steered | None:
         return None
     by_curvature = bool((slopes[:, heading, speed].abs() > SAME).any())
     tables = _tables(problem, z[:1, :1], low, high, heading, speed, (push, turn))
-    if tables is None or (by_curvature and not _alike(rates[:, heading], x[0, :, speed] * slopes[:, heading, speed])):
+    if tables is None or (by_curvature and not alike(rates[:, heading], x[0, :, speed] * slopes[:, heading, speed])):
         return None
     return Steered(heading, speed, *tables, by_curvature, (float(ends[0][speed]), float(ends[1][speed])))
 
 
-def _heading_and_speed(x: Tensor, velocity: Tensor, slopes: Tensor) -> tuple[int, int] | None:
+def heading_and_speed(x: Tensor, velocity: Tensor, slopes: Tensor) -> tuple[int, int] | None:
     """Places in the states x (S, n) where velocities (S, 2) are speed [cos heading, sin heading]; slopes (S, 2, n + m).
 
     The velocity turns with the heading and grows with the speed, by as much, and depends on nothing else.
@@ -109,7 +131,7 @@ def _heading_and_speed(x: Tensor, velocity: Tensor, slopes: Tensor) -> tuple[int
         return None
     for heading, speed in (depends, depends[::-1]):
         toward = torch.stack((x[:, heading].cos(), x[:, heading].sin()), dim=-1)
-        if _alike(velocity, x[:, speed, None] * toward):
+        if alike(velocity, x[:, speed, None] * toward):
             return heading, speed
     return None
 
@@ -140,7 +162,7 @@ def _tables(
     return made[0], made[1]
 
 
-def _alike(a: Tensor, b: Tensor) -> bool:
+def alike(a: Tensor, b: Tensor) -> bool:
     return bool((a - b).abs().amax() <= SAME * (1.0 + b.abs().amax()))
 
 

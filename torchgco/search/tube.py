@@ -23,6 +23,8 @@ from torchgco.search.candidates import Candidates
 from torchgco.search.converge import mapped
 from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Follow, Free, Paths
+from torchgco.search.manoeuvres import DOES as MANOEUVRES
+from torchgco.search.manoeuvres import manoeuvre
 from torchgco.search.proposals import Part
 from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
 from torchgco.search.row import Row
@@ -43,6 +45,7 @@ TOP = 8  # candidates of a problem that are solved, those of least cost as track
 class Tube(Row):
     """Tracks paths closely at several paces, solves the cheapest by the interior point, and keeps the best.
 
+    A car with a `Body` is solved from manoeuvres of its whole pose first (`manoeuvre`).
     In maps, a vehicle that drives along its heading is steered along ways that keep clear of them first (`pursue`).
     Where that doesn't arrive, and for all others, paths are tracked; among these is one that keeps clear of a map's
     obstacles, with its corners averaged. A vehicle that can turn on the spot follows each from rest and after either
@@ -81,12 +84,16 @@ class Tube(Row):
         if self.among == "maps":
             more, first = " and one that keeps clear", f"{DOES}; others, or without success: "
         tracked = f"{self.num_paths} paths{more}: {FOLLOW}, {PACES} paces"
-        return f"{first}{tracked}; not relaxed; interior point from the {TOP} cheapest"
+        cars = f"cars with a body: {MANOEUVRES}; without success, and others: "
+        return f"{cars}{first}{tracked}; not relaxed; interior point from the {TOP} cheapest"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
+        if not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
+            return
+        manoeuvre(search)
         rows = search.rows("unarrived")
-        if rows.numel() == 0 or not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
+        if rows.numel() == 0:
             return
         if self.among == "maps":
             for some in rows.split(PURSUED_AT_ONCE):
