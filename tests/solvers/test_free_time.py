@@ -222,9 +222,6 @@ def test_solvers_that_hold_the_time_are_refused() -> None:
         torchgco.compile(carts(B=1))
     with pytest.raises(InputError, match="solution: expected one of fixed times"):
         torchgco.solve(carts(B=1, N=20)).shifted()
-    x0 = torch.tensor([[1.0, 0.0]], dtype=D, requires_grad=True)
-    with pytest.raises(InputError, match="a free time"):
-        torchgco.solve(replace(carts(B=1), x0=x0))
 
 
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])

@@ -17,7 +17,7 @@ from torchgco.maps.lookup import Lattice, distances
 from torchgco.maps.points import PointCloud
 
 FINE = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
-NODES = 2**30  # of one field
+NODES, OF_CLOUDS = 2**30, 2**26  # of one field, and of one over clouds, whose distances are looked up one by one
 FAR = 1e6  # m: the distance where nothing is occupied
 MARGIN = 2  # nodes around the points of a cloud
 AT_ONCE = 2**17  # nodes whose distances are looked up together: Ctrl-C and SIGTERM wait for one such piece
@@ -226,7 +226,7 @@ def _of_cloud(cloud: PointCloud, unknown: Unknown, resolution: float | None) -> 
     origin = np.array([low - room for low, _ in ends])
     with np.errstate(over="ignore"):
         counts = np.max([np.ceil((high - low + 2 * room) / spacing) for low, high in ends], axis=0) + 1
-    _check_count(counts.tolist())
+    _check_count(counts.tolist(), OF_CLOUDS, "a larger radius, or `resolution`")
     shape = counts.astype(int)
     values = np.full((len(clouds), *shape), FAR, np.float32)
     for i, points in enumerate(clouds):
@@ -252,7 +252,7 @@ def _write_distances(points: np.ndarray, values: np.ndarray, origin: np.ndarray,
         values[i].reshape(-1)[part : part + AT_ONCE] = tree.query(places, workers=torch.get_num_threads())[0]
 
 
-def _check_count(counts: list[float]) -> None:
-    if np.prod(np.asarray(counts, float)) > NODES:
-        wanted = f"at most {NODES:,} nodes: cells that are larger, or `refine`"
+def _check_count(counts: list[float], most: int = NODES, way: str = "cells that are larger, or `refine`") -> None:
+    if np.prod(np.asarray(counts, float)) > most:
+        wanted = f"at most {most:,} nodes: {way}"
         raise InputError("field", wanted, " x ".join(f"{count:.0f}" for count in counts))

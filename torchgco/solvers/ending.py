@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.base.status import STALLED, UNMOVED, Status, is_over
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.kernels import cost_unit, kernels_of
-from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.lagrangian import Lagrangian, binding
 from torchgco.problem.problem import Problem
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
@@ -59,10 +59,13 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
-    hidden = (mu > 0) | _rounds(lagrangian, X, U)
-    if bool(hidden.any()):
-        saved = torch.where(hidden, torch.maximum(saved, _by_slopes(problem, run, U)), saved)
     cost = least_cost(problem) + (problem.cost.total(X, U) - constant_cost(problem)).abs()
+    rounds = _rounds(lagrangian, X, U)
+    if bool(((mu > 0) | rounds).any()):
+        sizes = _sizes(problem, U)
+        resists = 0.5 * mu * U.shape[1] * sizes.square().contiguous().sum(-1)  # what a change as large would cost by mu
+        hidden = (resists > STATIONARY * cost) | rounds
+        saved = torch.where(hidden, torch.maximum(saved, _by_slopes(problem, run, sizes)), saved)
     G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
     return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
 
@@ -71,23 +74,36 @@ def _rounds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
     """Where rounding of the rows' stiffness hides curvatures of the cost, (B,): states or controls have small units."""
     size = torch.cat((X.flatten(1), U.flatten(1)), dim=1).abs().amax(-1)
     stiffness = torch.finfo(X.dtype).eps * lagrangian.multipliers.mu * size.square()
-    return (stiffness > HIDES * cost_unit(lagrangian.problem)) & bool(lagrangian.problem.constraints)
+    hides = stiffness > HIDES * cost_unit(lagrangian.problem)
+    return hides & _binds(lagrangian, X, U) if bool(hides.any()) else hides
 
 
-def _by_slopes(problem: Problem, run: Callable[[Tensor], BackwardPass], U: Tensor) -> Tensor:
-    """The slopes of J_var + lam'c by the controls U (B, N, m), times these controls' size, summed, (B,).
+def _binds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
+    """Whether a row binds, (B,): others have no stiffness."""
+    found = torch.zeros_like(lagrangian.multipliers.mu, dtype=torch.bool)
+    for part, lam in zip(lagrangian.problem.constraints, lagrangian.multipliers.lam, strict=True):
+        found |= (binding(part.sense, part.value(X, U), lam) != 0).flatten(1).any(-1)
+    return found
 
-    Regularisation adds the same to the curvature of each control, whatever its units: where these are large, it hides
+
+def _sizes(problem: Problem, U: Tensor) -> Tensor:
+    """The size of each control, (B, m): the largest of U (B, N, m), or half the range of its bounds; 1 where all are 0."""
+    sizes, bounds = U.abs().amax(dim=1), problem.control_bounds
+    if bounds is not None:
+        half = 0.5 * bounds.range
+        sizes = torch.where(torch.isfinite(half), torch.maximum(sizes, half), sizes)
+    return torch.where(sizes > 0, sizes, 1.0)
+
+
+def _by_slopes(problem: Problem, run: Callable[[Tensor], BackwardPass], sizes: Tensor) -> Tensor:
+    """The slopes of J_var + lam'c by the controls, times these controls' sizes (B, m), summed, (B,).
+
+    Regularisation adds the same to the curvature of each control, whatever its units: where these are small, it hides
     what the controls could still save.
     """
     mu = STEEP * cost_unit(problem)
     slopes = run(mu).gains[..., -1].movedim(0, 1).abs() * mu.view(-1, 1, 1)
-    size = U.abs().amax(dim=1)
-    if problem.control_bounds is not None:
-        half = 0.5 * problem.control_bounds.range
-        size = torch.where(torch.isfinite(half), torch.maximum(size, half), size)
-    size = torch.where(size > 0, size, 1.0).unsqueeze(1)
-    return (slopes * size).contiguous().sum(-1).sum(-1)
+    return (slopes * sizes.unsqueeze(1)).contiguous().sum(-1).sum(-1)
 
 
 def constant_cost(problem: Problem) -> Tensor:
