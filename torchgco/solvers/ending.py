@@ -87,7 +87,7 @@ def _binds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _sizes(problem: Problem, U: Tensor) -> Tensor:
-    """The size of each control, (B, m): the largest of U (B, N, m), or half the range of its bounds; 1 where all are 0."""
+    """The size of each control, (B, m): the largest of U (B, N, m), or half its bounds' range; 1 where all are 0."""
     sizes, bounds = U.abs().amax(dim=1), problem.control_bounds
     if bounds is not None:
         half = 0.5 * bounds.range
