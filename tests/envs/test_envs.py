@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.engines import compiled
 from tests.missions.missions import far, mission, scene, varied
 from torchgco import Airframe, InputError, Problem
 from torchgco.missions import Disturbance, Flight, Outcome, RotorPlant
@@ -227,7 +228,9 @@ def _stepped(**options: Any) -> MissionVectorEnv:
     ("wrong", "field"),
     [
         (lambda: MissionVectorEnv(2, problem=varied(2, moving=True), mission=mission()), "problem.constraints"),
-        (lambda: MissionVectorEnv(2, problem=far(), mission=mission(sensor="lidar")), "mission"),
+        pytest.param(
+            lambda: MissionVectorEnv(2, problem=far(), mission=mission(sensor="lidar")), "mission", marks=compiled
+        ),
         (lambda: MissionVectorEnv(2, problem=far(), mission=mission(latency=1)), "mission"),
         (lambda: MissionVectorEnv(2, problem=scene(torch.zeros(1, 1, 3).double())), "problem.x0"),
         (lambda: MissionVectorEnv(0, problem=far()), "num_envs"),

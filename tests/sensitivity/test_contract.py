@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from tests.sensitivity.problems import B, D, along, asking, box_numbers, boxed, discs, numbers, solved, weights
 from torchgco import (
     ControlBounds,
@@ -30,6 +31,7 @@ def small(x0: Tensor, high: Tensor | float = 3.0) -> Solution:
     return torchgco.solve(Problem(MODEL, COST, [ControlBounds(-3.0, high)], x0, 10), verbose=False)
 
 
+@compiled
 def test_gradients_of_a_problem_do_not_depend_on_its_batch() -> None:
     th = numbers()
     leaves, whole = solved(discs, numbers)

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 import torchgco
+from tests.engines import compiled
 from tests.sensitivity.problems import D, along, discs, numbers, solved, weights
 from tests.sensitivity.test_contract import COST, MODEL, small
 from torchgco import ControlBounds, Goal, InputError, Problem, QuadraticCost
@@ -43,6 +44,7 @@ def test_jacobians_of_all_outputs_at_once_are_those_one_by_one(jacobian: Tensor)
     assert torch.equal(torch.autograd.grad(out, x0, basis, retain_graph=True, is_grads_batched=True)[0], jacobian)
 
 
+@compiled
 def test_products_with_tangents(jacobian: Tensor) -> None:
     want = torch.tensordot(jacobian, V, dims=2)
     _, twice = torch.autograd.functional.jvp(ends, X0, V)
@@ -58,6 +60,7 @@ def test_products_with_tangents(jacobian: Tensor) -> None:
     torch.testing.assert_close(ahead, jacobian, rtol=1e-12, atol=1e-12)
 
 
+@compiled
 def test_tangents_of_everything_that_a_problem_is_made_of() -> None:
     """In fields of all parts, in captured tensors and in weights of a net: products from both sides agree."""
     leaves, whole = solved(discs, numbers)
@@ -84,6 +87,7 @@ def test_forward_mode_needs_kernels_in_c() -> None:
         use_native(True)
 
 
+@compiled
 def test_smoothed_solutions_have_tangents() -> None:
     """Of the cost, too, which isn't at its minimum there."""
     leaf = X0.clone().requires_grad_()
@@ -96,6 +100,7 @@ def test_smoothed_solutions_have_tangents() -> None:
     assert tangent is not None and float(tangent.detach()) == pytest.approx(float((slope * V).sum()), rel=1e-9)
 
 
+@compiled
 def test_a_second_derivative_is_refused() -> None:
     x0 = torch.tensor([[1.0, 0.0]], dtype=D, requires_grad=True)
     found = small(x0)

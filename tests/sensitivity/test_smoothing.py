@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from tests.sensitivity.problems import D, Named, along, asking, boxed, discs, large_numbers, numbers, weights
 from torchgco import (
     ControlBounds,
@@ -136,6 +137,7 @@ def test_less_smoothing_is_nearer_to_the_solution() -> None:
     assert apart[0] > 5 * apart[1] > 25 * apart[2] > 0 and apart[2] < 1e-3
 
 
+@compiled
 def test_both_kernels_and_any_batch_give_the_same() -> None:
     th = numbers()
     leaves, whole = smoothed(discs, numbers)
@@ -185,6 +187,7 @@ def test_refused(smoothing: object) -> None:
         brake(torch.tensor([-4.0], dtype=D), smoothing)  # type: ignore[arg-type]
 
 
+@compiled
 def test_without_problems_and_in_inference_mode() -> None:
     one = Problem(MODEL, COST, [ControlBounds(-4.0, 5.0)], torch.zeros(1, 2, dtype=D), N)
     none = one.take(torch.zeros(0, dtype=torch.int64))
