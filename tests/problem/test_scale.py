@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -24,6 +25,8 @@ from torchgco import (
     presets,
 )
 from torchgco.costs.base import ShiftedCost
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.solvers.ending import optimality
 
 D = torch.float64
 
@@ -219,3 +222,18 @@ def test_a_row_is_small_whatever_the_size_of_other_states(solver: str, pressure:
         found = torchgco.solve(problem, solver=solver, verbose=False)
     claims = found.statuses[0] in (Status.CONVERGED, Status.FEASIBLE)
     assert not claims or any(issubclass(one.category, ScaleWarning) for one in said)
+
+
+@pytest.mark.filterwarnings("ignore:1 of 1 trajectories count as feasible")  # in single precision
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_slopes_are_numbers_in_any_precision(dtype: torch.dtype) -> None:
+    """What is left to save is measured by a regularisation as large as numbers can be: it must not overflow."""
+    weights = [[w] * 3 for w in (1e-6, 5e-6, 1e-5)]
+    parts = [FunctionConstraint(lambda u: u.sum(-1, keepdim=True), "equality", of="u"), ControlBounds(-200.0, 200.0)]
+    model = FunctionDynamics(lambda x, u: x + u, 3, 3, 1.0, "none")
+    cost = QuadraticCost(*weights, x_ref=[300.0, 500.0, 200.0])
+    problem = Problem(model, cost, parts, torch.tensor([[1000.0, 0.0, 0.0]], dtype=dtype), 10)
+    found = torchgco.solve(problem, solver="interior_point")
+    multipliers = replace(found.multipliers, mu=torch.full_like(found.cost, 1e12))  # stiffness that rounds
+    left = optimality(Lagrangian(problem, multipliers, None, True), found.X, found.U).left
+    assert bool(torch.isfinite(left).all()) and float(left) < 0.1

@@ -212,7 +212,7 @@ class FunctionConstraint(Constraint):
         except MISTAKES as error:
             got = why(error, one.value, *zeros)
             raise InputError(where, f"a function of {' and '.join(self.of)}", got) from theirs(error)
-        check_shape(rows, (1, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), "p"), where)
+        check_shape(rows, (1, count_of(knots, last + 1), "p"), where)
         if rows.dtype != dims.like.dtype:
             got = foreign(dims.like.dtype, one.value, *zeros) or str(rows.dtype)
             raise InputError(where, f"rows of {dims.like.dtype} as x0", got)

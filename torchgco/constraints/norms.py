@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, tensor
-from torchgco.constraints.base import Constraint, resolve_knots, whole
+from torchgco.constraints.base import Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
 AWAY = -1.0  # the row of a bound that one problem of a batch doesn't have
@@ -286,7 +286,7 @@ def _knots(knots: Any, kind: str, dims: Dimensions, field: str) -> tuple[slice |
     last = dims.N - 1 if kind == "u" else dims.N
     default = slice(0 if kind == "u" else 1, last + 1)
     found = resolve_knots(default if knots is None else knots, last, field, dims.like.device)
-    return found, len(range(last + 1)[found]) if isinstance(found, slice) else len(found)
+    return found, count_of(found, last + 1)
 
 
 def _per_knot(value: Any, field: str, dims: Dimensions, K: int) -> Tensor:

@@ -25,7 +25,6 @@ FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass
 HIDES = (
     0.1  # the error of a curvature by rounding, times the states' and controls' size squared, as a share of that unit
 )
-STEEP = 1e40  # the same of a pass whose steps are along the slopes, and so short that no stage feels another's
 
 
 def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
@@ -99,9 +98,10 @@ def _by_slopes(problem: Problem, run: Callable[[Tensor], BackwardPass], sizes: T
     """The slopes of J_var + lam'c by the controls, times these controls' sizes (B, m), summed, (B,).
 
     Regularisation adds the same to the curvature of each control, whatever its units: where these are small, it hides
-    what the controls could still save.
+    what the controls could still save. With as much as numbers can hold, squares included, steps are along the slopes,
+    and so short that no stage feels another's.
     """
-    mu = STEEP * cost_unit(problem)
+    mu = torch.finfo(sizes.dtype).max ** 0.5 * cost_unit(problem).clamp(max=1.0)
     slopes = run(mu).gains[..., -1].movedim(0, 1).abs() * mu.view(-1, 1, 1)
     return (slopes * sizes.unsqueeze(1)).contiguous().sum(-1).sum(-1)
 

@@ -48,7 +48,7 @@ def surfaces() -> np.ndarray:
     return np.concatenate([of_link, 0.7 * ball + [0, -2, 0]]) @ model.T + [1, -2, 0.5]
 
 
-def test_the_cells_of_a_world_are_those_near_its_bodies(tmp_path: Path) -> None:
+def test_the_cells_of_a_world_are_those_near_its_shapes(tmp_path: Path) -> None:
     (tmp_path / "yard.world").write_text(WORLD)
     grid, points = read(tmp_path / "yard.world", resolution=0.2), surfaces()
     assert isinstance(grid, OccupancyGrid)

@@ -12,7 +12,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError, shown
 from torchgco.maps.files.arrays import read_npy, read_npz
-from torchgco.maps.files.bodies import read_world
+from torchgco.maps.files.gazebo import read_world
 from torchgco.maps.files.images import read_image
 from torchgco.maps.files.las import read_las
 from torchgco.maps.files.layer import checked_layer, flat

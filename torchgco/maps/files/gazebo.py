@@ -17,8 +17,8 @@ from torchgco.maps.grid import OccupancyGrid
 
 WORLD = "a Gazebo world or model in SDF"
 MOST_XML = 2**24  # bytes
-MOST_BODIES = 2**14
-MOST_WORK = 2**29  # cells that are looked at, all bodies together
+MOST_SHAPES = 2**14
+MOST_WORK = 2**29  # cells that are looked at, all shapes together
 DEPTH = 16  # of models within models
 EMPTY = {"model://sun", "model://ground_plane"}  # what many worlds include, and nothing stands in the way of
 
@@ -36,7 +36,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Body:
+class Shape:
     """A box, or a cylinder or sphere, m: half its sides; `round` axes are measured together, as a radius."""
 
     frame: Frame
@@ -44,7 +44,7 @@ class Body:
     round: int  # 0: a box, 2: a cylinder along z, 3: a sphere
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distances (...) of points (..., 3) from the body, 0 inside, m."""
+        """Distances (...) of points (..., 3) from the shape, 0 inside, m."""
         p = (points - self.frame.t) @ self.frame.R
         beside = [np.linalg.norm(p[..., : self.round], axis=-1) - self.half[0]] if self.round else []
         beside += [np.abs(p[..., i]) - self.half[i] for i in range(self.round, 3)]
@@ -52,42 +52,42 @@ class Body:
 
     @property
     def reach(self) -> np.ndarray:
-        """Half the sides of the box along the axes that holds the body, (3,), m."""
+        """Half the sides of the box along the axes that holds the shape, (3,), m."""
         return self.half if self.round == 3 else np.abs(self.frame.R) @ self.half
 
 
 def read_world(source: Source, resolution: float | None) -> OccupancyGrid:
     """Cells whose centre lies within half a diagonal of a static model's box, cylinder or sphere are occupied.
 
-    So every cell that a body touches is, and some beside it. Planes, the sun and models that move are left out.
+    So every cell that a shape touches is, and some beside it. Planes, the sun and models that move are left out.
 
     Raises:
-        InputError: another file, no body, geometry of other kinds, models that are included from elsewhere, poses that
+        InputError: another file, no shape, geometry of other kinds, models that are included from elsewhere, poses that
             are relative to named frames.
     """
     source.needs("resolution", resolution, "the side of a cell, m")
     assert resolution is not None
-    bodies = list(_bodies(source, _root(source)))
-    if not bodies:
+    shapes = list(_shapes(source, _root(source)))
+    if not shapes:
         source.refuse(f"{WORLD} with a box, cylinder or sphere in a static model", "none")
-    source.limit(len(bodies), MOST_BODIES, "bodies")
-    ends = np.array([(body.frame.t - body.reach, body.frame.t + body.reach) for body in bodies])
+    source.limit(len(shapes), MOST_SHAPES, "shapes")
+    ends = np.array([(shape.frame.t - shape.reach, shape.frame.t + shape.reach) for shape in shapes])
     check_far(source, ends)
     near = 0.5 * math.sqrt(3.0) * resolution
     first, last = (np.floor((ends[:, i] + sign * near) / resolution).astype(np.int64) for i, sign in ((0, -1), (1, 1)))
-    low, shape = first.min(0), last.max(0) - first.min(0) + 1
+    low, sides = first.min(0), last.max(0) - first.min(0) + 1
     for count, most, what in (
-        (int(np.prod(shape, dtype=float)), MOST_CELLS, f"cells ({' x '.join(map(str, shape))})"),
-        (int(np.prod(last - first + 1.0, axis=-1).sum()), MOST_WORK, "cells around all bodies"),
+        (int(np.prod(sides, dtype=float)), MOST_CELLS, f"cells ({' x '.join(map(str, sides))})"),
+        (int(np.prod(last - first + 1.0, axis=-1).sum()), MOST_WORK, "cells around all shapes"),
     ):
         source.limit(count, most, what)
-    cells = np.zeros(tuple(shape), bool)
-    for body, begin, end in zip(bodies, first, last, strict=True):
-        for k in range(begin[2], end[2] + 1):  # layer by layer: a large body would take much memory
+    cells = np.zeros(tuple(sides), bool)
+    for shape, begin, end in zip(shapes, first, last, strict=True):
+        for k in range(begin[2], end[2] + 1):  # layer by layer: a large shape would take much memory
             axes = [resolution * (np.arange(a, b + 1) + 0.5) for a, b in zip(begin[:2], end[:2], strict=True)]
             points = np.stack(np.meshgrid(*axes, [resolution * (k + 0.5)], indexing="ij"), axis=-1)[:, :, 0]
             at = tuple(slice(a, b + 1) for a, b in zip((begin - low)[:2], (end - low)[:2], strict=True))
-            cells[(*at, k - low[2])] |= body.distance(points) <= near
+            cells[(*at, k - low[2])] |= shape.distance(points) <= near
     return made(source, cells, low * resolution, resolution)
 
 
@@ -102,7 +102,7 @@ def _root(source: Source) -> Element:
     return root
 
 
-def _bodies(source: Source, root: Element) -> Iterator[Body]:
+def _shapes(source: Source, root: Element) -> Iterator[Shape]:
     for world in root.findall("world") or [root]:
         for include in world.iter("include"):
             uri = (include.findtext("uri") or "").strip()
@@ -112,7 +112,7 @@ def _bodies(source: Source, root: Element) -> Iterator[Body]:
         yield from _of_models(source, world, Frame(np.eye(3), np.zeros(3)), static=False, depth=0)
 
 
-def _of_models(source: Source, parent: Element, frame: Frame, static: bool, depth: int) -> Iterator[Body]:
+def _of_models(source: Source, parent: Element, frame: Frame, static: bool, depth: int) -> Iterator[Shape]:
     if depth > DEPTH:
         source.refuse(f"models within models {DEPTH} deep at most", "more")
     for model in parent.findall("model"):
@@ -122,31 +122,31 @@ def _of_models(source: Source, parent: Element, frame: Frame, static: bool, dept
         for link in model.findall("link") if fixed else ():
             here = at.then(_pose(source, link))
             for collision in link.findall("collision"):
-                body = _body(source, collision.find("geometry"), here.then(_pose(source, collision)))
-                if body is not None:
-                    yield body
+                shape = _shape(source, collision.find("geometry"), here.then(_pose(source, collision)))
+                if shape is not None:
+                    yield shape
 
 
-def _body(source: Source, geometry: Element | None, frame: Frame) -> Body | None:
+def _shape(source: Source, geometry: Element | None, frame: Frame) -> Shape | None:
     """None of a plane, or of nothing."""
     shape = None if geometry is None else next(iter(geometry), None)
     if shape is None or shape.tag in ("plane", "empty"):
         return None
     if shape.tag == "box":
         half = 0.5 * np.array(_numbers(source, shape, "size", 3))
-        return Body(frame, _lengths(source, half), 0)
+        return Shape(frame, _lengths(source, half), 0)
     if shape.tag in ("sphere", "cylinder"):
         (radius,) = _numbers(source, shape, "radius", 1)
         if shape.tag == "sphere":
-            return Body(frame, _lengths(source, np.full(3, radius)), 3)
+            return Shape(frame, _lengths(source, np.full(3, radius)), 3)
         (length,) = _numbers(source, shape, "length", 1)
-        return Body(frame, _lengths(source, np.array([radius, radius, 0.5 * length])), 2)
-    return source.refuse("static bodies that are boxes, cylinders or spheres", f"<{shape.tag[:40]}>")
+        return Shape(frame, _lengths(source, np.array([radius, radius, 0.5 * length])), 2)
+    return source.refuse("static models of boxes, cylinders or spheres", f"<{shape.tag[:40]}>")
 
 
 def _lengths(source: Source, half: np.ndarray) -> np.ndarray:
     if not (half > 0).all():
-        source.refuse("bodies of sizes above 0 m", f"half sides {half.tolist()}")
+        source.refuse("shapes of sizes above 0 m", f"half sides {half.tolist()}")
     return half
 
 
