@@ -152,9 +152,9 @@ def timing(outputs: Path, alone: int, together: int) -> str:
         )
     batch = float(fly(TIMED[0], "gco", together, outputs)["seconds"].mean())
     text = [
-        "A period of 50 ms is missed where the planner and the tracker's five calls take longer; elapsed times. Planner and",
-        f"tracker take {np.mean(totals):.2f} s for a mission of the first row alone, {batch:.2f} s per mission in a batch",
-        f"of {min(together, AT_ONCE)}.",
+        "A period of 50 ms is missed where the planner and the tracker's five calls take longer; elapsed times.",
+        f"Planner and tracker take {np.mean(totals):.2f} s for a mission of the first row alone,",
+        f"{batch:.2f} s per mission in a batch of {min(together, AT_ONCE)}.",
     ]
     return "\n".join([markdown(head, rows), "", *text])
 
