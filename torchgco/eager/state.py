@@ -44,6 +44,7 @@ class State:
     scale: Tensor  # of the cost
     objective: Tensor  # 0 where feasibility alone is sought
     soft: Tensor  # delta_c
+    least_soft: Tensor  # the least one
     shift: Tensor  # delta_w
     theta: Tensor
     phi: Tensor
@@ -123,7 +124,7 @@ def blank(problem: Problem, X: Tensor, U: Tensor, z: Tensor) -> State:
     }  # fmt: skip
     made = {
         **own, "out": never, "fixes": never, "room": torch.ones_like(z), "relaxed": none, "mu": zero, "scale": one,
-        "objective": one, "soft": zero, "shift": zero, "theta": zero, "phi": zero, "highest": inf, "lowest": zero,
+        "objective": one, "soft": zero, "least_soft": zero, "shift": zero, "theta": zero, "phi": zero, "highest": inf, "lowest": zero,
         "filter": X.new_full((b, PAIRS, 2), torch.inf), "last": zero, "forced": zero, "entered": zero, "slope": zero,
         "alpha": zero, "least": inf, "left": inf, "idle": count, "made": count, "failures": count, "shortened": count,
         "ahead": count, "restoring": no, "crawls": no, "rows_relaxed": no, "presses": no, "watching": no,

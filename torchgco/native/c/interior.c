@@ -24,16 +24,20 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     for (int l = 0; l < LANES; l++) if (of[l]) k->pairs[l] = 0;
 }
 
-/* The largest slope or curvature of the cost in any one variable. */
-static V steepest(const Barrier *t) {
+/* The largest slope or curvature of the cost in any one variable, and the largest curvature. */
+static V steepest(const Barrier *t, V *curvature) {
     const Lanes *s = &t->lanes;
     V largest = SET(0.0), g[S], H[S * S];
+    *curvature = SET(0.0);
     for (int64_t k = 0; k <= s->of->N; k++) {
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
         cost_expand(s, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, g, H);
-        for (int i = 0; i < S; i++) largest = most(most(tgco_fabs(g[i]), tgco_fabs(H[i * S + i])), largest);
+        for (int i = 0; i < S; i++) {
+            largest = most(tgco_fabs(g[i]), largest);
+            *curvature = most(tgco_fabs(H[i * S + i]), *curvature);
+        }
     }
-    return largest;
+    return most(largest, *curvature);
 }
 
 /* The barrier parameter at which lane l begins: at least that at which it ends, where the barrier stays. */
@@ -44,7 +48,7 @@ static double first_barrier(const Barrier *t, int l) {
 
 /* Lanes `of` have just been loaded: the scale of their cost, slacks and multipliers. */
 static void begin(Barrier *t, Track *k, I of) {
-    V one = SET(1.0), zero = SET(0.0), largest;
+    V one = SET(1.0), zero = SET(0.0), largest, curvature;
     const Interior *how = t->how;
     const Problem *p = t->lanes.of;
     t->scale = tgco_choose(of, one, t->scale);
@@ -57,7 +61,6 @@ static void begin(Barrier *t, Track *k, I of) {
     k->restoring &= ~of; k->watching &= ~of;
     k->relaxed &= ~of; k->presses &= ~of;
     if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
-    t->soft = tgco_choose(of, SET(how->soft), t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
@@ -65,9 +68,15 @@ static void begin(Barrier *t, Track *k, I of) {
             for (int l = 0; l < LANES; l++)
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
-    largest = steepest(t);
+    largest = steepest(t, &curvature);
     V scale = SET(how->steepest) / largest;
     t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
+    /* Beside rows of stiffness 1 / soft, a slight curvature of the cost is lost in rounding. A cost without any has that
+       of the barrier. */
+    V share = SET(how->slight) / (t->scale * curvature), soft = SET(how->soft);
+    V softer = least(most(share * soft, soft), SET(how->softest));
+    k->least_soft = tgco_choose(of, tgco_choose(finite(share), softer, soft), k->least_soft);
+    t->soft = tgco_choose(of, k->least_soft, t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
     if (how->warm) {
@@ -294,7 +303,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     V higher = tgco_choose(t->shift > floor, SET(how->recovery_growth) * t->shift, most(floor, k->last));
     lower = tgco_if(lower >= floor, lower);
     k->forced = tgco_choose(won & ~k->restoring, tgco_choose(k->crawls, higher, lower), k->forced);
-    t->soft = tgco_choose(won, most(SET(how->soft), SET(how->soft_decay) * t->soft), t->soft);
+    t->soft = tgco_choose(won, most(k->least_soft, SET(how->soft_decay) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
     for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l] && k->forced[l] == 0) k->failures[l] = 0;
     for (int l = 0; l < LANES; l++) if (moving[l] && !won[l] && small[l]) { status[l] = CONVERGED; ended[l] = -1; }

@@ -9,6 +9,7 @@ typedef struct {
     V theta, phi, highest, lowest, last, forced, made, entered, slope, alpha;
     V least, idle; /* the smallest error of the end test so far, and the iterations since it fell by half */
     V left;        /* the smallest complementarity so far, of those that counted */
+    V least_soft;  /* of a lane's cost */
     Pair filter[LANES][PAIRS];
     int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
     I restoring, crawls, relaxed; /* relaxed: the rows are */
