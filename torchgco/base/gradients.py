@@ -6,11 +6,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import is_dataclass
+from types import FunctionType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn import Parameter
 
 _recording: ContextVar[bool] = ContextVar("recording", default=False)
 
@@ -53,13 +56,19 @@ def is_recording() -> bool:
     return _recording.get()
 
 
+# Types of most leaves, which hold nothing: a problem has some hundred, and each solve looks at them.
+_PLAIN = frozenset((Tensor, Parameter, np.ndarray, int, float, bool, str, FunctionType, type(None)))
+
+
 def leaves(tree: Any) -> list[Any]:
     """All that nested sequences, mappings and dataclasses hold, but for these themselves."""
     found: list[Any] = []
     waiting, seen = [tree], set[int]()
     while waiting:
         part = waiting.pop()
-        if not isinstance(part, (Mapping, tuple, list)) and (isinstance(part, type) or not is_dataclass(part)):
+        if type(part) in _PLAIN:
+            found.append(part)
+        elif not isinstance(part, (Mapping, tuple, list)) and (isinstance(part, type) or not is_dataclass(part)):
             found.append(part)
         elif id(part) not in seen:  # parts may hold each other
             seen.add(id(part))
