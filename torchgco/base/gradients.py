@@ -66,14 +66,17 @@ def leaves(tree: Any) -> list[Any]:
     waiting, seen = [tree], set[int]()
     while waiting:
         part = waiting.pop()
-        if type(part) in _PLAIN:
-            found.append(part)
-        elif not isinstance(part, (Mapping, tuple, list)) and (isinstance(part, type) or not is_dataclass(part)):
+        holds = type(part) not in _PLAIN and (isinstance(part, (Mapping, tuple, list)) or _is_made(part))
+        if not holds:
             found.append(part)
         elif id(part) not in seen:  # parts may hold each other
             seen.add(id(part))
             waiting += [held for _, held in _parts(part)]
     return found
+
+
+def _is_made(part: Any) -> bool:
+    return is_dataclass(part) and not isinstance(part, type)
 
 
 def asking(tree: Any) -> list[Tensor]:

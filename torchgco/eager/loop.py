@@ -19,6 +19,7 @@ from torchgco.eager.fixed import (
     join_multipliers,
     readmit,
     relax,
+    soften_rows,
     sort_rows,
     split_multipliers,
 )
@@ -102,20 +103,16 @@ def _of_rows(problem: Problem, X: Tensor, flags: list[bool]) -> Tensor:
 def begin(kinds: Kinds, model: Model, t: State) -> None:
     """The scale of the cost, slacks and multipliers."""
     how = kinds.how
+    t.soft = torch.full_like(t.mu, how.soft)
     slopes, H = model.cost_model(t.X, t.U)
     curvature = H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1)
     largest = torch.maximum(slopes.abs().flatten(1).amax(-1), curvature)
     scale = how.steepest / largest
     t.scale = torch.where(torch.isfinite(scale) & (largest > 0.0), scale, t.scale)
-    # Beside rows of stiffness 1 / soft, a slight curvature of the cost is lost in rounding. A cost without any has that
-    # of the barrier.
-    share = how.slight / (t.scale * curvature)
-    softer = (how.soft * share).clamp(min=how.soft, max=how.softest)
-    t.least_soft = torch.where(torch.isfinite(share), softer, how.soft)
-    t.soft = t.least_soft.clone()
     t.mu = first_barrier(kinds, t)
     settle(kinds, model, t)
     sort_rows(kinds, model, t)
+    soften_rows(kinds, model, t, t.scale.view(-1, 1, 1) * H.diagonal(dim1=-2, dim2=-1).abs())
     t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
     remeasure(kinds, t)
     if not how.warm:
@@ -194,7 +191,7 @@ class _Loop:
         won = search(kinds, self.model, t, step, moving, tau)
         t.made = t.made + running.to(t.made.dtype)
         self._remember_shift(won)
-        t.soft = torch.where(won, torch.maximum(how.soft_decay * t.soft, t.least_soft), t.soft)
+        t.soft = torch.where(won, (how.soft_decay * t.soft).clamp(min=how.soft), t.soft)
         t.failures = torch.where(won & ~t.restoring & (t.forced == 0.0), 0, t.failures)
         status[:] = torch.where(moving & ~won & small, int(Status.CONVERGED), status)
         lost = self._recover(moving & ~won & ~small)

@@ -61,6 +61,7 @@ static void begin(Barrier *t, Track *k, I of) {
     k->restoring &= ~of; k->watching &= ~of;
     k->relaxed &= ~of; k->presses &= ~of;
     if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
+    t->soft = tgco_choose(of, SET(how->soft), t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
@@ -71,14 +72,9 @@ static void begin(Barrier *t, Track *k, I of) {
     largest = steepest(t, &curvature);
     V scale = SET(how->steepest) / largest;
     t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
-    /* Beside rows of stiffness 1 / soft, a slight curvature of the cost is lost in rounding. A cost without any has that
-       of the barrier. */
-    V share = SET(how->slight) / (t->scale * curvature), soft = SET(how->soft);
-    V softer = least(most(share * soft, soft), SET(how->softest));
-    k->least_soft = tgco_choose(of, tgco_choose(finite(share), softer, soft), k->least_soft);
-    t->soft = tgco_choose(of, k->least_soft, t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
+    soften_rows(t, of, t->scale * curvature);
     if (how->warm) {
         if (t->some_out) join_multipliers(t, of);
         ROWS(t, 0, {
@@ -303,7 +299,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     V higher = tgco_choose(t->shift > floor, SET(how->recovery_growth) * t->shift, most(floor, k->last));
     lower = tgco_if(lower >= floor, lower);
     k->forced = tgco_choose(won & ~k->restoring, tgco_choose(k->crawls, higher, lower), k->forced);
-    t->soft = tgco_choose(won, most(k->least_soft, SET(how->soft_decay) * t->soft), t->soft);
+    t->soft = tgco_choose(won, most(SET(how->soft), SET(how->soft_decay) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
     for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l] && k->forced[l] == 0) k->failures[l] = 0;
     for (int l = 0; l < LANES; l++) if (moving[l] && !won[l] && small[l]) { status[l] = CONVERGED; ended[l] = -1; }
