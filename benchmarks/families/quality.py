@@ -19,7 +19,7 @@ import pandas as pd
 from benchmarks.lib import ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, FAMILIES, Family
-from benchmarks.lib.page import INTERVALS, interval, machine, markdown, origin, put, share, shown
+from benchmarks.lib.page import INTERVALS, crossed, filed, interval, machine, markdown, origin, put, share, shown
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.judging.judge import SUCCESS_VIOLATION
@@ -35,12 +35,17 @@ HEAD = (
     "median seconds",
 )  # fmt: skip
 
+SHORT = ("Success", "Reached", "Median seconds")  # of several solvers
+
 
 def main(words: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(words)
     trials = pd.concat([fly(EVERY[name], asked) for name in asked.families], ignore_index=True)
     text = table(trials)
     print(text)
+    if len(asked.solvers) > 1:
+        parts = (crossed(text, "family", "solver", cell) for cell in ("success", "reached", "median seconds"))
+        text = filed("ladder", text, *(f"{title}:\n\n{part}" for title, part in zip(SHORT, parts, strict=True)))
     if set(asked.families) == set(FAMILIES) and asked.write:
         name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}, shared and busy."
         put(ROOT / "benchmarks" / PAGES[name], name, f"{head}\n\n{text}")

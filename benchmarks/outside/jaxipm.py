@@ -19,7 +19,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib import comparison as lib
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import markdown
+from benchmarks.lib.page import filed, markdown
 from benchmarks.outside.jaxipm_ipopt import Ipopt
 from benchmarks.outside.jaxipm_problems import SCENARIOS, Scenario, spread
 from torchgco import InteriorPoint, Status
@@ -148,7 +148,7 @@ def tables(instances: int, ipopt: int, scenarios: Sequence[str]) -> str:
         flights = [*by_torchgco(scenario, places), *by_ipopt(scenario, places[spread(len(places), few)])]
         rows += [[column(each, flights[2]) for _, column in COLUMNS] for each in flights]
         rates.append(_beside(scenario.name, dict(zip((INTERIOR, DEFAULT, MX, SX), flights, strict=True))))
-    return "\n\n".join((markdown([name for name, _ in COLUMNS], rows), markdown(HEAD, rates)))
+    return filed("jaxipm", markdown([name for name, _ in COLUMNS], rows), markdown(HEAD, rates))
 
 
 HEAD = [

@@ -20,7 +20,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib import comparison as lib
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import INTERVALS
+from benchmarks.lib.page import INTERVALS, chosen, filed
 from benchmarks.outside.navigation_problem import fan, line_guess, navigation, recount
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
@@ -55,6 +55,10 @@ COMPARISON = lib.Comparison(counted, [
     ("times IPOPT, one core", times("alone")),
     ("two cores", times("shared")),
 ])  # fmt: skip
+SHOWN = (
+    "fan", "solver", "violation <= 1e-4", "cost, share of IPOPT's: least, median, largest",
+    "problems per second, one core", "times IPOPT, one core",
+)  # fmt: skip
 
 
 def default(problem: Problem, ids: Tensor) -> Callable[[], Solution]:
@@ -137,7 +141,8 @@ def table(starts: int, sectors: Sequence[float]) -> str:
     for sector in sectors:
         flights = [fly(name, sector, starts) for name in SOLVERS]
         rows += COMPARISON.rows(flights, flights[-1])
-    return COMPARISON.table(rows)
+    whole = COMPARISON.table(rows)
+    return filed("navigation", whole, chosen(whole, SHOWN))
 
 
 main = Command(
