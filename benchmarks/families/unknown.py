@@ -136,7 +136,7 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
 
 def short(name: str, table: str, misses: str) -> str:
     """Both tables as files, and some columns of the first."""
-    few = chosen(table, (*HEAD[:5], "safe periods", "flight time", "clearance", "above 50 ms"))
+    few = chosen(table, (*HEAD[:5], "flight time", "clearance"))
     missed = filed(f"{name}-misses", misses) if misses.startswith("|") else misses
     return f"{filed(name, table, few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
 

@@ -56,7 +56,8 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def short(name: str, table: str) -> str:
     """The table as a file; in the page the rows of `gco`, and how many layouts each solver reaches."""
-    return filed(name, table, chosen(table, OWN, solver=("`gco`",)), crossed(table, "world", "solver", "reached"))
+    reached = crossed(table, "world", "solver", "reached")
+    return filed(name, table, *([] if "drawn" in name else [chosen(table, OWN, solver=("`gco`",))]), reached)
 
 
 def _parser() -> ArgumentParser:

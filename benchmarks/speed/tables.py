@@ -53,7 +53,7 @@ WORDS = {
 }
 
 # What the page shows of a section: quantities, the only solver (empty: all), and the form: a column per quantity
-# (empty), the quantities in one column (list), or one quantity with a row per case (case) or per solver (solver).
+# (empty), or one quantity with a row per case (case) or per solver (solver).
 SHOWN = {
     "targets": [(("time", "FATROP", "acados", "pytorch-mppi"), "", "")],
     "families": [
@@ -65,17 +65,18 @@ SHOWN = {
     "swing_up": [(("median", "99 %", "first period", "up"), "", "")],
     "learned": [
         (("first solve, nothing built", "first solve, solver's objects built"), "", ""),
-        (("an iteration", "training step, median", "first solve"), "", "list"),
+        (("an iteration",), "", "case"),
+        (("training step, median",), "", "case"),
+        (("first solve",), "", "case"),
     ],
     "own_model": [(("seconds per problem", "reached", "median cost"), "", "")],
-    "paper": [(("all", "reached"), "", "")],
     "mppi": [(("per round",), "", "case")],
-    "first_use": [(("seconds", "both"), "", "")],
+    "first_use": [(("seconds",), "", "case"), (("both",), "", "case")],
     "share": [(("sum",), "", "solver")],
-    "batch": [(("per problem", "memory per problem"), "", "")],
+    "batch": [(("per problem",), "", "solver"), (("memory per problem",), "", "solver")],
     "scaling": [(("seconds per problem",), "", "case")],
-    "growth": [(("per problem and iteration",), "", "case")],
 }
+LEFT_OUT = ("paper", "cores", "growth")  # of the page: the file alone has them
 
 
 def section_text(rows: list[Row]) -> str:
@@ -91,30 +92,23 @@ def form_of(rows: list[Row], form: str) -> str:
     """One table of these rows."""
     if form == "":
         return section_table(rows)
-    if form == "list":
-        return markdown(["case", "solver", "measured"], [
-            [case, f"`{solver}`", "; ".join(f"{_head(row)}: {_rounded(row['value'])}" for row in own)]
-            for (case, solver), own in _grouped(rows).items()
-        ])  # fmt: skip
     long = [[row["case"], f"`{row['solver']}`", _rounded(row["value"])] for row in rows]
     table = markdown(["case", "solver", "value"], long)
-    return crossed(table, form, "solver" if form == "case" else "case", "value")
-
-
-def _grouped(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:
-    found: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        found.setdefault((row["case"], row["solver"]), []).append(row)
-    return found
+    table = crossed(table, form, "solver" if form == "case" else "case", "value")
+    return table.replace(f"| {form} |", f"| {_head(rows[0])} |", 1)
 
 
 def section_table(rows: list[Row]) -> str:
-    """A Markdown table: a row per case and solver, a column per quantity, in the order of measurement."""
+    """A Markdown table: a row per case and solver, a column per quantity, in the order of measurement.
+
+    The column of solvers is left out where there is one.
+    """
     lines = dict.fromkeys((row["case"], row["solver"]) for row in rows)
     heads = dict.fromkeys(_head(row) for row in rows)
     cells = {(row["case"], row["solver"], _head(row)): _rounded(row["value"]) for row in rows}
     values = ([case, f"`{solver}`", *(cells.get((case, solver, head), "") for head in heads)] for case, solver in lines)
-    return markdown(["case", "solver", *heads], values)
+    one = len({solver for _, solver in lines}) == 1
+    return markdown(["case", *["solver"] * (not one), *heads], ([v[0], *v[1 + one :]] for v in values))
 
 
 def _rounded(value: str) -> str:
@@ -148,7 +142,7 @@ def _device_text(rows: list[Row]) -> str:
     """Tables of one device; a line on the source precedes a section where it differs from the section before."""
     blocks, before = [], ""
     present = {row["section"] for row in rows}
-    for section in [name for name in WORDS if name in present]:
+    for section in [name for name in WORDS if name in present and name not in LEFT_OUT]:
         own = [row for row in rows if row["section"] == section]
         source = _source(own[0])
         blocks += [source] if source != before else []
