@@ -37,11 +37,11 @@ def text(flights: pd.DataFrame, peers: pd.DataFrame, families: Sequence[Family],
     references = references_of(peers)
     known = flights.merge(references[[*KEY, "best", "rest"]], on=KEY, how="left")
     every = [known, *peer_flights(references)]
-    sets = set_table(every, families)
+    sets, optima = set_table(every, families), known_table(known, references, families, seed)
     mine = chosen(sets, SHOWN, solver=[*dict.fromkeys(flights.solver)])
     parts = [
         ("Sets", filed("general-sets", sets, mine, chosen(sets, SHOWN, set=("all",), solver=(REST, BEST, FATROP)))),
-        ("Known optima", known_table(known, references, families, seed)),
+        ("Known optima", optima and filed("general-known", optima)),
         ("Statuses", honesty_table(known)),
         ("Families", filed("general-families", family_table(known, references, families, seed))),
     ]

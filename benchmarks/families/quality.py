@@ -2,7 +2,7 @@
 
 Every family and solver is a separate study below outputs/quality, so that a run that was stopped resumes where it
 was. The table is printed. With --write, and where all families flew, it is put into its page with date and commit: the
-table of `gco` alone into benchmarks/README.md, drawn layouts into results/drawn.md, several solvers into
+table of `gco` alone into benchmarks/README.md, drawn layouts and several solvers into
 results/ladder.md, unless --page names another page.
 """
 
@@ -28,14 +28,14 @@ from torchgco.scenarios import Layouts
 PAGES = {
     "quality": "README.md",
     "ladder": "results/ladder.md",
-    "drawn": "results/drawn.md",
+    "drawn": "results/ladder.md",
 }  # below benchmarks/; a table is between the marks of its name
 HEAD = (
     "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "median iterations",
     "median seconds",
 )  # fmt: skip
 
-SHORT = ("Success", "Reached", "Median seconds")  # of several solvers
+SHORT = ("Success", "Median seconds")  # of several solvers
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -44,7 +44,7 @@ def main(words: Sequence[str] | None = None) -> int:
     text = table(trials)
     print(text)
     if len(asked.solvers) > 1:
-        parts = (crossed(text, "family", "solver", cell) for cell in ("success", "reached", "median seconds"))
+        parts = (crossed(text, "family", "solver", cell) for cell in ("success", "median seconds"))
         text = filed("ladder", text, *(f"{title}:\n\n{part}" for title, part in zip(SHORT, parts, strict=True)))
     if set(asked.families) == set(FAMILIES) and asked.write:
         name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}, shared and busy."

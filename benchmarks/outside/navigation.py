@@ -2,7 +2,7 @@
 
 Both solvers run in worker processes with one thread each, one worker, then two that share the starts. IPOPT has the
 published guess and options. All results are judged by `recount`, in NumPy. With --write the table goes into
-benchmarks/results/navigation.md.
+benchmarks/results/jaxipm.md.
 """
 
 from __future__ import annotations
@@ -146,8 +146,9 @@ def table(starts: int, sectors: Sequence[float]) -> str:
 
 
 main = Command(
-    __doc__, "navigation", table,
+    __doc__, "jaxipm", table,
     "{starts} starts per fan, processor time without set-up, one thread per process", "CasADi", INTERVALS,
+    mark="navigation",
     starts=(500, "starts per fan"), sectors=([90.0, 180.0], "widths of the fans, degrees"),  # as published
 )  # fmt: skip
 
