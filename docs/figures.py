@@ -84,18 +84,8 @@ def tables() -> str:
     plane, space = (presets.gco(dimension).table().reset_index().iloc[:, :4] for dimension in (2, 3))
     lines = [space.columns.tolist(), ["---"] * len(space.columns)]
     for a, b in zip(plane.values.tolist(), space.values.tolist(), strict=True):
-        lines.append([_both(str(x), str(y)) for x, y in zip(a, b, strict=True)])
+        lines.append([x if x == y or y == "" else f"{x} / {y}" if x else y for x, y in zip(a, b, strict=True)])
     return "\n".join(f"|{'|'.join(map(str, line))}|" for line in lines)
-
-
-def _both(a: str, b: str) -> str:
-    """A cell for the plane and one for space; of cells of as many parts only the parts that differ."""
-    if a == b or "" in (a, b):
-        return a or b
-    left, right = a.split("; "), b.split("; ")
-    if len(left) != len(right):
-        return f"{a} / {b}"
-    return "; ".join(x if x == y else f"{x} / {y}" for x, y in zip(left, right, strict=True))
 
 
 def with_tables(text: str) -> str:
