@@ -17,7 +17,7 @@ import pandas as pd
 import torch
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import markdown, put, put_between
+from benchmarks.lib.page import chosen, filed, markdown, put, put_between
 from benchmarks.lib.provenance import provenance
 from torchgco import compose
 from torchgco.experiments.statistics.statistics import wilson
@@ -114,6 +114,13 @@ def table(trials: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
+def short(table: str, misses: str) -> str:
+    """Both tables as files, and some columns of the first."""
+    said, _, missed = misses.partition("\n\n")
+    few = chosen(table, [name for name in HEAD if name not in ("DIVERGED", "kept plans")])
+    return f"{filed('missions', table, few)}\n\n{said}\n\n{filed('missions-misses', missed) if missed else ''}".rstrip()
+
+
 def many(count: int, outputs: Path) -> str:
     """Markdown: missions of the first case by `gco`, as many as it takes to bound the rate of collisions."""
     trials = fly(next(iter(CASES)), "gco", count, outputs)
@@ -205,7 +212,7 @@ def main(words: Sequence[str] | None = None) -> int:
                 continue
             parts.append(fly(case, solver, max(1, round(asked.share * PLANNERS[solver])), asked.outputs))
     trials = pd.concat(parts)
-    blocks = {"missions": f"{_origin('Flown')}\n\n{table(trials)}\n\n{misses(trials)}"}
+    blocks = {"missions": f"{_origin('Flown')}\n\n{short(table(trials), misses(trials))}"}
     if asked.alone > 0:
         together = max(1, round(asked.share * PLANNERS["gco"]))
         blocks["times"] = f"{_origin('Measured')}\n\n{timing(asked.outputs, asked.alone, together)}"
