@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torchgco.eager.model import Derivatives, Model
+from torchgco.eager.softness import gives_of
 from torchgco.eager.step import Factors, factor, solve
-from torchgco.lagrangian.kkt import PIVOT, ROUNDS, STIFF, KktSolve, RightSides
+from torchgco.lagrangian.kkt import PIVOT, ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
 
 
 def kkt(
@@ -17,12 +18,15 @@ def kkt(
     """As `native.interior.InteriorEngine.kkt`."""
     lam = torch.cat([X.new_zeros(X.shape[0], 0), *(part.flatten(1) for part in multipliers)], dim=1)
     lam = torch.where(active, lam, 0.0)
-    y = _costates(model.slopes(X, U), lam)
+    slopes = model.slopes(X, U)
+    y = _costates(slopes, lam)
     found = model.expand(X, U, torch.ones_like(X[:, 0, 0]), y, lam)
     sigma = STIFF * found.H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1, keepdim=True)
+    curvature = slopes.H.diagonal(dim1=-2, dim2=-1).abs()
+    sigma = sigma / gives_of(model, slopes, curvature, SLIGHT / STIFF * sigma[:, 0], active)
     stays = torch.ones_like(lam) if give is None else torch.where(active, 1.0 + sigma * give, 1.0)
     H = found.with_squares(torch.where(active, sigma / stays, 0.0))
-    factors = factor(found.F, H, torch.zeros_like(sigma[:, 0]), PIVOT, model.problem.free_start)
+    factors = factor(found.F, H, torch.zeros_like(X[:, 0, 0]), PIVOT, model.problem.free_start)
     sides = zip(right.a, right.b, right.c, strict=True)
     columns = [_solved(found, factors, active, sigma, stays, *side) for side in sides]
     none = (X.new_zeros(0, *shape.shape[1:]) for shape in (right.a, right.b, right.c, right.a[..., 0, 0]))
@@ -58,4 +62,4 @@ def _solved(
         step = torch.cat((dx, torch.nn.functional.pad(du, (0, 0, 0, 1))), dim=-1)
         z, y, c = z + step, y + dy[:, 1:], (c + torch.where(active, found.push(step, c), 0.0)) / stays
         v = v + sigma * c
-    return z, y, v, c.abs().amax(-1) if c.shape[1] > 0 else torch.zeros_like(sigma[:, 0])
+    return z, y, v, c.abs().amax(-1) if c.shape[1] > 0 else torch.zeros_like(z[:, 0, 0])

@@ -19,12 +19,12 @@ from torchgco.eager.fixed import (
     join_multipliers,
     readmit,
     relax,
-    soften_rows,
     sort_rows,
     split_multipliers,
 )
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.search import Step, curvature, go_back, search, stepped
+from torchgco.eager.softness import gives_of
 from torchgco.eager.state import (
     How,
     Kinds,
@@ -112,7 +112,10 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
     t.mu = first_barrier(kinds, t)
     settle(kinds, model, t)
     sort_rows(kinds, model, t)
-    soften_rows(kinds, model, t, t.scale.view(-1, 1, 1) * H.diagonal(dim1=-2, dim2=-1).abs())
+    if bool(kinds.fixed(t).any()):
+        diagonal = t.scale.view(-1, 1, 1) * H.diagonal(dim1=-2, dim2=-1).abs()
+        share = torch.full_like(t.mu, how.slight)
+        t.gives = gives_of(model, model.slopes(t.X, t.U), diagonal, share, kinds.fixed(t))
     t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
     remeasure(kinds, t)
     if not how.warm:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
-from torchgco.lagrangian.kkt import PIVOT, ROUNDS, STIFF, KktSolve, RightSides
+from torchgco.lagrangian.kkt import PIVOT, ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
 from torchgco.native.codegen.source import INTERIOR, LANES
 from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
@@ -102,7 +102,7 @@ class InteriorEngine:
             Kkt.complete(
                 of=packed, active=active.double().contiguous(), give=give, y=costates, left=left, **sides, problems=B,
                 free_start=None if free is None else free.double().contiguous(), count=right.a.shape[0],
-                rounds=ROUNDS, stiff=STIFF, pivot=PIVOT,
+                rounds=ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=PIVOT,
             ),
         )  # fmt: skip
         return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, out["status"] == Status.CONVERGED)

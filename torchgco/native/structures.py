@@ -189,7 +189,7 @@ class Kkt(Structure):
         ("double *", "a b c"),  # (C, E, N+1, NX+NU), (C, E, N, NX), (C, E, R): right hand sides in, z, y, v out
         ("double *", "y left"),  # (E, N+1, NX): costates; (C, E): largest of what active rows leave open
         ("int64_t", "problems count rounds"),  # E, C
-        ("double", "stiff pivot"),
+        ("double", "stiff slight pivot"),
     )
     _fields_ = fields(declared)
 

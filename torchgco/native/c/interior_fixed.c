@@ -202,50 +202,99 @@ static void sort_rows(Barrier *t, I of) {
     t->some_out = any(some);
 }
 
-/* Rows that hold as equalities give way more where units are small: see eager/fixed.py. `largest` is the cost's largest
-   curvature. */
-static void soften_rows(Barrier *t, I of, V largest) {
+/* The squares of the slopes of step at knot k, F_iv^2, into squares (S, NX): a variable after the other. */
+static void square_slopes(const Barrier *t, int64_t k, V *squares) {
     const Lanes *s = &t->lanes;
-    const Problem *p = s->of;
-    V g[S], H[S * S], own[S], none = SET(INFINITY);
+    V f[NJ + 1], own[S];
+    model_jacobian(s->X + k * NX, s->U + k * NU, model_at(s, k), s->of->shared, f);
+    for (int v = 0; v < S; v++) {
+        for (int w = 0; w < S; w++) own[w] = SET(w == v);
+        model_push(f, own, squares + v * NX);
+        for (int i = 0; i < NX; i++) squares[v * NX + i] *= squares[v * NX + i];
+    }
+}
+
+#define LITTLE 1e-4 /* below which J^2 would have to be large for a row to give way */
+
+/* What it costs to move the variables of each knot, with all they lead to: of states into dx, of controls into du, which
+   hold no step yet. */
+static void measure_costs(Barrier *t) {
+    const Lanes *s = &t->lanes;
+    V g[S], H[S * S], squares[S * NX];
+    for (int64_t k = s->of->N; k >= 0; k--) {
+        int last = k == s->of->N;
+        memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+        cost_expand(s, k, s->X + k * NX, last ? 0 : s->U + k * NU, g, H);
+        if (!last) square_slopes(t, k, squares);
+        for (int v = 0; v < (last ? NX : S); v++) {
+            V sum = t->scale * tgco_fabs(H[v * S + v]);
+            if (!last) for (int i = 0; i < NX; i++) ADD(sum, squares[v * NX + i], t->dx[(k + 1) * NX + i]);
+            *(v < NX ? t->dx + k * NX + v : t->du + k * NU + v - NX) = sum;
+        }
+    }
+}
+
+/* Rows of constraint i at knot k give way by `share` of J^2 moves, the least of their variables', where they hold. */
+static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V share) {
+    const Lanes *s = &t->lanes;
+    const Constraint *con = s->of->constraint + i;
+    const V *x = s->X + k * NX, *u = k < s->of->N ? s->U + k * NU : 0;
+    int64_t q = row_of(t, i, k);
+    V own[S], change[con->rows], least_of[con->rows];
+    for (int j = 0; j < con->rows; j++) least_of[j] = SET(INFINITY);
+    for (int v = 0; v < (u ? S : NX); v++) {
+        for (int w = 0; w < S; w++) own[w] = SET(w == v);
+        along(t, i, k, x, u, own, change);
+        for (int j = 0; j < con->rows; j++) {
+            V by = change[j] * change[j] * moves[v];
+            least_of[j] = tgco_choose(by > SET(0.0), least(by, least_of[j]), least_of[j]);
+        }
+    }
+    for (int j = 0; j < con->rows; j++) {
+        V gives = share * least_of[j];
+        t->gives[q + j] = tgco_choose(of & finite(gives) & (gives > SET(1.0)), gives, t->gives[q + j]);
+    }
+}
+
+/* Rows of the lanes `of` that hold as equalities, or `all` that may, give way more where units are small: eager/softness.py
+   says why, and what `moves` are. */
+static void soften_rows(Barrier *t, I of, V share, int all) {
+    const Problem *p = t->lanes.of;
+    int some = t->some_out | all;
+    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
+    for (int64_t i = 0; i < p->constraints; i++) some |= p->constraint[i].equality;
+    if (!some) return;
+    V moves[S], squares[S * NX], zero = SET(0.0), one = SET(1.0);
+    measure_costs(t);
+    for (int i = 0; i < NX; i++) {
+        moves[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]) & (t->dx[i] > zero), one / t->dx[i]) : zero;
+    }
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
-        int known = 0;
-        for (int64_t i = 0; i < p->constraints; i++) {
+        for (int i = 0; i < NX; i++) {
+            V cost = t->dx[k * NX + i];
+            moves[i] = tgco_choose(cost > zero, least(one / cost, moves[i]), moves[i]);
+        }
+        for (int j = 0; j < NU; j++) {
+            V cost = k < p->N ? t->du[k * NU + j] : zero;
+            moves[NX + j] = tgco_if(cost > zero, one / cost);
+        }
+        I far = of & ~of;
+        for (int v = 0; v < S; v++) far |= share * moves[v] > SET(LITTLE);
+        for (int64_t i = 0; i < p->constraints && any(of & far); i++) {
             const Constraint *con = p->constraint + i;
             if (con->place[k] == NOWHERE) continue;
-            int64_t q = row_of(t, i, k);
-            int holds = con->equality;
-            for (int j = 0; j < con->rows; j++) {
-                t->gives[q + j] = tgco_choose(of, SET(1.0), t->gives[q + j]);
-                holds |= t->some_out && any(of & t->fixes[q + j]);
-            }
-            if (!holds) continue;
-            if (!known) {
-                memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-                cost_expand(s, k, x, u, g, H);
-                known = 1;
-            }
-            V change[con->rows], ratio[con->rows], alone[con->rows];
-            for (int j = 0; j < con->rows; j++) { ratio[j] = none; alone[j] = SET(0.0); }
-            for (int v = 0; v < (u ? S : NX); v++) {
-                for (int w = 0; w < S; w++) own[w] = SET(w == v);
-                along(t, i, k, x, u, own, change);
-                V h = t->scale * tgco_fabs(H[v * S + v]);
-                for (int j = 0; j < con->rows; j++) {
-                    V square = change[j] * change[j];
-                    I counts = (square > SET(0.0)) & (h > SET(0.0));
-                    ratio[j] = tgco_choose(counts, least(square / h, ratio[j]), ratio[j]);
-                    alone[j] = most(square / largest, alone[j]);
-                }
-            }
-            for (int j = 0; j < con->rows; j++) {
-                V share = SET(t->how->slight) * tgco_choose(finite(ratio[j]), ratio[j], alone[j]);
-                I held = con->equality ? of : of & t->fixes[q + j];
-                held &= finite(share) & (share > SET(1.0));
-                t->gives[q + j] = tgco_choose(held, share, t->gives[q + j]);
-            }
+            int holds = con->equality | all;
+            for (int j = 0; j < con->rows; j++) holds |= t->some_out && any(of & t->fixes[row_of(t, i, k) + j]);
+            if (holds) soften_at(t, of, i, k, moves, share);
         }
+        if (k == p->N) break;
+        square_slopes(t, k, squares);
+        V next[NX];
+        for (int i = 0; i < NX; i++) {
+            next[i] = zero;
+            for (int v = 0; v < S; v++) ADD(next[i], squares[v * NX + i], moves[v]);
+        }
+        for (int i = 0; i < NX; i++) moves[i] = next[i];
     }
 }
 

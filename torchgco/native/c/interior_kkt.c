@@ -21,12 +21,16 @@ typedef struct {
     V sigma;
 } System;
 
-/* The curvature w across row q, where it holds. */
-static inline V weight_of(const System *of, int64_t q) { return of->sigma / (SET(1.0) + of->sigma * of->give[q]); }
+/* sigma of a row, and its curvature w, where it holds. */
+static inline V sigma_of(const Barrier *t, const System *of, int64_t q) { return of->sigma / t->gives[q]; }
+static inline V weight_of(const Barrier *t, const System *of, int64_t q) {
+    V sigma = sigma_of(t, of, q);
+    return sigma / (SET(1.0) + sigma * of->give[q]);
+}
 
 /* A row of inequalities that holds has this curvature; one that doesn't none. (The interior point: z / s.) */
 static void stiffen(Barrier *t, const System *of) {
-    ROWS(t, 0, t->s[q] = tgco_choose(of->active[q] > SET(0.0), t->z[q] / weight_of(of, q), SET(INFINITY)))
+    ROWS(t, 0, t->s[q] = tgco_choose(of->active[q] > SET(0.0), t->z[q] / weight_of(t, of, q), SET(INFINITY)))
     t->soft = SET(1.0) / of->sigma;
 }
 
@@ -43,7 +47,7 @@ static void add_all_rows(Barrier *t) {
 }
 
 /* Costates, then curvatures of all knots with their sigma, and the factors; where these don't exist the answer is false. */
-static I factor_kkt(Barrier *t, System *of, double stiff) {
+static I factor_kkt(Barrier *t, System *of, double stiff, double slight) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N;
     V largest = SET(0.0);
@@ -60,6 +64,7 @@ static I factor_kkt(Barrier *t, System *of, double stiff) {
     for (int64_t k = 0; k <= N; k++)
         for (int i = 0; i < (k < N ? S : NX); i++) largest = most(tgco_fabs(t->H[k * S * S + i * S + i]), largest);
     of->sigma = SET(stiff) * largest;
+    soften_rows(t, all, SET(slight) * largest, 1);
     stiffen(t, of);
     add_all_rows(t);
     return factor(t, ~all);
@@ -109,7 +114,7 @@ static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
     for (int64_t round = 0; round < rounds; round++) {
         find_open(t, of);
         for (int64_t q = 0; q < t->rows; q++)
-            t->r[q] = tgco_if(of->active[q] > SET(0.0), of->c[q] + of->v[q] / weight_of(of, q));
+            t->r[q] = tgco_if(of->active[q] > SET(0.0), of->c[q] + of->v[q] / weight_of(t, of, q));
         add_all_rows(t);
         solve(t);
         along_rows(t);
@@ -119,9 +124,9 @@ static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
         }
         for (int64_t i = 0; i < N * NX; i++) of->y[i] += t->yn[NX + i];
         for (int64_t q = 0; q < t->rows; q++) {
-            V open = of->c[q] + tgco_if(of->active[q] > SET(0.0), t->ds[q]), stays = SET(1.0) + of->sigma * of->give[q];
-            of->c[q] = open / stays;
-            ADD(of->v[q], of->sigma, of->c[q]);
+            V open = of->c[q] + tgco_if(of->active[q] > SET(0.0), t->ds[q]), sigma = sigma_of(t, of, q);
+            of->c[q] = open / (SET(1.0) + sigma * of->give[q]);
+            ADD(of->v[q], sigma, of->c[q]);
         }
     }
     V worst = SET(0.0);
@@ -186,7 +191,7 @@ int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
     for (int64_t at = first; at < last; at += LANES) {
         int own = last - at < LANES ? last - at : LANES; /* lanes without a problem repeat the first one */
         for (int l = 0; l < LANES; l++) enter_system(t, of, how, l, l < own ? at + l : at);
-        I good = factor_kkt(t, of, how->stiff);
+        I good = factor_kkt(t, of, how->stiff, how->slight);
         for (int l = 0; l < own; l++) {
             p->status[at + l] = good[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
             for (int64_t i = 0; i < (p->N + 1) * NX; i++) how->y[(at + l) * (p->N + 1) * NX + i] = t->y[i][l];
