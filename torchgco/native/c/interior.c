@@ -70,7 +70,6 @@ static void begin(Barrier *t, Track *k, I of) {
     t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
-    soften_rows(t, of, SET(how->slight), 0);
     if (how->warm) {
         if (t->some_out) join_multipliers(t, of);
         ROWS(t, 0, {
@@ -83,6 +82,7 @@ static void begin(Barrier *t, Track *k, I of) {
     } else {
         renew(t, of);
     }
+    soften_rows(t, of, SET(how->slight), 0);
 }
 
 /* The next mu of the lanes whose barrier problem is solved well enough; their filter begins anew. */

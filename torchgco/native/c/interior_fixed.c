@@ -204,17 +204,13 @@ static void sort_rows(Barrier *t, I of) {
 
 /* The squares of the slopes of step at knot k, F_iv^2, into squares (S, NX): a variable after the other. */
 static void square_slopes(const Barrier *t, int64_t k, V *squares) {
-    const Lanes *s = &t->lanes;
-    V f[NJ + 1], own[S];
-    model_jacobian(s->X + k * NX, s->U + k * NU, model_at(s, k), s->of->shared, f);
+    V own[S];
     for (int v = 0; v < S; v++) {
         for (int w = 0; w < S; w++) own[w] = SET(w == v);
-        model_push(f, own, squares + v * NX);
+        model_push(t->f + k * NJ, own, squares + v * NX);
         for (int i = 0; i < NX; i++) squares[v * NX + i] *= squares[v * NX + i];
     }
 }
-
-#define LITTLE 1e-4 /* below which J^2 would have to be large for a row to give way */
 
 /* What it costs to move the variables of each knot, with all they lead to: of states into dx, of controls into du, which
    hold no step yet. */
@@ -240,9 +236,13 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
     const Constraint *con = s->of->constraint + i;
     const V *x = s->X + k * NX, *u = k < s->of->N ? s->U + k * NU : 0;
     int64_t q = row_of(t, i, k);
+    int first = 0, end = u ? S : NX;
+#if DIM > 0
+    if (con->kind != BOUNDS && con->kind != FUNCTION && con->kind != BODY) { first = POSITION; end = POSITION + DIM; }
+#endif
     V own[S], change[con->rows], least_of[con->rows];
     for (int j = 0; j < con->rows; j++) least_of[j] = SET(INFINITY);
-    for (int v = 0; v < (u ? S : NX); v++) {
+    for (int v = first; v < end; v++) {
         for (int w = 0; w < S; w++) own[w] = SET(w == v);
         along(t, i, k, x, u, own, change);
         for (int j = 0; j < con->rows; j++) {
@@ -256,11 +256,22 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
     }
 }
 
-/* Rows of the lanes `of` that hold as equalities, or `all` that may, give way more where units are small: eager/softness.py
-   says why, and what `moves` are. */
-static void soften_rows(Barrier *t, I of, V share, int all) {
+/* Whether a row of constraint i at knot k holds as an equality in one of the lanes `of`; `active` says it of all rows. */
+static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, const V *active) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    if (con->place[k] == NOWHERE) return 0;
+    int64_t q = row_of(t, i, k);
+    int hold = con->equality;
+    for (int j = 0; j < con->rows; j++, q++)
+        hold |= active ? any(of & (active[q] > SET(0.0))) : t->some_out && any(of & t->fixes[q]);
+    return hold;
+}
+
+/* Rows of the lanes `of` that hold as equalities give way more where units are small: eager/softness.py says why, and what
+   `moves` are. The slopes f are those of the iterate. */
+static void soften_rows(Barrier *t, I of, V share, const V *active) {
     const Problem *p = t->lanes.of;
-    int some = t->some_out | all;
+    int some = t->some_out || active;
     for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
     for (int64_t i = 0; i < p->constraints; i++) some |= p->constraint[i].equality;
     if (!some) return;
@@ -278,15 +289,8 @@ static void soften_rows(Barrier *t, I of, V share, int all) {
             V cost = k < p->N ? t->du[k * NU + j] : zero;
             moves[NX + j] = tgco_if(cost > zero, one / cost);
         }
-        I far = of & ~of;
-        for (int v = 0; v < S; v++) far |= share * moves[v] > SET(LITTLE);
-        for (int64_t i = 0; i < p->constraints && any(of & far); i++) {
-            const Constraint *con = p->constraint + i;
-            if (con->place[k] == NOWHERE) continue;
-            int holds = con->equality | all;
-            for (int j = 0; j < con->rows; j++) holds |= t->some_out && any(of & t->fixes[row_of(t, i, k) + j]);
-            if (holds) soften_at(t, of, i, k, moves, share);
-        }
+        for (int64_t i = 0; i < p->constraints; i++)
+            if (some_hold(t, of, i, k, active)) soften_at(t, of, i, k, moves, share);
         if (k == p->N) break;
         square_slopes(t, k, squares);
         V next[NX];

@@ -64,7 +64,7 @@ static I factor_kkt(Barrier *t, System *of, double stiff, double slight) {
     for (int64_t k = 0; k <= N; k++)
         for (int i = 0; i < (k < N ? S : NX); i++) largest = most(tgco_fabs(t->H[k * S * S + i * S + i]), largest);
     of->sigma = SET(stiff) * largest;
-    soften_rows(t, all, SET(slight) * largest, 1);
+    soften_rows(t, all, SET(slight) * largest, of->active);
     stiffen(t, of);
     add_all_rows(t);
     return factor(t, ~all);
