@@ -25,7 +25,7 @@ LAYERS = [
     ["solvers", "roadmap"],
     ["sensitivity"],
     ["guidance", "missions", "scenarios"],
-    ["search", "plotting"],
+    ["search", "plotting", "exploration"],
     ["view"],
     ["baselines"],
     ["presets"],

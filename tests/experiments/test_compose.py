@@ -17,7 +17,8 @@ from torchgco.experiments.config.build import Setup, build, compose_config, conf
 from torchgco.experiments.config.groups import FAMILIES, options_of
 from torchgco.experiments.flying.flight import plan_of
 from torchgco.experiments.flying.study import check_mission
-from torchgco.missions import Mission, Planner, RotorPlant
+from torchgco.exploration import SensorMission
+from torchgco.missions import Planner, RotorPlant
 from torchgco.scenarios import Vehicle
 
 DATA = ROOT / "benchmarks" / "data"
@@ -155,7 +156,9 @@ def test_a_mistake_in_a_vehicle_gets_one_line(words: list[str], line: str) -> No
 
 
 def test_a_registered_mission_is_its_class() -> None:
-    assert compose(["experiment=mission"]).mission == Mission(Planner(presets.gco(3)), plant=RotorPlant(Airframe()))
+    assert compose(["experiment=mission"]).mission == SensorMission(
+        Planner(presets.gco(3)), plant=RotorPlant(Airframe())
+    )
 
 
 def test_a_preset_flies_all_layouts_of_a_file() -> None:

@@ -16,8 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
-from torchgco.missions.log import MissionLog
-from torchgco.missions.unknown.safety import SeenLog
+from torchgco.missions.log import MissionLog, SeenLog
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.course import VEHICLE, Course, draw_contacts, handles
 from torchgco.plotting.style import INK, PALETTE, legend, tidy

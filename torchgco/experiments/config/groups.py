@@ -23,7 +23,8 @@ from omegaconf import OmegaConf
 
 from torchgco.base.version import PACKAGE
 from torchgco.dynamics import Airframe
-from torchgco.missions import Disturbance, Mission, Planner, RotorPlant, Tracker
+from torchgco.exploration import SensorMission
+from torchgco.missions import Disturbance, Planner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
 from torchgco.scenarios import (
     Crossing,
@@ -130,7 +131,7 @@ def register() -> None:
     _store("plant", "rotors", _fields_of(RotorPlant, *ALIKE))
     planner = {"_partial_": True} | _fields_of(Planner, "solver", *ALIKE)  # its solver is the one under study
     parts = {"planner": planner, "tracker": _fields_of(Tracker, *ALIKE), "disturbance": _fields_of(Disturbance)}
-    _store("mission", "default", {"_partial_": True} | _fields_of(Mission, "plant", *parts) | parts)
+    _store("mission", "default", {"_partial_": True} | _fields_of(SensorMission, "plant", *parts) | parts)
 
 
 def classes_of(group: str) -> frozenset[type]:

@@ -13,10 +13,10 @@ import torch
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.progress import Bar
+from torchgco.exploration.safety import safe_arrays
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.safe import safe_arrays
 from torchgco.missions.tables import clearances, ending, mission_row, packed
 from torchgco.scenarios import Layouts
 

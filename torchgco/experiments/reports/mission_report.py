@@ -47,7 +47,7 @@ def mission_table(
     period, contact = float(problem.dynamics.dt), Contact.among(problem)
     frames, plans, fine = [], [], []
     for name, rows in zip(solvers, logs, strict=True):
-        arrays = unpacked(rows, setup.mission.substeps(period) or 1, setup.mission.sensor != "full")
+        arrays = unpacked(rows, setup.mission.substeps(period) or 1, not setup.mission.sees_all)
         frame = mission_frame(arrays, layouts.ids.tolist(), period, clearances(arrays, period, contact))
         frame.insert(0, "solver", name)
         frames.append(frame)

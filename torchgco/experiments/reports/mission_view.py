@@ -18,9 +18,9 @@ from torchgco.base.notices import watched
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
 from torchgco.experiments.results.limits import LARGEST
+from torchgco.exploration.replay import replayed
 from torchgco.judging.contact import contacts
 from torchgco.missions import Mission
-from torchgco.missions.replay import replayed
 from torchgco.missions.tables import STATES
 from torchgco.native.compiler import NativeError
 from torchgco.problem.problem import Problem

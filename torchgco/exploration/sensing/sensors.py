@@ -10,7 +10,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, Count, Meters, NonNegative, Share, Within, check_options
-from torchgco.missions.sensing.world import World
+from torchgco.exploration.sensing.world import World
 
 SCAN_STREAM = 2  # of a mission's draws; 1 is the disturbance's
 Angle = Annotated[float, Within(1, 360, "degrees")]

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.quadrotor import Airframe
+from torchgco.exploration.explorer import Explorer, within_bounds
+from torchgco.exploration.safety import AT_REST
 from torchgco.lagrangian.lagrangian import Multipliers, shifted
 from torchgco.missions.planner import Plan
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.unknown.explorer import Explorer, within_bounds
-from torchgco.missions.unknown.safety import AT_REST
 from torchgco.problem.problem import Problem
 
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from torchgco.missions.unknown.reference import Pace, along, between, lengths, motion, swings, taut
+from torchgco.exploration.reference import Pace, along, between, lengths, motion, swings, taut
 
 PACE, DT = Pace(4.0, 5.0, 3.0), 0.05
 STILL = np.zeros(3)

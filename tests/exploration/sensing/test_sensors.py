@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from torchgco.base.errors import InputError
-from torchgco.missions.sensing import Depth, Lidar, World
-from torchgco.missions.sensing.sensors import turned
+from torchgco.exploration.sensing import Depth, Lidar, World
+from torchgco.exploration.sensing.sensors import turned
 
 NOWHERE, LEVEL = np.zeros(3), np.array([1.0, 0, 0, 0])
 

@@ -14,14 +14,14 @@ from torchgco.base.options import Above, Meters, NonNegative, Seconds, Within, c
 from torchgco.base.shapes import Dimensions
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.constraints.base import Constraint
+from torchgco.constraints.half_spaces import HalfSpaces, stacked
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
+from torchgco.exploration.reference import Pace
+from torchgco.exploration.sensing.grid import SeenMap
 from torchgco.kernels import followed
 from torchgco.missions.planner import Planner
 from torchgco.missions.planning_problem import airframe_of, biased, first_step, planning_state
-from torchgco.missions.sensing.grid import SeenMap
-from torchgco.missions.unknown.halfspaces import HalfSpaces, stacked
-from torchgco.missions.unknown.reference import Pace
 from torchgco.problem.problem import Problem
 
 SensorName = Literal["full", "lidar", "depth"]

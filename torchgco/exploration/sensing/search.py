@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.missions.sensing.grid import SeenMap
-from torchgco.missions.sensing.library import call
+from torchgco.exploration.sensing.grid import SeenMap
+from torchgco.exploration.sensing.library import call
 
 ENTRIES = 8  # of the heap, for each cell
 ENTRY_BYTES = 8

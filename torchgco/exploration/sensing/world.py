@@ -13,10 +13,10 @@ from typing import Self
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.exploration.sensing.library import call
 from torchgco.maps.field import BoundField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.points import PointCloud
-from torchgco.missions.sensing.library import call
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes

@@ -9,8 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from tests.reference.sensing import chords, cubes, distances, inside
-from torchgco.missions.sensing import Lidar, Scan, SeenMap, World, library
-from torchgco.missions.sensing.grid import (
+from torchgco.exploration.sensing import Lidar, Scan, SeenMap, World, library
+from torchgco.exploration.sensing.grid import (
     CHORD,
     FREE,
     FREE_AT,
@@ -22,7 +22,7 @@ from torchgco.missions.sensing.grid import (
     REACH,
     UNKNOWN,
 )
-from torchgco.missions.sensing.search import Search
+from torchgco.exploration.sensing.search import Search
 
 CORNER, SIZE, SHAPE = np.array([-2.0, -1.5, -1.0]), 0.25, (17, 13, 9)
 SPAN = np.array(SHAPE) * SIZE

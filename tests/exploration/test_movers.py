@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torchgco import Goal, Problem, Spheres, compose
-from torchgco.missions.sensing import Lidar, SeenMap, World
-from torchgco.missions.sensing.grid import OCCUPIED
-from torchgco.missions.unknown.movers import Known, Moving, Tracks, clusters, seen_ball
+from torchgco.exploration.movers import Known, Moving, Tracks, clusters, seen_ball
+from torchgco.exploration.sensing import Lidar, SeenMap, World
+from torchgco.exploration.sensing.grid import OCCUPIED
 
 
 def ball(center: list[float], radius: float) -> np.ndarray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchgco.missions.sensing.library import call
-from torchgco.missions.sensing.sensors import Scan
+from torchgco.exploration.sensing.library import call
+from torchgco.exploration.sensing.sensors import Scan
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 SEEN_OCCUPIED, NOT_FREE = 1 << OCCUPIED, (1 << OCCUPIED) | (1 << UNKNOWN)  # kinds of cells

@@ -8,9 +8,9 @@ import torch
 from tests.engines import engine_of
 from torchgco import ILQR, AugmentedLagrangian, ControlBounds, Problem, QuadraticCost, QuadrotorPlanning
 from torchgco.base.errors import InputError
+from torchgco.constraints.half_spaces import HalfSpaces, stacked
 from torchgco.kernels import use_native, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.missions.unknown.halfspaces import HalfSpaces, stacked
 
 B, N, R = 2, 6, 3
 REST = [0.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 9.81]

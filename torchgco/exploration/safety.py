@@ -7,42 +7,29 @@ points along the plan from all cubes near it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
-from torchgco.missions.sensing.grid import FREE
+from torchgco.exploration.sensing.grid import FREE
+from torchgco.missions.log import MissionLog, SeenLog
+from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.problem.problem import Problem
 
 AT_REST = 0.1  # m/s at most, where a plan has come to rest
 SPACING = 0.05  # m between the points of a plan that are tested
 
 
-@dataclass
-class SeenLog:
-    """What a vehicle knew of its grid, period by period.
-
-    Args:
-        corner: (3,), m, where cell (0, 0, 0) begins.
-        shape: number of cells (3,).
-        resolution: side of a cell, m.
-        changes: for each period the flat indices of the cells whose state changed in it, int32, and their new states,
-            uint8; cells are unknown at first.
-        safe: for each period the positions (N+1, 3), m, of the plan that comes to rest.
-    """
-
-    corner: np.ndarray
-    shape: tuple[int, int, int]
-    resolution: float
-    changes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    safe: list[np.ndarray] = field(default_factory=list)
-
-    def state(self, step: int) -> np.ndarray:
-        """The states (X, Y, Z) of all cells in a period."""
-        state = np.zeros(self.shape, np.uint8)
-        for cells, new in self.changes[: step + 1]:
-            state.reshape(-1)[cells] = new
-        return state
+def safe_arrays(log: MissionLog, problem: Problem) -> dict[str, np.ndarray]:
+    """`safe` (B, K) of missions: 1 where safe, 0 where not, NaN after their ends; no array without a sensor."""
+    if not log.seen:
+        return {}
+    safe = np.full(tuple(log.cost.shape), np.nan)
+    for b, seen in enumerate(log.seen):
+        radius = max((float(part.vehicle_radius[b]) for part in problem.obstacles), default=0.0)
+        found = safe_periods(seen, CONTACT_FACTOR * radius, log.period)
+        safe[b, : len(found)] = found
+    return {"safe": safe}
 
 
 def safe_periods(log: SeenLog, radius: float, dt: float) -> np.ndarray:

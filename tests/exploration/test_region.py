@@ -12,13 +12,13 @@ from torch import Tensor
 from tests.missions.missions import REST
 from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, presets
 from torchgco.dynamics import Airframe
+from torchgco.exploration.explorer import FLYABLE, PLACES, Explorer, unflyable, within_bounds
+from torchgco.exploration.pilot import Exploration
+from torchgco.exploration.sensing import Lidar
+from torchgco.exploration.sensing.grid import FREE, OCCUPIED
 from torchgco.kernels import followed
 from torchgco.missions import Planner
 from torchgco.missions.plant import hovering
-from torchgco.missions.sensing import Lidar
-from torchgco.missions.sensing.grid import FREE, OCCUPIED
-from torchgco.missions.unknown.exploration import Exploration
-from torchgco.missions.unknown.explorer import FLYABLE, PLACES, Explorer, unflyable, within_bounds
 
 LOW, HIGH = -0.5, 3.0  # m: floor and ceiling of the map
 LEAST, MOST = [-5.0, -5.0, -5.0, 0.26], [5.0, 5.0, 5.0, 14.9]  # controls

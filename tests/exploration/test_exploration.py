@@ -12,16 +12,17 @@ import torch
 from tests.missions.missions import REST
 from torchgco import Airframe, Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, presets
 from torchgco.base.errors import InputError
-from torchgco.missions import Mission, Planner
+from torchgco.exploration.explorer import Explorer, steady_yaw
+from torchgco.exploration.mission import SensorMission
+from torchgco.exploration.pilot import Exploration
+from torchgco.exploration.safety import safe_arrays
+from torchgco.exploration.sensing import Depth, Lidar
+from torchgco.missions import Planner
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.plant import RotorPlant, hovering
-from torchgco.missions.safe import safe_arrays
-from torchgco.missions.sensing import Depth, Lidar
 from torchgco.missions.tables import SENSED, ending, mission_frame, mission_row, packed, unpacked
-from torchgco.missions.unknown.exploration import Exploration
-from torchgco.missions.unknown.explorer import Explorer, steady_yaw
 
 GOALS = torch.tensor([[4.0, 0.0, 0.0], [3.0, 0.5, 0.2]]).double()
 EXPLORER = Explorer(around=(2.5, 1.5), stages=40)
@@ -39,9 +40,9 @@ def walled(side: float = 0.0) -> Problem:
     return Problem(QuadrotorPlanning(dt=0.05), cost, [wall, bounds], x0, 20, Goal(GOALS, 0.4))
 
 
-def mission(**options: Any) -> Mission:
+def mission(**options: Any) -> SensorMission:
     parts: dict[str, Any] = {"sensor": "lidar", "lidar": LIDAR, "explorer": EXPLORER, "duration": 6.0} | options
-    return Mission(Planner(presets.gco(3)), **parts)
+    return SensorMission(Planner(presets.gco(3)), **parts)
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,11 @@ def test_a_dead_end_is_left() -> None:
 def test_options_that_do_not_fit_are_named(options: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError, match=field):
         mission(**options)
+
+
+def test_plans_on_a_map_are_no_first_plans() -> None:
+    with pytest.raises(InputError, match=r"mission\.sensor"):
+        mission().first_plans(walled())
 
 
 def test_an_explorer_names_what_is_wrong() -> None:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.missions.unknown.test_exploration import GOALS, mission, walled
+from tests.exploration.test_exploration import GOALS, mission, walled
 from torchgco import InputError
+from torchgco.exploration.replay import replayed
+from torchgco.exploration.safety import safe_periods
 from torchgco.missions import Disturbance
-from torchgco.missions.replay import replayed
-from torchgco.missions.unknown.safety import safe_periods
 
 NOISY = Disturbance(position_noise=0.01, attitude_noise=0.005)
 

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.exploration.mission import SensorMission
+from torchgco.exploration.scout import ARRIVES
 from torchgco.missions.disturbance import measured
+from torchgco.missions.log import SeenLog
 from torchgco.missions.mission import Mission
-from torchgco.missions.unknown.safety import SeenLog
-from torchgco.missions.unknown.scout import ARRIVES
 from torchgco.problem.problem import Problem
 
 
@@ -52,9 +53,9 @@ def replayed(
     """
     if problem.B != 1 or x.dim() != 2 or x.shape[1] != 17:
         raise InputError("x", "states (K, 17) of one mission", f"{tuple(x.shape)} of {problem.B}")
+    if not isinstance(mission, SensorMission) or mission.sees_all:
+        raise InputError("mission.sensor", "lidar or depth: only then is there something to see", "full")
     exploration = mission.exploration(problem, seed, torch.tensor([number], device="cpu"))
-    if exploration is None:
-        raise InputError("mission.sensor", "lidar or depth: only then is there something to see", mission.sensor)
     period = float(problem.dynamics.dt)
     _, noise = mission.disturbance.draw(seed, [number], mission.periods(period), period)
     (scout,), sought = exploration.scouts, []

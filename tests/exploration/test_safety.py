@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tests.reference.sensing import cubes, distances
-from torchgco.missions.sensing.grid import FREE, OCCUPIED
-from torchgco.missions.unknown.safety import SeenLog, least_gap, safe_periods
+from torchgco.exploration.safety import least_gap, safe_periods
+from torchgco.exploration.sensing.grid import FREE, OCCUPIED
+from torchgco.missions.log import SeenLog
 
 SHAPE, SIZE, CORNER = (20, 10, 8), 0.25, np.array([-1.0, -1.0, -1.0])
 CELLS = np.arange(np.prod(SHAPE))

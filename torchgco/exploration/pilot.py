@@ -17,16 +17,8 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
-from torchgco.missions.log import PARTS
-from torchgco.missions.planner import Plan, Planner
-from torchgco.missions.planning_problem import EARLY, airframe_of
-from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED
-from torchgco.missions.sensing.search import Search
-from torchgco.missions.sensing.sensors import Sensor
-from torchgco.missions.sensing.world import World
-from torchgco.missions.unknown.evading import evaded
-from torchgco.missions.unknown.explorer import (
+from torchgco.exploration.evading import evaded
+from torchgco.exploration.explorer import (
     CORRIDOR,
     FLYABLE,
     PLANES,
@@ -35,10 +27,18 @@ from torchgco.missions.unknown.explorer import (
     Unknown,
     unflyable,
 )
-from torchgco.missions.unknown.former import braking, ends_at_rest, former_plans
-from torchgco.missions.unknown.movers import Known, Movers, Tracks, Unaware
-from torchgco.missions.unknown.safety import AT_REST, SeenLog
-from torchgco.missions.unknown.scout import DRIFT, SEARCH, SPARE, Scout
+from torchgco.exploration.former import braking, ends_at_rest, former_plans
+from torchgco.exploration.movers import Known, Movers, Tracks, Unaware
+from torchgco.exploration.safety import AT_REST
+from torchgco.exploration.scout import DRIFT, SEARCH, SPARE, Scout
+from torchgco.exploration.sensing.grid import NOT_FREE, SEEN_OCCUPIED
+from torchgco.exploration.sensing.search import Search
+from torchgco.exploration.sensing.sensors import Sensor
+from torchgco.exploration.sensing.world import World
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
+from torchgco.missions.log import PARTS, SeenLog
+from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planning_problem import EARLY, airframe_of
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.missions.sensing.grid import SEEN_OCCUPIED, SeenMap
-from torchgco.missions.sensing.search import Search
-from torchgco.missions.sensing.world import World
-from torchgco.missions.unknown.explorer import Explorer
-from torchgco.missions.unknown.movers import Movers, Moving, nothing
-from torchgco.missions.unknown.reference import between, motion, swings, taut
-from torchgco.missions.unknown.safety import SeenLog
+from torchgco.exploration.explorer import Explorer
+from torchgco.exploration.movers import Movers, Moving, nothing
+from torchgco.exploration.reference import between, motion, swings, taut
+from torchgco.exploration.sensing.grid import SEEN_OCCUPIED, SeenMap
+from torchgco.exploration.sensing.search import Search
+from torchgco.exploration.sensing.world import World
+from torchgco.missions.log import SeenLog
 from torchgco.obstacles.base import CONTACT_FACTOR
 
 SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}

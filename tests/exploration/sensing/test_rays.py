@@ -11,8 +11,8 @@ from tests.reference.sensing import in_cells, inside, march
 from torchgco import Boxes, Capsules, ControlBounds, Problem, QuadraticCost, QuadrotorPlanning, Spheres
 from torchgco.base.errors import InputError
 from torchgco.constraints import FunctionConstraint
+from torchgco.exploration.sensing import World
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
-from torchgco.missions.sensing import World
 from torchgco.obstacles.base import Obstacles
 
 STEP = 2e-3  # m, of the march

@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from torchgco.missions.unknown.movers import Moving
+from torchgco.exploration.movers import Moving
 
 STRIDE = 3  # steps between two layers of nodes
 ASIDE, LIFT = 4, 2  # nodes to each side, and above and below

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchgco.missions.sensing import World
-from torchgco.missions.sensing.world import Motion
-from torchgco.missions.unknown.evading import evaded, offsets
-from torchgco.missions.unknown.movers import Known, Moving
+from torchgco.exploration.evading import evaded, offsets
+from torchgco.exploration.movers import Known, Moving
+from torchgco.exploration.sensing import World
+from torchgco.exploration.sensing.world import Motion
 
 DT, KEEP, HOLD = 0.05, 0.3, 1.0
 LINE = np.column_stack([4.0 * DT * np.arange(61), np.zeros(61), np.full(61, 2.0)])  # 4 m/s for 3 s
