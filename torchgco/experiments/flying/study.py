@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
@@ -34,7 +33,6 @@ from torchgco.experiments.results.identity import (
     difference,
     digest,
     layout_digests,
-    plain,
     settings_of,
 )
 from torchgco.experiments.results.lock import held
@@ -47,11 +45,11 @@ from torchgco.missions import Mission
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.
-Recompose = Callable[[str], DictConfig]
+Recompose = Callable[[str], dict[str, Any]]
 
 
 def run_study(
-    config: DictConfig,
+    configuration: dict[str, Any],
     folder: Path,
     recompose: Recompose,
     accepted: Callable[[], None] = lambda: None,
@@ -75,7 +73,7 @@ def run_study(
             one, damaged files, worker processes that die again and again, no layout that could be flown at all, missing
             trials where `collect` is set.
     """
-    study = _study(config, recompose)
+    study = _study(configuration, recompose)
     records = Records(folder, study.manifest, study.plan.repair)
     with held(folder, study.plan.job, study.plan.jobs):
         records.claim()
@@ -165,8 +163,8 @@ def _report(study: _Study, folder: Path) -> str:
     return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure)
 
 
-def _study(config: DictConfig, recompose: Recompose) -> _Study:
-    setup = build(config)
+def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
+    setup = build(configuration)
     layouts = setup.layouts()
     task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
     plan = plan_of(setup)
@@ -176,12 +174,11 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
             raise InputError("study.explain", "false in missions: single solves can be explained", True)
         if plan.figure is not None:
             raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
-    configs = _rivals(config, recompose)
-    solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
-    configuration = {"version": VERSION, **plain(config)}
+    rivals = _rivals(configuration, recompose)
+    solvers = {name: setup.solver if held is configuration else solver_of(held) for name, held in rivals.items()}
     manifest = Manifest(
-        configuration=configuration,
-        solvers={name: settings_of(held) for name, held in configs.items()},
+        configuration={"version": VERSION, **configuration},
+        solvers={name: settings_of(held) for name, held in rivals.items()},
         layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
     )
     return _Study(setup, plan, layouts, solvers, manifest)
@@ -194,13 +191,13 @@ def check_mission(mission: Mission, task: Task) -> None:
         raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
 
 
-def _rivals(config: DictConfig, recompose: Recompose) -> dict[str, DictConfig]:
+def _rivals(configuration: dict[str, Any], recompose: Recompose) -> dict[str, dict[str, Any]]:
     """The configurations of the solvers by name, the one under study first; a baseline that equals it is left out."""
-    own = config.solver.name
-    found = {own: config}
-    for name in config.study.baselines or ():
+    own = configuration["solver"]["name"]
+    found = {own: configuration}
+    for name in configuration["study"]["baselines"] or ():
         other = recompose(name)
-        here, there = settings_of(config), settings_of(other)
+        here, there = settings_of(configuration), settings_of(other)
         if name == own and digest(here) != digest(there):
             expected = f"another name, as the baseline {own} has other settings: solver.name={own}_changed"
             raise InputError("solver.name", expected, f"{own} ({difference(there, here)})")

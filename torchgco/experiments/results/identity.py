@@ -14,7 +14,6 @@ from hashlib import sha256
 from typing import Any, Self
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
 
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
@@ -34,16 +33,9 @@ EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same 
 LONGEST = 40  # letters of a value in a message
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration as plain dicts, lists and numbers, resolved."""
-    held = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(held, dict)
-    return {str(key): value for key, value in held.items()}
-
-
-def settings_of(config: DictConfig) -> dict[str, Any]:
-    """The settings of a configuration's solver, resolved, without its name."""
-    return {key: value for key, value in plain(config)["solver"].items() if key != "name"}
+def settings_of(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a configuration's solver, without its name."""
+    return {key: value for key, value in configuration["solver"].items() if key != "name"}
 
 
 def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> dict[str, Any]:
