@@ -23,9 +23,9 @@ from tests.maps.files import samples
 from torchgco import InputError
 from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.reports.finished import Study
+from torchgco.experiments.results.folder import read_trials
 from torchgco.experiments.results.identity import Manifest, digest, settings_of
 from torchgco.experiments.results.limits import read_npz
-from torchgco.experiments.results.runs import read_trials
 from torchgco.maps import read
 from torchgco.scenarios import Layouts
 

@@ -19,8 +19,8 @@ from torchgco import kernels
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.config.groups import options_of
 from torchgco.experiments.flying import progress, study
+from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import decisive
-from torchgco.experiments.results.records import COLUMNS
 from torchgco.scenarios import Layouts
 from torchgco.solvers.augmented_lagrangian import OuterLoop
 

@@ -35,6 +35,11 @@ def shown(value: object) -> str:
     return text if len(text) <= 80 and "\n" not in text else type(value).__name__
 
 
+def first_line(error: BaseException) -> str:
+    """An error in one line: the first of its text, or its type."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 def theirs(error: BaseException) -> BaseException | None:
     """An error with the part of its traceback that begins in a user's code, as the cause of an InputError.
 

@@ -13,7 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, first_line
 
 INDEX = 8  # bytes of a row's number
 PART = ("torchgco-", ".part")  # beginning and ending of the name of a file that is still being written
@@ -97,7 +97,7 @@ def read_arrays(
     except InputError:
         raise
     except Exception as error:  # damaged bytes make numpy, zipfile and zlib raise nearly anything
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         if "pickle" in reason:  # NumPy's words recommend to load it all the same
             reason = "of another format, or with Python objects"
         raise InputError(field, "a readable npz file without pickles", f"{path} ({reason})") from None

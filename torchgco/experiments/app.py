@@ -18,7 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, first_line
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import forget_composed, plain, recomposer
 from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
@@ -99,8 +99,7 @@ def _is_of_launcher(error: Exception) -> bool:
 
 def _stopped(error: Exception) -> str:
     """A launcher's error as one line."""
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
-    return f"a job was stopped ({reason}); what jobs flew is kept, and the same command resumes"
+    return f"a job was stopped ({first_line(error)}); what jobs flew is kept, and the same command resumes"
 
 
 def _remove_empty(folder: Path) -> None:

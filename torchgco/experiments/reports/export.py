@@ -22,8 +22,8 @@ from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import damaged, write
+from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.experiments.results.limits import read_table
-from torchgco.experiments.results.records import SOLUTIONS
 from torchgco.problem.sampled import TIME, sampled
 from torchgco.problem.times import times
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,8 @@ import pandas as pd
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import mission_from, solver_from, vehicle_of
-from torchgco.experiments.results.files import damaged
-from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
-from torchgco.experiments.results.records import (
+from torchgco.experiments.results.files import damaged, readable
+from torchgco.experiments.results.folder import (
     DONE,
     LAYOUTS,
     MANIFEST,
@@ -23,8 +22,10 @@ from torchgco.experiments.results.records import (
     SOLUTIONS,
     TRIALS,
     read_manifest,
+    read_trials,
 )
-from torchgco.experiments.results.runs import read_trials
+from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
 from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
@@ -76,7 +77,7 @@ class Study:
         Raises:
             InputError: the file is damaged, takes more than it may, or has other solvers or layouts.
         """
-        held = self._held(name, read_npz)
+        held = readable(self.folder / name, partial(read_npz, trust=self.trust))
         solvers, ids = list(self.manifest.solvers), self.layouts.ids
         named = {"solver", "layout", part} <= held.keys() and held["solver"].tolist() == solvers
         if not named or not np.array_equal(held["layout"], ids):
@@ -89,16 +90,7 @@ class Study:
     @property
     def log(self) -> pd.DataFrame:
         """The control steps of its missions; InputError where the file is damaged, or takes more than it may."""
-        return self._held(MISSION, read_log)
-
-    def _held(self, name: str, reader: Callable[[Path, bool], Any]) -> Any:
-        try:
-            return reader(self.folder / name, self.trust)
-        except InputError:
-            raise
-        except Exception as error:  # damaged bytes make readers raise nearly anything
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise damaged(self.folder / name, f"is damaged ({reason})") from None
+        return readable(self.folder / MISSION, partial(read_log, trust=self.trust))
 
     @property
     def missions(self) -> bool:

@@ -16,9 +16,8 @@ from torchgco.experiments.flying.mission_flight import FEW
 from torchgco.experiments.flying.progress import draw as draw_all
 from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
+from torchgco.experiments.results.folder import LAYOUTS, MISSION, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
-from torchgco.experiments.results.records import LAYOUTS, MISSION, TRIALS
-from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.missions.contact import Contact
 from torchgco.missions.planning_problem import airframe_of

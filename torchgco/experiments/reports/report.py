@@ -23,10 +23,10 @@ from torchgco.experiments.flying.progress import draw
 from torchgco.experiments.reports.finished import TRUST
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
+from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TRIALS, read_trials
 from torchgco.experiments.results.kinds import MISSION, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
-from torchgco.experiments.results.records import LAYOUTS, MANIFEST, SOLUTIONS, TRIALS
-from torchgco.experiments.results.runs import is_merged, read_trials
+from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.mission_statistics import summarise_missions
 from torchgco.experiments.statistics.statistics import TASK, plain, summarise, task_columns
 from torchgco.experiments.statistics.tables import FORMATS, format_frame

@@ -20,7 +20,7 @@ from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.records import SOLUTIONS
+from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.judging.judge import OTHERS_WITHIN
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Rows, flights_of

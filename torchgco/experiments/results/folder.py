@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shutil
-import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -21,12 +21,13 @@ from typing import IO, Any
 import numpy as np
 import pandas as pd
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, first_line
 from torchgco.base.files import PART, regular
 from torchgco.experiments.results.durations import parted
-from torchgco.experiments.results.files import checksum, create, damaged, write
+from torchgco.experiments.results.files import checksum, create, damaged, readable, write
 from torchgco.experiments.results.identity import Manifest, difference
 from torchgco.experiments.results.limits import read_npz, read_table
+from torchgco.experiments.statistics.statistics import check_trials
 from torchgco.scenarios import Layouts
 
 COLUMNS = (
@@ -43,10 +44,10 @@ Save = Callable[[IO[bytes]], Any]
 
 
 @dataclass(frozen=True)
-class Records:
+class StudyFolder:
     """One study's folder; with `repair`, damaged files are dropped and redone."""
 
-    folder: Path
+    path: Path
     manifest: Manifest
     repair: bool = False
 
@@ -62,8 +63,8 @@ class Records:
         Raises:
             InputError: results of another study lie there, or the study's manifest is damaged or missing.
         """
-        path = self.folder / MANIFEST
-        orphaned = (self.folder / TRIALS).is_file() or any(self.folder.glob("shards/*.npz"))
+        path = self.path / MANIFEST
+        orphaned = (self.path / TRIALS).is_file() or any(self.path.glob("shards/*.npz"))
         there = path.is_file()  # looked at after the results, which another job of the study may be writing
         if there and self._claimed(path):
             return
@@ -94,21 +95,34 @@ class Records:
             InputError: a file is damaged or missing. With `repair`, `layouts.npz` is written again, and for any other
                 file the study counts as unfinished.
         """
-        path = self.folder / DONE
-        if not path.is_file():
+        mark = self.path / DONE
+        if not mark.is_file():
             return False
-        for name, sums in (self._checksums() or {TRIALS: []}).items():
-            file = self.folder / name
-            if file.is_file() and checksum(file) in sums:
-                continue
+        for file in self._changed():
             if not self.repair:
                 raise damaged(file, "is damaged" if file.is_file() else "is missing")
-            if name != LAYOUTS:
-                path.unlink(missing_ok=True)  # another job may be repairing, too
+            if file.name != LAYOUTS:
+                mark.unlink(missing_ok=True)  # another job may be repairing, too
                 return False
             write(file, _arrays(layouts.arrays()))
             self.close()
         return True
+
+    def verify(self) -> None:
+        """Raise InputError where a file of the finished study isn't as the study wrote it."""
+        for file in self._changed():
+            raise damaged(file, "isn't as the study wrote it")
+
+    def table(self) -> pd.DataFrame:
+        """The trials of the finished study; InputError as `read_trials`."""
+        return read_trials(self.path / TRIALS, trust=True)
+
+    def _changed(self) -> Iterator[Path]:
+        """The files of the finished study that aren't there as it wrote them."""
+        for name, sums in (self._checksums() or {TRIALS: []}).items():
+            file = self.path / name
+            if not file.is_file() or checksum(file) not in sums:
+                yield file
 
     def missing(self, solver: str) -> list[int]:
         """Ids of the layouts that a solver hasn't flown.
@@ -141,7 +155,7 @@ class Records:
         )
         # JSON by way of Python floats keeps every bit, NaN and infinity included.
         columns = json.dumps(rows.to_dict(orient="list"), default=lambda value: value.item())
-        path = self.folder / "shards" / f"{solver}-{numbers[0]:06d}-{numbers[-1]:06d}.npz"
+        path = self.path / "shards" / f"{solver}-{numbers[0]:06d}-{numbers[-1]:06d}.npz"
         # Not compressed: controls hardly shrink, and a shard is dropped when the study is done.
         write(path, lambda file: np.savez(file, U=U, rows=np.array(columns)))
 
@@ -165,13 +179,13 @@ class Records:
         Where the time is free the last of the controls is the length of each stage.
         """
         solvers = np.array(list(self.manifest.solvers))
-        write(self.folder / TRIALS, _table(trials))
+        write(self.path / TRIALS, _table(trials))
         if isinstance(flown, pd.DataFrame):
-            write(self.folder / MISSION, _table(flown))
+            write(self.path / MISSION, _table(flown))
         else:
             own = {"U": flown} if layouts.free_time is None else parted(flown)
-            write(self.folder / SOLUTIONS, _arrays({**own, "solver": solvers, "layout": layouts.ids}))
-        write(self.folder / LAYOUTS, _arrays(layouts.arrays()))
+            write(self.path / SOLUTIONS, _arrays({**own, "solver": solvers, "layout": layouts.ids}))
+        write(self.path / LAYOUTS, _arrays(layouts.arrays()))
 
     def replace(self, trials: pd.DataFrame, layouts: Layouts) -> None:
         """Put other trials and layouts in the place of a finished study's."""
@@ -179,24 +193,24 @@ class Records:
         # Old and new content both count as whole until `close`: a stop in between damages nothing.
         sums = self._checksums()
         both = {name: [*held, sha256(new[name]).hexdigest()] if name in new else held for name, held in sums.items()}
-        write(self.folder / DONE, _json(both))
+        write(self.path / DONE, _json(both))
         for name, content in new.items():
-            write(self.folder / name, lambda file, content=content: file.write(content))
+            write(self.path / name, lambda file, content=content: file.write(content))
 
     def close(self) -> None:
         """Mark the study as done, with the checksums of its files, and drop its shards."""
-        write(self.folder / DONE, _json({name: [checksum(self.folder / name)] for name in self.files}))
+        write(self.path / DONE, _json({name: [checksum(self.path / name)] for name in self.files}))
         self.drop_shards()
-        for part in self.folder.glob(f"{PART[0]}*{PART[1]}"):  # of a start that was killed while it wrote
+        for part in self.path.glob(f"{PART[0]}*{PART[1]}"):  # of a start that was killed while it wrote
             part.unlink(missing_ok=True)
 
     def drop_shards(self) -> None:
         """Remove the shards of a study that is done."""
-        shutil.rmtree(self.folder / "shards", ignore_errors=True)
+        shutil.rmtree(self.path / "shards", ignore_errors=True)
 
     def _shards(self, solver: str) -> list[Path]:
         name = re.compile(rf"{re.escape(solver)}-\d+-\d+\.npz")
-        return sorted(path for path in self.folder.glob("shards/*.npz") if name.fullmatch(path.name))
+        return sorted(path for path in self.path.glob("shards/*.npz") if name.fullmatch(path.name))
 
     def _read(self, path: Path, solver: str) -> Flown:
         """A shard's rows and controls; InputError where it is damaged, or doesn't match its name or the study."""
@@ -215,9 +229,9 @@ class Records:
     def _checksums(self) -> dict[str, list[str]]:
         """The valid checksums of each file; with `repair`, an empty dict if they can't be read."""
         try:
-            sums = read_checksums(self.folder / DONE)
+            sums = read_checksums(self.path / DONE)
             if sums.keys() != set(self.files):
-                raise damaged(self.folder / DONE, "is damaged (it doesn't name all files)")
+                raise damaged(self.path / DONE, "is damaged (it doesn't name all files)")
         except InputError:
             if not self.repair:
                 raise
@@ -227,7 +241,7 @@ class Records:
     def _refuse_foreign(self) -> None:
         """Raise where a readable file in the folder is of another study than the manifest to be written."""
         wanted = self.manifest.settings
-        for path in [self.folder / TRIALS, *self.folder.glob("shards/*.npz")]:
+        for path in [self.path / TRIALS, *self.path.glob("shards/*.npz")]:
             try:
                 rows = read_table(path) if path.name == TRIALS else read_shard(path)[0]
             except Exception:  # unreadable: to be redone
@@ -240,50 +254,75 @@ class Records:
 
     def _another(self, which: str) -> InputError:
         return InputError(
-            "hydra.run.dir", "an empty folder, or one of this very study", f"{self.folder}, which holds another {which}"
+            "hydra.run.dir", "an empty folder, or one of this very study", f"{self.path}, which holds another {which}"
         )
 
 
 def read_manifest(path: Path, whole: bool = False) -> Manifest:
     """The manifest in a study.json; InputError where it is damaged, with `whole` also where a group is missing."""
-    try:
+
+    def read(path: Path) -> Manifest:
         manifest = Manifest.from_json(regular(path).read_bytes())
         if whole:
             manifest.check_whole()
         return manifest
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise damaged(path, f"is damaged ({_first_line(error)})") from None
+
+    return readable(path, read)
 
 
 def read_checksums(path: Path) -> dict[str, list[str]]:
     """The valid checksums of each file of a finished study; InputError where its mark is damaged."""
-    try:
+
+    def read(path: Path) -> dict[str, list[str]]:
         sums = json.loads(regular(path).read_bytes())
         if not all(isinstance(held, list) for held in sums.values()):
             raise ValueError("no checksums")
         return sums
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise damaged(path, f"is damaged ({_first_line(error)})") from None
+
+    return readable(path, read)
 
 
 def read_shard(path: Path) -> Flown:
     """The rows and controls in a shard; InputError where it can't be read."""
-    try:
-        held = read_npz(path)  # first, as it refuses sizes
-        with zipfile.ZipFile(path) as members:
-            if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
-                raise ValueError("a checksum differs")
+
+    def read(path: Path) -> Flown:
+        held = read_npz(path)
         rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
         absent = {*COLUMNS, "sound"} - {*JUDGED, *rows.columns}
         if absent or U.ndim != 3 or len(U) != len(rows):
             raise ValueError(f"{len(rows)} rows, controls {U.shape}, no {', '.join(sorted(absent)) or 'more'}")
-    except Exception as error:  # damaged bytes make numpy, zipfile and zlib raise nearly anything
-        raise damaged(path, f"is damaged ({_first_line(error)})") from None
-    return rows, U
+        return rows, U
+
+    return readable(path, read, sized=False)
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+def read_trials(path: str | os.PathLike[str], trust: bool = False) -> pd.DataFrame:
+    """The table in a `trials.parquet`.
+
+    Raises:
+        InputError: it can't be read, lacks columns of a study, isn't as the study left it, or without `trust` takes
+            more memory than a run's file may.
+    """
+    mark = Path(path).parent / DONE
+    sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
+    if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
+        raise damaged(Path(path), "isn't as the study wrote it")
+    trials = table_of(path, trust)
+    missing = [name for name in COLUMNS if name not in trials.columns]
+    if missing:
+        raise InputError("trials", "the columns of a study", f"{path} without {', '.join(missing)}")
+    check_trials(trials, path)
+    return trials
+
+
+def table_of(path: str | os.PathLike[str], trust: bool, **options: Any) -> pd.DataFrame:
+    """A table of trials, of a study or merged; InputError where it can't be read or takes more than it may."""
+    try:
+        return read_table(Path(path), trust, **options)
+    except InputError:
+        raise
+    except Exception as error:  # damaged bytes make the reader raise nearly anything
+        raise InputError("trials", "a readable parquet file", f"{path} ({first_line(error)})") from None
 
 
 def _table(trials: pd.DataFrame) -> Save:
