@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 MAX_LETTERS = 300  # letters of a value in an error
+NAMED = 5  # problems that a warning names
 
 
 class InputError(ValueError):

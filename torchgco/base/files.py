@@ -15,7 +15,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError, first_line
 
-INDEX = 8  # bytes of a row's number
+INDEX_BYTES = 8  # bytes of a row's number
 PART = ("torchgco-", ".part")  # beginning and ending of the name of a file that is still being written
 
 
@@ -89,7 +89,7 @@ def read_arrays(
             with np.load(file, allow_pickle=False) as held:
                 arrays = {name: held[name] for name in held.files}
             longest = max((max(array.shape, default=0) for array in arrays.values() if not array.size), default=0)
-            if INDEX * longest > room:  # no numbers, but as many rows
+            if INDEX_BYTES * longest > room:  # no numbers, but as many rows
                 expected = f"arrays whose rows fit into the {room / 1e9:.3g} GB {limit}"
                 raise InputError(field, expected, f"{path} with {longest:,} rows")
     except FileNotFoundError:

@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError
 from torchgco.native.compiler import NativeError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-OWN = (signal.default_int_handler, signal.SIG_DFL)  # handlers of Python and of the system
+OWN_HANDLERS = (signal.default_int_handler, signal.SIG_DFL)  # handlers of Python and of the system
 
 
 class Refused(SystemExit):
@@ -80,7 +80,7 @@ def raised() -> Iterator[Noted]:
     noted, before = Noted(), {}
     if threading.current_thread() is threading.main_thread():  # only that one may set handlers and gets signals
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
-        before = {number: held for number, held in handlers.items() if held in OWN or isinstance(held, Noted)}
+        before = {number: held for number, held in handlers.items() if held in OWN_HANDLERS or isinstance(held, Noted)}
     for number in before:
         signal.signal(number, noted)
     try:

@@ -17,8 +17,8 @@ STRIDE = 3  # steps between two layers of nodes
 ASIDE, LIFT = 4, 2  # nodes to each side, and above and below
 APART = 0.5  # m between them
 DELAYS = 5  # of which each is a layer longer
-CLOSE = 0.3  # m beyond the distance to keep, within which nodes cost more
-BLOCKED, NEAR, AWAY, TURN, LATE = 1e3, 4.0, 0.05, 0.3, 0.4  # costs of a node: closeness, offsets; of moves; of a delay
+HALO = 0.3  # m beyond the distance to keep, within which nodes cost more
+BLOCKED, GRAZE, AWAY, TURN, LATE = 1e3, 4.0, 0.05, 0.3, 0.4  # costs of a node: closeness, offsets; of moves; of a delay
 SMOOTH = 3  # steps before and after, over which a way is averaged
 
 Gaps = Callable[[np.ndarray], np.ndarray]  # distances (K,), m, of points (K, 3) from what is at rest
@@ -33,7 +33,7 @@ def evaded(points: np.ndarray, moving: Moving, static: Gaps, keep: float, dt: fl
         keep: distance from bodies, m.
         hold: s after the last point, in which that has to stay clear.
     """
-    t, aside = dt * np.arange(len(points)), APART * np.array([ASIDE, ASIDE, LIFT]) + keep + CLOSE
+    t, aside = dt * np.arange(len(points)), APART * np.array([ASIDE, ASIDE, LIFT]) + keep + HALO
     moving = moving.within(points.min(axis=0) - aside, points.max(axis=0) + aside, t[-1] + hold)
     if len(moving.radii) == 0:
         return points
@@ -82,7 +82,7 @@ def _costs(
         after = moving.gaps(last, np.full(len(last), dt * layers[-1] + t)).reshape(DELAYS, S)
         gaps[-1] = np.minimum(gaps[-1], after)
     gaps = np.minimum(gaps, rest[behind])
-    cost = np.where(gaps < keep, BLOCKED * (1.0 + keep - gaps), NEAR * np.clip(1.0 - (gaps - keep) / CLOSE, 0.0, 1.0))
+    cost = np.where(gaps < keep, BLOCKED * (1.0 + keep - gaps), GRAZE * np.clip(1.0 - (gaps - keep) / HALO, 0.0, 1.0))
     cost[0] = 0.0  # where the vehicle is
     return cost + AWAY * np.square(sides).sum(axis=1) + LATE * np.arange(DELAYS)[:, None]
 

@@ -14,15 +14,15 @@ from torchgco.exploration.sensing.world import Motion, World
 
 BESIDE = 0.3  # m around a ball, within which returns are its own
 JOINED = 0.4  # m: returns closer than about this belong to one body
-LEAST = 2  # returns of a body at least
+LEAST_RETURNS = 2  # returns of a body at least
 SMALLEST = 0.05  # m: radius of a body at least
-LARGEST = 1.6  # m: what is wider along an axis is no body that moves
+LARGEST_BODY = 1.6  # m: what is wider along an axis is no body that moves
 SEEN = 0.2  # m: standard deviation of a centre as it is seen
 ACCELERATION = 1.0  # m/s^2: standard deviation of what bodies do between two scans
 FASTEST = 1.0  # m/s: standard deviation of a velocity before anything is known of it
 LOOK = 10  # scans of a body between two looks whether it has moved
 STAYS = 0.25  # m: a body that has moved by less is at rest
-LOST = 0.6  # s without a return, after which a body is given up
+GIVEN_UP = 0.6  # s without a return, after which a body is given up
 LOOKS = 6  # moments at which bodies are looked at while a point stays clear
 GROWTH, MOST_GROWTH = 0.25, 0.5  # m/s by which balls grow ahead of their time, as velocities are estimates; m at most
 
@@ -263,12 +263,12 @@ class Tracks:
         for track in sorted(self.tracks, key=lambda track: -track.scans):
             away = np.linalg.norm(points - track.expected(t), axis=1)
             own = loose & (away <= track.radius + BESIDE)
-            if own.sum() >= LEAST:
+            if own.sum() >= LEAST_RETURNS:
                 self._follow(track, points[own], scan.origin, t)
                 loose &= ~own
         for members in clusters(points[loose]):
             self._begin(points[loose][members], scan.origin, t)
-        self.tracks = [track for track in self.tracks if t - track.last <= LOST and not self._rests(track, seen, t)]
+        self.tracks = [track for track in self.tracks if t - track.last <= GIVEN_UP and not self._rests(track, seen, t)]
         keep[rays] = ~self.now(t).holds(points)
         return keep
 
@@ -314,7 +314,7 @@ class Tracks:
 
     def _begin(self, points: np.ndarray, origin: np.ndarray, t: float) -> None:
         """A cluster of returns (R, 3) that no track expects begins one, unless it is too large for a body."""
-        if np.ptp(points, axis=0).max() > LARGEST:
+        if np.ptp(points, axis=0).max() > LARGEST_BODY:
             return
         center, radius = seen_ball(points, origin, self.pitch)
         self.tracks.append(Track(center, np.zeros(3), radius, t, center, t))
@@ -342,7 +342,7 @@ def clusters(points: np.ndarray) -> list[np.ndarray]:
     grid[tuple(cubes.T)] = True
     names, count = label(grid, np.ones((3, 3, 3)))
     own = names[tuple(cubes.T)]
-    return [rows for rows in (np.flatnonzero(own == n + 1) for n in range(count)) if len(rows) >= LEAST]
+    return [rows for rows in (np.flatnonzero(own == n + 1) for n in range(count)) if len(rows) >= LEAST_RETURNS]
 
 
 def seen_ball(points: np.ndarray, origin: np.ndarray, pitch: float) -> tuple[np.ndarray, float]:

@@ -30,13 +30,13 @@ from torchgco.exploration.explorer import (
 from torchgco.exploration.former import braking, ends_at_rest, former_plans
 from torchgco.exploration.movers import Known, Movers, Tracks, Unaware
 from torchgco.exploration.safety import AT_REST
-from torchgco.exploration.scout import DRIFT, SEARCH, SPARE, Scout
+from torchgco.exploration.scout import DRIFT, SEARCH_OPTIONS, SPARE, Scout
 from torchgco.exploration.sensing.grid import NOT_FREE, SEEN_OCCUPIED
 from torchgco.exploration.sensing.search import Search
 from torchgco.exploration.sensing.sensors import Sensor
 from torchgco.exploration.sensing.world import World
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
-from torchgco.missions.log import PARTS, SeenLog
+from torchgco.missions.log import TIMED_PARTS, SeenLog
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import EARLY, airframe_of
 from torchgco.obstacles.base import CONTACT_FACTOR
@@ -46,15 +46,15 @@ from torchgco.solvers.ending import optimality
 
 OUTER = 12  # outer iterations of a plan at most
 LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violation_tolerance": 5e-3}
-ROUGH = 0.01  # m of distance that sensed maps and plans between their knots may err by
-BETTER = 2 * ROUGH  # m of distance gained that an unsafe plan needs to replace another unsafe one
-AWAY = 1.0  # m/s^2 with which a vehicle gets out of a margin that it has entered
+MAP_ERROR = 0.01  # m of distance that sensed maps and plans between their knots may err by
+BETTER = 2 * MAP_ERROR  # m of distance gained that an unsafe plan needs to replace another unsafe one
+ESCAPE_ACCELERATION = 1.0  # m/s^2 with which a vehicle gets out of a margin that it has entered
 NEARLY = 0.2  # largest excess over the actuators' limits of a plan that replaces an unsafe one
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
-HOLD = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
-FINE = 4  # points tested per step of a plan
+CLEAR_AFTER = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
+TESTED_POINTS = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
 
 
@@ -90,7 +90,7 @@ class Exploration:
         start, goal = self.whole.x0[b, :3].numpy(), self.whole.goal.position[b].numpy()  # type: ignore[union-attr]
         seen, radius = self.explorer.map_of(start, goal), float(self.radius[b])
         size = seen.resolution
-        search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH)
+        search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH_OPTIONS)
         log = SeenLog(seen.corner, seen.shape, seen.resolution)
         world = World.of(self.whole, b)
         scout = Scout(
@@ -140,7 +140,7 @@ class Exploration:
                 took = [mapped - began, time.perf_counter() - mapped]
             scout.log.changes.append((scout.changed, scout.seen.state.reshape(-1)[scout.changed]))
             scout.changed = scout.changed[:0]
-            scout.seconds = dict(zip(PARTS, (*took, 0.0), strict=True))
+            scout.seconds = dict(zip(TIMED_PARTS, (*took, 0.0), strict=True))
 
     def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
         """Plans from plants measured at x (B, 17), and the seconds that they took, those of the maps among them."""
@@ -166,7 +166,7 @@ class Exploration:
 
     def parts(self) -> dict[str, Tensor]:
         """Seconds of the last period by part, (B,)."""
-        return {name: torch.tensor([s.seconds[name] for s in self.scouts], dtype=torch.float64) for name in PARTS}
+        return {name: torch.tensor([s.seconds[name] for s in self.scouts], dtype=torch.float64) for name in TIMED_PARTS}
 
     def seek(self, x: Tensor) -> None:
         """Find paths of vehicles measured at x (B, 17) to their goals, and the parts that are known to be free."""
@@ -188,10 +188,10 @@ class Exploration:
             p, keep = reference[b, :, :3].numpy(), scout.keep
             horizon = self.explorer.stages * self.dt
             around = horizon * self.explorer.speed
-            scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + HOLD).clear_of(p[0], keep)
+            scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + CLEAR_AFTER).clear_of(p[0], keep)
             if len(scout.moving.radii):
                 static = lambda q, scout=scout, keep=keep: scout.seen.gaps(q, keep + 0.3, self.kinds)
-                way = evaded(p, scout.moving, static, keep, self.dt, HOLD)
+                way = evaded(p, scout.moving, static, keep, self.dt, CLEAR_AFTER)
                 if way is not p:
                     reference[b, :, :3] = torch.from_numpy(way)
                     reference[b, :, 3:6] = torch.from_numpy(np.gradient(way, self.dt, axis=0))
@@ -208,10 +208,10 @@ class Exploration:
                 own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
                 if self.explorer.movers != "none":
                     times = self.dt * np.arange(1, N + 1)
-                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING, HOLD)], axis=1)
+                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING, CLEAR_AFTER)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 late = self.dt * (np.arange(1, N + 1) - EARLY).clip(0)
-                near = max(gap - ROUGH, CONTACT_FACTOR * scout.radius) + 0.5 * AWAY * late**2
+                near = max(gap - MAP_ERROR, CONTACT_FACTOR * scout.radius) + 0.5 * ESCAPE_ACCELERATION * late**2
                 new = (
                     (planes, own),
                     (room, far),
@@ -237,7 +237,7 @@ class Exploration:
         former = former.clone()
         for b, scout in enumerate(self.scouts):
             least = CONTACT_FACTOR * scout.radius + SPARE
-            blocked = np.flatnonzero(scout.seen.gaps(former[b].numpy(), least + ROUGH, self.kinds) < least)
+            blocked = np.flatnonzero(scout.seen.gaps(former[b].numpy(), least + MAP_ERROR, self.kinds) < least)
             if len(blocked):
                 at = max(0, int(blocked[0]) - WAITS)
                 former[b, at:] = former[b, at].clone()
@@ -306,19 +306,19 @@ class Exploration:
         if np.abs(X[:, 3:6]).max() > max(self.explorer.speed + OVER, np.abs(X[0, 3:6]).max()):
             return -np.inf
         p = X[:, :3]
-        share = np.arange(FINE)[:, None] / FINE
+        share = np.arange(TESTED_POINTS)[:, None] / TESTED_POINTS
         points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
         gaps = scout.seen.gaps(points, least + 2.0 * DRIFT, self.kinds)
-        gaps = np.minimum(gaps, scout.moving.gaps(points, self.dt / FINE * np.arange(len(points))))
+        gaps = np.minimum(gaps, scout.moving.gaps(points, self.dt / TESTED_POINTS * np.arange(len(points))))
         if len(scout.moving.radii):
-            late = self.dt * (len(p) - 1) + np.linspace(0.0, HOLD, FINE)
-            gaps[-1] = min(gaps[-1], scout.moving.gaps(np.repeat(p[-1:], FINE, axis=0), late).min())
+            late = self.dt * (len(p) - 1) + np.linspace(0.0, CLEAR_AFTER, TESTED_POINTS)
+            gaps[-1] = min(gaps[-1], scout.moving.gaps(np.repeat(p[-1:], TESTED_POINTS, axis=0), late).min())
         low, high = scout.seen.box(0.0)
         gaps = gaps - np.linalg.norm(points - points.clip(low, high), axis=1)  # how far outside of the map
         near = gaps[0] - least
         asked = np.zeros(len(gaps))
         if near < 0:
-            asked[: FINE * EARLY] = near - BETTER
+            asked[: TESTED_POINTS * EARLY] = near - BETTER
         return float((gaps - least - asked).min())
 
 

@@ -9,8 +9,8 @@ import numpy as np
 SWERVE = 0.25  # m at most, by which a turn misses its corner
 TIGHT = 0.02  # m by which it may where nothing is free beyond the corner: of what plans keep beyond contact
 STEEP = 2.5  # m/s^2 at most, straight up and down: thrust changes more slowly than a vehicle tilts
-SMOOTH = 5  # steps before and after, over which positions are averaged: that limits the jerk
-SETTLED = 0.3  # s before the horizon's end in which the reference rests
+REFERENCE_SMOOTHING = 5  # steps before and after, over which positions are averaged: that limits the jerk
+RESTS_BEFORE = 0.3  # s before the horizon's end in which the reference rests
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def motion(
     It starts with the vehicle's velocity (3,), and rests at the polyline's end, or shortly before the last of them.
     Turns miss the inner corners by `swing` (K-2,), m.
     """
-    at, last, slow = lengths(corners), count * dt - SETTLED, _corner_speeds(corners, pace, swing)
+    at, last, slow = lengths(corners), count * dt - RESTS_BEFORE, _corner_speeds(corners, pace, swing)
     steps = np.diff(corners, axis=0) / np.maximum(np.diff(at), 1e-9)[:, None]
     places, s = np.zeros(count + 1), 0.0
     v = max(0.0, float(steps[0] @ velocity)) if len(steps) else 0.0
@@ -112,12 +112,12 @@ def _smoothed(points: np.ndarray, velocity: np.ndarray, dt: float) -> tuple[np.n
 
     The first remains where it is.
     """
-    before = points[0] - np.arange(SMOOTH, 0, -1)[:, None] * dt * velocity
-    whole = np.concatenate([before, points, np.repeat(points[-1:], SMOOTH, axis=0)])
-    width = 2 * SMOOTH + 1
+    before = points[0] - np.arange(REFERENCE_SMOOTHING, 0, -1)[:, None] * dt * velocity
+    whole = np.concatenate([before, points, np.repeat(points[-1:], REFERENCE_SMOOTHING, axis=0)])
+    width = 2 * REFERENCE_SMOOTHING + 1
     sums = np.concatenate([np.zeros((1, 3)), whole.cumsum(axis=0)])
     mean = (sums[width:] - sums[:-width]) / width
-    fade = np.exp(-np.arange(len(mean)) / SMOOTH)[:, None]
+    fade = np.exp(-np.arange(len(mean)) / REFERENCE_SMOOTHING)[:, None]
     mean = mean + fade * (points[0] - mean[0])
     speeds = np.diff(mean, axis=0, append=mean[-1:]) / dt
     return mean, speeds

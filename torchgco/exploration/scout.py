@@ -17,17 +17,17 @@ from torchgco.exploration.sensing.world import World
 from torchgco.missions.log import SeenLog
 from torchgco.obstacles.base import CONTACT_FACTOR
 
-SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
+SEARCH_OPTIONS: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
 # Where no way is found, a search with less margin, then one over all cells: the share of the margin, and the stride.
-LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
+CAUTION_LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 MOST_SEARCHED = 24_000  # cells that searches of a control period look at: 15 ms
 SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin, or a slow reference, ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
-STILL = 0.3  # m within which a vehicle has stayed in its place
-AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
+STAYED_WITHIN = 0.3  # m within which a vehicle has stayed in its place
+PATH_POINTS_AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
 SLOW = 0.45  # factor on the speed of a slow reference; at 1 m/s^2 it still leaves a place within `patience`
 PAUSE = 0.25  # s in one place after which a reference that no plan follows becomes slow, for `HELD`
 
@@ -57,7 +57,7 @@ class Scout:
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
     waited: int = 0  # control periods near `place`
     place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
-    level: int = 0  # of LEVELS
+    level: int = 0  # of CAUTION_LEVELS
     since: int = 0  # control periods at this level
     slow: int = 0  # control periods for which the reference stays slow, in this place
     seconds: dict[str, float] = field(default_factory=dict)
@@ -69,7 +69,7 @@ class Scout:
     @property
     def keep(self) -> float:
         """The distance, m, that plans keep from what isn't known to be free."""
-        least, share = CONTACT_FACTOR * self.radius + SPARE + 2.0 * DRIFT, LEVELS[self.level][0]
+        least, share = CONTACT_FACTOR * self.radius + SPARE + 2.0 * DRIFT, CAUTION_LEVELS[self.level][0]
         return share * max(least, self.radius + self.explorer.margin) + (1.0 - share) * least
 
     def seek(self, position: np.ndarray) -> None:
@@ -102,7 +102,7 @@ class Scout:
             self.level, self.since = 0, 0
         left = MOST_SEARCHED
         while True:
-            self.search.radius, self.search.stride = self.keep, LEVELS[self.level][1]
+            self.search.radius, self.search.stride = self.keep, CAUTION_LEVELS[self.level][1]
             self.search.limit = max(left, 1)
             found = self.search.path(position, self.goal)
             left -= self.search.expanded
@@ -112,7 +112,7 @@ class Scout:
             new, arrives = found
             self.path = self._steady(position, new) if arrives and self.arrives else new
             self.arrives = arrives
-            if arrives or self.level + 1 == len(LEVELS):
+            if arrives or self.level + 1 == len(CAUTION_LEVELS):
                 return
             self.level, self.since = self.level + 1, 0
 
@@ -130,13 +130,13 @@ class Scout:
 
         The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
         """
-        if np.linalg.norm(position - self.place) > STILL:
+        if np.linalg.norm(position - self.place) > STAYED_WITHIN:
             self.place, self.waited, self.slow = position.copy(), 0, 0
         self.waited += self.search.pending is None
         if self.waited * self.dt >= self.explorer.patience:
             blocked = np.flatnonzero(gaps < self.keep)
             first = blocked[blocked > 0][:1]
-            self.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
+            self.search.avoid(points[first[0] if len(first) else min(PATH_POINTS_AHEAD, len(points) - 1)], 1.0)
             self.waited = 0
 
     def motion(self, velocity: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

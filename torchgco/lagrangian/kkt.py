@@ -18,8 +18,8 @@ from torch import Tensor
 
 # sigma, as a multiple of the largest curvature: the root of rounding, which balances what each round leaves
 STIFF = 1e8
-ROUNDS = 4
-PIVOT = 1e-14  # least pivot of the factors, as a share of its entry: where one is less, the minimum isn't strict
+SHIFT_ROUNDS = 4
+LEAST_PIVOT = 1e-14  # least pivot of the factors, as a share of its entry: where one is less, the minimum isn't strict
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.missions.planner import Plan
 from torchgco.missions.tracker import Tracking
 
-PARTS = ("map_seconds", "field_seconds", "search_seconds")
+TIMED_PARTS = ("map_seconds", "field_seconds", "search_seconds")
 
 
 @dataclass
@@ -117,6 +117,6 @@ class MissionLog:
     def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
         """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""
         names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
-        names = (*names, "planner_seconds", "tracker_seconds", *(PARTS if self.seen else ()))
+        names = (*names, "planner_seconds", "tracker_seconds", *(TIMED_PARTS if self.seen else ()))
         names = (*names, *(["plan"] if plans else []))
         return {name: getattr(self, name).numpy() for name in names}

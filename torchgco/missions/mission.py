@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
-from torchgco.base.shapes import check_tensor, computing_on
+from torchgco.base.shapes import CPU, check_tensor, computing_on
 from torchgco.base.tree import take
 from torchgco.constraints.gates import has_gates
 from torchgco.dynamics.base import Dynamics
@@ -37,7 +37,6 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
-CPU = torch.device("cpu")
 Begin = Callable[[Problem, Tensor, int, Tensor], Pilot]
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
 

@@ -13,7 +13,7 @@ from torchgco.base.notices import watched
 from torchgco.experiments.config.launching import side_by_side
 
 # Parts of a trial count too: a mission is one, and takes seconds.
-LAYOUT = "{l_bar}{bar}| {n:.0f}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+BAR_FORMAT = "{l_bar}{bar}| {n:.0f}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 PERIOD = 30.0  # s between two lines of a job
 
 

@@ -19,8 +19,8 @@ from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
-from torchgco.experiments.flying.mission_flight import FEW, MissionFlight
-from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines, lines_alone
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionFlight
+from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
 from torchgco.experiments.flying.workers import Shared, run_all
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
@@ -225,7 +225,7 @@ def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
     count = layouts * len(study.solvers)
     if lines_alone():
         return Lines(name, count, count - left)
-    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=LAYOUT)
+    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=BAR_FORMAT)
 
 
 def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
@@ -244,7 +244,7 @@ def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | 
     if study.setup.mission is None:
         most = None if study.layouts.stages is None else int(np.max(study.layouts.stages))
         return Flight(study.setup, layouts, name, solver, bar, most)
-    return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= FEW)
+    return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
 
 
 def _fly_side_by_side(

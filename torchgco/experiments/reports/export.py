@@ -24,11 +24,11 @@ from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import damaged, write
 from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.experiments.results.limits import read_table
-from torchgco.problem.sampled import TIME, sampled
+from torchgco.problem.sampled import TIME_COLUMN, sampled
 from torchgco.problem.times import times
 
 FOLDER = "export"
-QUATERNION, VELOCITY = slice(6, 10), slice(3, 6)  # of the plant's states
+ATTITUDE_STATES, VELOCITY = slice(6, 10), slice(3, 6)  # of the plant's states
 Table = tuple[str, int, pd.DataFrame]  # solver, layout, columns
 
 
@@ -134,8 +134,8 @@ def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:
         u = u[np.clip(np.searchsorted(t[:, 0], at + 1e-9, side="right") - 1, 0, len(u) - 1)]  # they hold
     rates = np.gradient(x[:, VELOCITY], t[:, 0], axis=0) if len(t) > 1 else np.zeros((1, 3))
     x, rates = _between(at, t[:, 0], x), _between(at, t[:, 0], rates)
-    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
-    columns: dict[str, Any] = {TIME: at}
+    x[:, ATTITUDE_STATES] /= np.linalg.norm(x[:, ATTITUDE_STATES], axis=1, keepdims=True)
+    columns: dict[str, Any] = {TIME_COLUMN: at}
     columns |= {one.label: x[:, i] for i, one in enumerate(states_of(plant))}
     columns |= {f"a{axis} [m/s^2]": rates[:, i] for i, axis in enumerate("xyz")}
     columns["thrust [N]"] = x[:, 13:].sum(1)

@@ -33,7 +33,7 @@ from torchgco.view.document import Document
 from torchgco.view.flights import constraint_name
 from torchgco.view.vehicles import Look
 
-BATCH = 64  # layouts whose trajectories are measured at once
+MEASURED_AT_ONCE = 64  # layouts whose trajectories are measured at once
 TRUST = "--trust", "admit any size in a run's files, and any class, such as a model of yours: its code runs"
 
 
@@ -68,7 +68,7 @@ class Study:
         vehicle = vehicle_of(manifest.configuration, trust)
         layouts, trials = read_layouts(folder / LAYOUTS, trust), read_trials(folder / TRIALS, trust)
         if not trust:
-            check_stages(folder, vehicle, layouts, BATCH)
+            check_stages(folder, vehicle, layouts, MEASURED_AT_ONCE)
         return cls(folder, manifest, vehicle, layouts, trials, trust)
 
     def flown(self, name: str, part: str) -> dict[str, np.ndarray]:
@@ -107,7 +107,7 @@ class Study:
 
     def batches(self) -> Iterator[tuple[np.ndarray, Problem]]:
         """Problems of some layouts at a time, and their places."""
-        for places in self.layouts.together(BATCH):
+        for places in self.layouts.together(MEASURED_AT_ONCE):
             yield places, self.vehicle.task(self.layouts.take(places)).problem
 
     @property

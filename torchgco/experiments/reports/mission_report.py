@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from torchgco.experiments.config.build import Setup
-from torchgco.experiments.flying.mission_flight import FEW
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT
 from torchgco.experiments.flying.progress import draw as draw_all
 from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
@@ -31,7 +31,7 @@ from torchgco.scenarios import Layouts
 
 SNAPSHOTS = 4  # instants of a mission in one figure
 # Where few missions fly: planned positions (solver, L, K, N+1, 3), and a row per time step of the plant.
-PLANS, TIME_STEPS = "plans.npz", "time_steps.parquet"
+PLANS_FILE, TIME_STEPS = "plans.npz", "time_steps.parquet"
 
 
 def mission_table(
@@ -58,7 +58,7 @@ def mission_table(
         steps = pd.concat(fine, ignore_index=True)
         write(folder / TIME_STEPS, lambda file: steps.to_parquet(file, index=False))
         held = {"plan": np.stack(plans), "solver": np.array(solvers), "layout": layouts.ids}
-        write(folder / PLANS, lambda file: np.savez_compressed(file, **held))
+        write(folder / PLANS_FILE, lambda file: np.savez_compressed(file, **held))
     return pd.concat(frames, ignore_index=True)
 
 
@@ -70,7 +70,7 @@ def write_mission_report(folder: Path, setup: Setup, figures: bool = True) -> st
     if figures:
         draw_all(_drawings(folder, trials, setup))
     text = format_report(parts, "table")
-    return mission_lines(trials) if trials["layout"].nunique() <= FEW else text
+    return mission_lines(trials) if trials["layout"].nunique() <= PLANS_KEPT else text
 
 
 def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Callable[[], object]]:
@@ -122,9 +122,9 @@ class _Flown:
     @classmethod
     def read(cls, folder: Path) -> _Flown | None:
         """None where a study has many missions."""
-        if not all((folder / name).is_file() for name in (PLANS, TIME_STEPS)):
+        if not all((folder / name).is_file() for name in (PLANS_FILE, TIME_STEPS)):
             return None
-        with np.load(folder / PLANS, allow_pickle=False) as held:
+        with np.load(folder / PLANS_FILE, allow_pickle=False) as held:
             plans = dict(zip(held["solver"].tolist(), held["plan"], strict=True))
         return cls(pd.read_parquet(folder / MISSION), pd.read_parquet(folder / TIME_STEPS), plans)
 

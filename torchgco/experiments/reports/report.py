@@ -24,12 +24,12 @@ from torchgco.experiments.reports.finished import TRUST
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TRIALS, read_trials
-from torchgco.experiments.results.kinds import MISSION, Part, format_report, parts_of, write_tables
+from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.mission_statistics import summarise_missions
 from torchgco.experiments.statistics.statistics import TASK, plain, summarise, task_columns
-from torchgco.experiments.statistics.tables import FORMATS, format_frame
+from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
@@ -106,7 +106,7 @@ def drawings(part: Part) -> Drawings:
 
     What would be empty isn't drawn: a distribution or shares of single trials.
     """
-    mission = part.kind == MISSION
+    mission = part.kind == MISSIONS
     named, again = ("outcomes", summarise_missions) if mission else ("rates", summarise)
     trials, summary, held = part.trials, part.summary, {}
     swept = task_columns(trials)[len(TASK) :]
@@ -154,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="torchgco-report", description="One report on many studies.")
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
-    parser.add_argument("--format", choices=FORMATS, default="table", help="of the tables on stdout; default: table")
+    parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser

@@ -20,7 +20,7 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import vehicle_of
-from torchgco.experiments.flying.mission_flight import LOST
+from torchgco.experiments.flying.mission_flight import FAILED
 from torchgco.experiments.results.durations import durations, times_at
 from torchgco.experiments.results.files import damaged, readable
 from torchgco.experiments.results.folder import (
@@ -46,9 +46,9 @@ from torchgco.scenarios import Layouts, Vehicle
 
 TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries round differently
 BATCH = 256  # layouts judged at once
-ROW = ["solver", "layout"]
+TRIAL = ["solver", "layout"]
 IDENTITY = ("model", "seed", "version", "device", "dtype", "layout_digest", "settings_digest")
-KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row of summary.csv or paired.csv
+ROW_KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row of summary.csv or paired.csv
 DIFFERENT = 10  # differing values that are printed per table
 # Of missions: columns that the log, which has the states at control steps alone, can't confirm; and those that are
 # compared with the outcome only.
@@ -122,10 +122,10 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     missions = manifest.configuration.get("mission") is not None
     layouts = readable(folder / LAYOUTS, partial(read_layouts, trust=trust))
     held = readable(folder / TRIALS, partial(read_table, trust=trust))
-    rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=ROW)
-    if not set(ROW) <= set(held.columns) or not held.set_index(ROW).index.sort_values().equals(rows.sort_values()):
+    rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=TRIAL)
+    if not set(TRIAL) <= set(held.columns) or not held.set_index(TRIAL).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
-    held = held.set_index(ROW)
+    held = held.set_index(TRIAL)
     vehicle = vehicle_of(manifest.configuration, trust)
     if not trust:
         check_stages(folder, vehicle, layouts, BATCH)
@@ -160,7 +160,7 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
             shapes = (f"{len(some)} rows, {len(some.columns)} columns" for some in (held, computed))
             differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
         else:
-            keys = pd.MultiIndex.from_frame(computed[KEYS.intersection(computed.columns)])
+            keys = pd.MultiIndex.from_frame(computed[ROW_KEYS.intersection(computed.columns)])
             differences = _differences(held.set_axis(keys), computed.set_axis(keys))
         found.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
     return found, tuple(absent)
@@ -196,7 +196,7 @@ def _trajectories(
             more = durations(times) | gates_passed(task.problem, verdict)
             parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
-    return rows.set_index(ROW)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
+    return rows.set_index(TRIAL)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
 
 
 def _missions(
@@ -219,12 +219,12 @@ def _missions(
         rows.append(
             {
                 "solver": solver, "layout": layout, "status": outcome,
-                "feasible": outcome not in {lost.name for lost in LOST}, "reached": outcome == Outcome.REACHED.name,
+                "feasible": outcome not in {lost.name for lost in FAILED}, "reached": outcome == Outcome.REACHED.name,
                 "clearance_knots": nearest[solver][layout],
                 **step_columns({str(name): column.to_numpy() for name, column in steps.items()}, period),
             }
         )  # fmt: skip
-    return pd.DataFrame(rows).set_index(ROW)
+    return pd.DataFrame(rows).set_index(TRIAL)
 
 
 def _nearest(log: pd.DataFrame, layouts: Layouts, contact: Contact, period: float) -> dict[int, float]:

@@ -27,8 +27,8 @@ from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page
 from torchgco.view.vehicles import look_of
 
-NAME = "view.html"
-SLOW = 256  # layouts from which on a bar shows how far the page is
+PAGE_NAME = "view.html"
+SLOW_PAGE = 256  # layouts from which on a bar shows how far the page is
 
 
 def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) -> str:
@@ -52,7 +52,7 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
     controls, held_times = study.flown(SOLUTIONS, "U"), study.times
     document, rows, order = None, study.rows, list[np.ndarray]()
-    hidden = study.layouts.count < SLOW or not watched()
+    hidden = study.layouts.count < SLOW_PAGE or not watched()
     bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=hidden)
     for places, problem in study.batches():
         look = look_of(problem.dynamics)
@@ -100,7 +100,7 @@ def told(row: Mapping[str, Any]) -> Rows:
 def _parser() -> argparse.ArgumentParser:
     parser = RunParser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
-    parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {NAME} in RUN")
+    parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {PAGE_NAME} in RUN")
     words = "solve the layouts of these numbers again, and show the search"
     parser.add_argument("--search", metavar="N", type=int, nargs="+", default=[], help=words)
     parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
@@ -109,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def write_view(folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False) -> Path:
     """Write the page of a finished study; returns where it lies. Raises InputError as `study_page` does."""
-    path = folder / NAME if output is None else output
+    path = folder / PAGE_NAME if output is None else output
     if path.is_dir():
         raise InputError("--output", "a file", f"{path}, which is a folder")
     text = study_page(folder, searched, trust)

@@ -30,7 +30,7 @@ CLOSED_LOOP = ("mission", "plant")  # nodes of missions
 GROUPS = ("scenario", "model", "device", *CLOSED_LOOP)
 DIGITS = 16  # hexadecimal, of a digest: 64 bits
 EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same float
-LONGEST = 40  # letters of a value in a message
+MESSAGE_LETTERS = 40  # letters of a value in a message
 
 
 def settings_of(configuration: Mapping[str, Any]) -> dict[str, Any]:
@@ -241,4 +241,4 @@ def _short(value: Any) -> str:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     text = str(value)
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return text if len(text) <= MESSAGE_LETTERS else f"{text[:MESSAGE_LETTERS]}..."

@@ -17,7 +17,7 @@ from torchgco.experiments.statistics.statistics import TASK, are_missions, summa
 from torchgco.experiments.statistics.tables import csv_text, format_frame, format_table, printed
 
 KIND = "kind"  # first column of summary.csv and paired.csv
-TRAJECTORY, MISSION = "trajectory", "mission"
+TRAJECTORIES, MISSIONS = "trajectory", "mission"
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ def parts_of(trials: pd.DataFrame) -> list[Part]:
     """
     missions = are_missions(trials)
     if trials.empty or not missions.any():
-        return [Part(TRAJECTORY, trials, summarise(trials), compare(trials))]
+        return [Part(TRAJECTORIES, trials, summarise(trials), compare(trials))]
     flown, single = _own(trials[missions]), _own(trials[~missions])
     pairs = compare(flown)
-    found = [Part(MISSION, flown, summarise_missions(flown), pairs[pairs["outcome"] == "reached"])]
-    return [Part(TRAJECTORY, single, summarise(single), compare(single)), *found] if len(single) else found
+    found = [Part(MISSIONS, flown, summarise_missions(flown), pairs[pairs["outcome"] == "reached"])]
+    return [Part(TRAJECTORIES, single, summarise(single), compare(single)), *found] if len(single) else found
 
 
 def _own(rows: pd.DataFrame) -> pd.DataFrame:
@@ -99,8 +99,8 @@ def format_report(parts: Sequence[Part], form: str) -> str:
 
 
 def _text(part: Part) -> str:
-    return (format_missions if part.kind == MISSION else format_table)(part.summary, part.paired)
+    return (format_missions if part.kind == MISSIONS else format_table)(part.summary, part.paired)
 
 
 def _printed(part: Part) -> list[pd.DataFrame]:
-    return (printed_missions if part.kind == MISSION else printed)(part.summary, part.paired)
+    return (printed_missions if part.kind == MISSIONS else printed)(part.summary, part.paired)

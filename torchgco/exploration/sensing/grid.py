@@ -15,7 +15,7 @@ SEEN_OCCUPIED, NOT_FREE = 1 << OCCUPIED, (1 << OCCUPIED) | (1 << UNKNOWN)  # kin
 # Log-odds. Returns make an unknown cell occupied, and outweigh many rays that pass: they may pass through the free part
 # of a cell that an obstacle fills in part. For the same reason it takes several of them to make a cell free.
 # Beside an occupied cell it takes more, as the surface may go on into this one.
-HIT, MISS, LEAST, MOST, FREE_AT, FREE_BESIDE, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.55, -1.45, 0.5
+HIT, MISS, LEAST_ODDS, MOST_ODDS, FREE_AT, FREE_BESIDE, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.55, -1.45, 0.5
 REACH = 4  # as C has it
 CHORD = 0.5  # of a cell's side: what a ray passes for less, it doesn't show
 
@@ -63,7 +63,7 @@ class SeenMap:
             self._counts, len(scan.distances), np.ascontiguousarray(scan.origin, np.float64),
             np.ascontiguousarray(scan.directions, np.float64), np.ascontiguousarray(scan.distances, np.float64),
             float(reach), float(before), CHORD * self.resolution,
-            HIT, MISS, LEAST, MOST, FREE_AT, FREE_BESIDE, OCCUPIED_AT, self._touched, self._changed,
+            HIT, MISS, LEAST_ODDS, MOST_ODDS, FREE_AT, FREE_BESIDE, OCCUPIED_AT, self._touched, self._changed,
         )  # fmt: skip
         return self._changed[:found].copy()
 

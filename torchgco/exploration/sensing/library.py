@@ -13,8 +13,8 @@ import numpy as np
 
 from torchgco.native.compiler import Compiler, build, find_compiler
 
-FOLDER = Path(__file__).parent / "c"
-TYPES = {"int64_t": c_int64, "double": c_double}
+C_FOLDER = Path(__file__).parent / "c"
+C_TYPES = {"int64_t": c_int64, "double": c_double}
 DECLARED = re.compile(r"^\w+ (tgco_\w+)\(([^)]*)\)", re.MULTILINE)
 
 
@@ -38,10 +38,10 @@ def _passed(value: Any) -> Any:
 
 @functools.cache
 def _library(compiler: Compiler | None) -> ctypes.CDLL:
-    source = "\n".join(path.read_text() for path in sorted(FOLDER.glob("*.c")))
+    source = "\n".join(path.read_text() for path in sorted(C_FOLDER.glob("*.c")))
     library = build(source)
     for name, declared in DECLARED.findall(source):
         function = getattr(library, name)
         function.restype = c_int64
-        function.argtypes = [c_void_p if "*" in one else TYPES[one.split()[0]] for one in declared.split(",")]
+        function.argtypes = [c_void_p if "*" in one else C_TYPES[one.split()[0]] for one in declared.split(",")]
     return library

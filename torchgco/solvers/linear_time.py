@@ -22,10 +22,10 @@ from torchgco.solvers.straight import last_rows
 TIMES = 16  # that are tried, from the shortest to the longest
 STAGES = 20  # of constant controls in each
 MISSES = 1e-6  # of the way to the end, which counts as reached
-SLACK = 1e-9  # by which controls and states may pass their bounds
+LIMIT_SLACK = 1e-9  # by which controls and states may pass their bounds
 
 
-class Steering:
+class LinearTime:
     """The linear model of problems with a free time, and what its controls of least squares do in some time.
 
     Args:
@@ -109,11 +109,11 @@ class Steering:
 
     def _fits(self, x: Tensor, u: Tensor, misses: Tensor) -> Tensor:
         """Whether the end is reached, and controls and states are within their bounds, (B,) bool."""
-        fits = (misses <= MISSES) & (u.abs().amax((1, 2)) <= 1.0 + SLACK)
+        fits = (misses <= MISSES) & (u.abs().amax((1, 2)) <= 1.0 + LIMIT_SLACK)
         for bounds in self.problem.constraints:
             if isinstance(bounds, StateBounds) and isinstance(bounds.knots, slice) and bounds.lower.dim() == 2:
                 over = torch.maximum(x - bounds.upper.unsqueeze(1), bounds.lower.unsqueeze(1) - x)
-                fits &= over[:, 1:].amax((1, 2)) <= SLACK
+                fits &= over[:, 1:].amax((1, 2)) <= LIMIT_SLACK
         return fits
 
 
