@@ -184,7 +184,7 @@ OF_ILQR: dict[str, tuple[float, ILQR, Callable[[State], None], Callable[[], Prob
     "DAMPING": (0.05, CHOOSY, unchanged, planar, 1),
     "DAMPING_GROWTH": (7.0, CHOOSY, damped, planar, 2),
     "DAMPING_DECAY": (2.0, ILQR(), damped, planar, 1),
-    "ROUNDING": (1e6, ILQR(), unchanged, planar, 1),
+    "ROUNDED_OFF": (1e6, ILQR(), unchanged, planar, 1),
 }
 PRINTED = ILQR(as_printed=True, line_search=Choosy())  # takes the last step length
 OF_LINE_SEARCH = {
@@ -217,7 +217,7 @@ def same(a: State, b: State) -> bool:
 
 @pytest.mark.parametrize("B", [1, 3])
 def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
-    """With LOST = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
+    """With LOST_BY = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
     problem = planar().take(torch.arange(B))
     usual = run(CHOOSY, unchanged, problem, True, 1)
     monkeypatch.setattr(lifted, "LOST_BY", 0.0)
@@ -269,8 +269,8 @@ def test_the_collision_penalty_changes_both_kernels(monkeypatch) -> None:
 
 
 OF_ROADMAP = {
-    "SHELLS": {2: (1.4,)}, "RAYS": 5, "MIDWAY": 1, "CLEAR": 0.4, "EDGE_COST": 0.3, "HOPS": 1, "TIE": 0.5, "AROUND": 4.0,
-    "TINY": 3.0, "SMALL": 30.0,
+    "SHELLS": {2: (1.4,)}, "CIRCLE": 5, "MIDWAY": 1, "LEAST_GAP": 0.4, "EDGE_COST": 0.3, "HOPS": 1, "TIE": 0.5,
+    "AROUND": 4.0, "TINY": 3.0, "UNIT": 30.0,
 }  # fmt: skip
 
 
