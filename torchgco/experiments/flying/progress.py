@@ -77,6 +77,11 @@ def lines_alone() -> bool:
     return side_by_side() or not watched()
 
 
+def page_bar(total: int, slow: int, unit: str, of: str | None = None) -> tqdm:
+    """A bar over the parts of a page, shown where there are `slow` or more and somebody watches."""
+    return tqdm(total=total, desc=of, unit=unit, leave=False, disable=total < slow or not watched())
+
+
 def draw(drawings: Mapping[str, Callable[[], object]]) -> None:
     """Draw figures, and say before how many: they may take longer than what they show."""
     if not drawings:

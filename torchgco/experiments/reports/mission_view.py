@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from tqdm import tqdm
 
 from torchgco.base.errors import InputError
 from torchgco.base.memory import limited
-from torchgco.base.notices import watched
+from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS_FILE
 from torchgco.experiments.results.limits import LARGEST_FILE
@@ -98,18 +97,13 @@ class _Log:
             return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:
-            with limited(math.inf if study.trust else LARGEST_FILE), _bar(len(x)) as bar:
+            with limited(math.inf if study.trust else LARGEST_FILE), page_bar(len(x), SLOW_MAP, "period", "map") as bar:
                 replay = replayed(loop, problem, x, study.seed, number, bar.update)
         except (NativeError, MemoryError) as error:  # a map of any size can be asked for
             notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]
             return replace(flight, plan=plan[: len(flight.path)])
         safe = steps["safe"].to_numpy() == 1
         return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(replay.seen, replay.sought, safe))
-
-
-def _bar(periods: int) -> tqdm:
-    hidden = periods < SLOW_MAP or not watched()
-    return tqdm(total=periods, desc="map", unit="period", leave=False, disable=hidden)
 
 
 def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:

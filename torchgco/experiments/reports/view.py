@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from torchgco.base.errors import InputError
-from torchgco.base.notices import watched
 from torchgco.experiments.ending import ended, say
+from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.reports.finished import TRUST, Study, document_of
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.parser import RunParser
@@ -52,8 +51,7 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
     controls, held_times = study.flown(SOLUTIONS, "U"), study.times
     document, rows, order = None, study.rows, list[np.ndarray]()
-    hidden = study.layouts.count < SLOW_PAGE or not watched()
-    bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=hidden)
+    bar = page_bar(study.layouts.count, SLOW_PAGE, "layout")
     for places, problem in study.batches():
         look = look_of(problem.dynamics)
         document = document or document_of(study, problem, look)

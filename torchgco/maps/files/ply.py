@@ -1,4 +1,7 @@
-"""ply: the vertices of a Stanford polygon file, as text or binary, or its mesh. Plyfile has a stronger licence."""
+"""ply: the vertices of a Stanford polygon file, as text or binary, or its mesh.
+
+Read by hand: plyfile has a stronger licence, and trimesh, which reads meshes, is an extra that clouds do without.
+"""
 
 from __future__ import annotations
 
