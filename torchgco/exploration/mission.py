@@ -15,7 +15,6 @@ from torchgco.missions.mission import Mission
 from torchgco.missions.pilot import Pilot
 from torchgco.native.compiler import find_compiler
 from torchgco.problem.problem import Problem
-from torchgco.solution import Solution
 
 
 @dataclass(frozen=True)
@@ -55,12 +54,6 @@ class SensorMission(Mission):
         if not self.sees_all and find_compiler() is None:
             wanted = "full on a machine without a C compiler: sensors and their maps are computed in C (TORCHGCO_CC)"
             raise InputError("mission.sensor", wanted, self.sensor)
-
-    def first_plans(self, problem: Problem, seed: int = 0, ids: Tensor | None = None) -> tuple[Problem, Solution]:
-        """See `Mission`; missions with a sensor, which plan on their maps, raise InputError."""
-        if not self.sees_all:
-            raise InputError("mission.sensor", "full for first plans", self.sensor)
-        return super().first_plans(problem, seed, ids)
 
     def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
         """Who plans for vehicles at plants x (B, 17): the planner, or with a sensor the explorer."""

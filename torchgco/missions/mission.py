@@ -117,8 +117,10 @@ class Mission:
         """The planning problems of the first control period, and the solutions that `fly` makes its first plans of.
 
         Raises:
-            InputError: as `fly`.
+            InputError: as `fly`, and for missions with a sensor, which plan on their maps.
         """
+        if not self.sees_all:
+            raise InputError("mission.sensor", "full for first plans", "a sensor")
         problem, seed, ids = check_flown(self, problem, seed, ids)
         with computing_on(CPU):
             x = hovering(airframe_of(problem.dynamics), problem.x0[:, :3])

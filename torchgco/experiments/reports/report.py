@@ -27,8 +27,7 @@ from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TR
 from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
-from torchgco.experiments.statistics.mission_statistics import summarise_missions
-from torchgco.experiments.statistics.statistics import TASK, plain, summarise, task_columns
+from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
@@ -106,9 +105,8 @@ def drawings(part: Part) -> Drawings:
 
     What would be empty isn't drawn: a distribution or shares of single trials.
     """
-    mission = part.kind == MISSIONS
-    named, again = ("outcomes", summarise_missions) if mission else ("rates", summarise)
-    trials, summary, held = part.trials, part.summary, {}
+    mission, again = part.kind is MISSIONS, part.kind.summarise
+    named, trials, summary, held = "outcomes" if mission else "rates", part.trials, part.summary, {}
     swept = task_columns(trials)[len(TASK) :]
     for name in swept:
         others = [other for other in swept if other != name]
