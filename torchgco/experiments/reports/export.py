@@ -17,7 +17,7 @@ from torchgco.dynamics import QuadrotorPlant
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.bags import Storage, write_bag
-from torchgco.experiments.reports.finished import TRUST, Study
+from torchgco.experiments.reports.finished import Study
 from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
@@ -161,7 +161,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--solver", metavar="NAME", nargs="+", default=[], help="default: all of the study")
     kinds = list(get_args(Storage))
     parser.add_argument("--bag", metavar="KIND", choices=kinds, help=f"bags of ROS 2 instead: {' or '.join(kinds)}")
-    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 

@@ -34,7 +34,6 @@ from torchgco.view.flights import constraint_name
 from torchgco.view.vehicles import Look
 
 MEASURED_AT_ONCE = 64  # layouts whose trajectories are measured at once
-TRUST = "--trust", "admit any size in a run's files, and any class, such as a model of yours: its code runs"
 
 
 @dataclass(frozen=True)

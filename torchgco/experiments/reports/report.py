@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 import pandas as pd
@@ -20,7 +19,7 @@ from matplotlib.figure import Figure
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.flying.progress import draw
-from torchgco.experiments.reports.finished import TRUST
+from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TRIALS, read_trials
@@ -141,20 +140,12 @@ def _distributions(trials: pd.DataFrame, prefix: str) -> Drawings:
     return held
 
 
-class _Parser(argparse.ArgumentParser):
-    """Without the usage before an error: one line for every mistake."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError("command line", "DIR and the options of --help", message)
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="torchgco-report", description="One report on many studies.")
+    parser = RunParser("torchgco-report", "One report on many studies.", "DIR")
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
-    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 

@@ -13,7 +13,7 @@ import torch
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.flying.progress import page_bar
-from torchgco.experiments.reports.finished import TRUST, Study, document_of
+from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.searched import searches
@@ -101,7 +101,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {PAGE_NAME} in RUN")
     words = "solve the layouts of these numbers again, and show the search"
     parser.add_argument("--search", metavar="N", type=int, nargs="+", default=[], help=words)
-    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 
