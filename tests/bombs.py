@@ -23,9 +23,9 @@ from tests.maps.files import samples
 from torchgco import InputError
 from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.reports.finished import Study
-from torchgco.experiments.results.identity import Manifest, digest, plain, settings_of
+from torchgco.experiments.results.folder import read_trials
+from torchgco.experiments.results.identity import Manifest, digest, settings_of
 from torchgco.experiments.results.limits import read_npz
-from torchgco.experiments.results.runs import read_trials
 from torchgco.maps import read
 from torchgco.scenarios import Layouts
 
@@ -47,7 +47,7 @@ def zipped(name: str, size: int, shape: str = "(3,)") -> bytes:
 def run(folder: Path, **changed: Any) -> Path:
     """A folder with the study.json of a finished study, the given keys of its vehicle changed, and one layout."""
     config = compose_config(["solver=hold", "scenario=walls"])
-    held = {"version": "0", **plain(config)}
+    held = {"version": "0", **config}
     held["model"]["vehicle"] |= changed
     (folder / "study.json").write_bytes(Manifest(held, {"hold": settings_of(config)}, {0: "a"}).to_json())
     (folder / "done").write_text("{}")

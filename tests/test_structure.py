@@ -25,7 +25,7 @@ LAYERS = [
     ["solvers", "roadmap"],
     ["sensitivity"],
     ["guidance", "missions", "scenarios"],
-    ["search", "plotting"],
+    ["search", "plotting", "exploration"],
     ["view"],
     ["baselines"],
     ["presets"],
@@ -143,6 +143,18 @@ def test_tracing_a_model_loads_no_slow_module() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_constant_means_one_thing() -> None:
+    """Where two modules need one, they share it; `_SENTENCES` are those of an enumeration, by its members."""
+    found: dict[str, set[str]] = {}
+    for path in MODULES:
+        for node in ast.parse(path.read_text()).body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            for name in (part for target in targets if target is not None for part in ast.walk(target)):
+                if isinstance(name, ast.Name) and name.id.isupper() and len(name.id) > 1 and name.id != "_SENTENCES":
+                    found.setdefault(name.id, set()).add(ast.unparse(node.value))  # type: ignore[attr-defined]
+    assert not {name: values for name, values in found.items() if len(values) > 1}
 
 
 def test_instantiate_is_called_in_one_place() -> None:

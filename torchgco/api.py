@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
+from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.judging.scale import SHARE, dwarfed, noise
-from torchgco.judging.worst import NONE, kind_of
+from torchgco.judging.worst import NO_PLACE, kind_of
 from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage
 
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
-NAMED = 5  # problems that the warning names
 
 
 def solve(
@@ -243,7 +242,7 @@ def _warn_of_scale(problem: Problem, solution: Solution) -> None:
         problem.take(rows), solution.X[rows], solution.U[rows], None if solution.times is None else solution.times[rows]
     )
     place = dwarfed(some, X, U)
-    large = (place != NONE).nonzero().flatten().tolist()
+    large = (place != NO_PLACE).nonzero().flatten().tolist()
     if large:
         b, i = int(rows[large[0]]), int(place[large[0]])
         warnings.warn(

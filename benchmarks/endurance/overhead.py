@@ -23,6 +23,7 @@ from torchgco.kernels import kernels_of
 from torchgco.solvers.memory import plan_batch
 
 COMMON = ["solver=gco", "device.threads=1"]
+FOLDER = "torchgco.experiments.results.folder.StudyFolder"
 # A phase lasts while one of its functions runs, except for phases inside it.
 PHASES = {
     "solve": ["torchgco.solvers.contracts.Solver.solve"],
@@ -31,13 +32,13 @@ PHASES = {
     "make problems": ["torchgco.scenarios.vehicle.Vehicle.task"],
     "progress": ["torchgco.experiments.flying.flight.Flight._progress"],
     "digests": ["torchgco.experiments.flying.study.layout_digests"],
-    "write shards": ["torchgco.experiments.results.records.Records.keep"],
+    "write shards": [f"{FOLDER}.keep"],
     "read shards": [
-        "torchgco.experiments.results.records.Records.flown", "torchgco.experiments.results.records.Records.missing",
+        f"{FOLDER}.flown", f"{FOLDER}.missing",
     ],
     "tables": [
-        "torchgco.experiments.flying.study.with_success", "torchgco.experiments.results.records.Records.finish",
-        "torchgco.experiments.results.records.Records.close",
+        "torchgco.experiments.flying.study.with_success", f"{FOLDER}.finish",
+        f"{FOLDER}.close",
     ],
     "report": ["torchgco.experiments.flying.study.write_report"],
 }  # fmt: skip

@@ -30,7 +30,7 @@ from torchgco.solvers.contracts import Solver
 
 OUTPUTS = ROOT / "outputs" / "general"
 # IPOPT stays near a result that it starts from.
-NEARBY = {"mu_init": 1e-6, "bound_push": 1e-6, "bound_frac": 1e-6}
+STEEP = {"mu_init": 1e-6, "bound_push": 1e-6, "bound_frac": 1e-6}
 
 
 def flown(family: Family, name: str, seed: int, seconds: int, restart: int) -> pd.DataFrame:
@@ -66,7 +66,7 @@ def alone(problem: Problem, solver: Solver, seconds: int) -> float:
 
 def restarts(problem: Problem, solution: Solution, limit: int) -> list[float]:
     """The costs that IPOPT finds from each result; NaN where it finds none."""
-    peer = prepared("ipopt", problem, NEARBY) if limit else None
+    peer = prepared("ipopt", problem, STEEP) if limit else None
     flights = [fly(peer, b, (solution.X, solution.U), limit) for b in range(problem.B)] if peer else []
     return [one.cost if one.status == SOLVED else float("nan") for one in flights] or [float("nan")] * problem.B
 

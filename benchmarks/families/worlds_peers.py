@@ -19,7 +19,6 @@ from typing import Any
 
 import pandas as pd
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from benchmarks.lib import acados
@@ -102,9 +101,7 @@ class World:
     def of(cls, family: Family, folder: Path) -> World:
         setup = compose(family.overrides())
         task = setup.task()
-        vehicle = OmegaConf.to_container(setup.config.model.vehicle, resolve=True)
-        assert isinstance(vehicle, dict)
-        return cls(family.name, task, layout_digests(task.layouts, {str(k): v for k, v in vehicle.items()}), folder)
+        return cls(family.name, task, layout_digests(task.layouts, setup.configuration["model"]["vehicle"]), folder)
 
     def problem(self, layout: int) -> Problem:
         return self.task.problem.take(torch.tensor([layout]))

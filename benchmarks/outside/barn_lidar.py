@@ -49,8 +49,8 @@ from torchgco import (
     Solution,
     StateBounds,
 )
-from torchgco.missions.sensing.sensors import Lidar
-from torchgco.missions.sensing.world import World
+from torchgco.exploration.sensing.sensors import Lidar
+from torchgco.exploration.sensing.world import World
 
 STAGES = 100  # of a plan
 LIMIT = 100.0  # s, after which the challenge ends a run

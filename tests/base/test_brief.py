@@ -10,7 +10,7 @@ import torch
 import torchgco
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from torchgco import ControlBounds, Dynamics, Planar, Spheres, presets
-from torchgco.base.brief import LETTERS
+from torchgco.base.brief import TEXT_LETTERS
 from torchgco.problem.problem import Problem
 
 
@@ -19,13 +19,13 @@ def test_a_problem_takes_a_few_lines(make) -> None:
     problem: Problem = make()[0]
     lines = repr(problem).splitlines()
     sizes = f"B={problem.B}, N={problem.N}, n={problem.n}, m={problem.m}, float64"
-    assert lines[0] == f"Problem({sizes}" and len(lines) == 5 and max(map(len, lines)) < 2 * LETTERS
+    assert lines[0] == f"Problem({sizes}" and len(lines) == 5 and max(map(len, lines)) < 2 * TEXT_LETTERS
     assert type(problem.dynamics).__name__ in lines[1] and "ControlBounds" in lines[3] and "radius" in lines[4]
 
 
 @pytest.mark.parametrize("name", presets.PRESETS)
 def test_solvers_are_short_and_name_changed_options(name: str) -> None:
-    assert len(repr(presets.PRESETS[name](2))) <= LETTERS
+    assert len(repr(presets.PRESETS[name](2))) <= TEXT_LETTERS
     changed = replace(presets.al_ilqr(2), max_outer_iterations=17)
     assert "max_outer_iterations=17" in repr(changed) and "patience" not in repr(changed)
 

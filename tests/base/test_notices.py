@@ -40,7 +40,7 @@ def test_a_log_gets_the_line_and_no_bar(capsys) -> None:
 
 def test_a_terminal_shows_the_line_in_place_of_a_bar(shown) -> None:
     notices.notice("working")
-    assert shown.getvalue() == f"{notices.CLEAR}torchgco: working\n"
+    assert shown.getvalue() == f"{notices.CLEAR_LINE}torchgco: working\n"
 
 
 def test_something_brief_is_shown_to_those_who_watch(shown, capsys, monkeypatch) -> None:

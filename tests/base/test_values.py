@@ -13,7 +13,7 @@ from torch import Tensor
 import torchgco
 from tests.engines import compiled, engine_of
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost, kernels
-from torchgco.base.values import NONE
+from torchgco.base.values import NO_VALUES
 from torchgco.kernels import EagerWarning, measured
 
 D = torch.float64
@@ -83,8 +83,8 @@ def test_functions_of_the_knot_leave_pytorchs_precision_as_it_was() -> None:
         return x * k
 
     x = torch.zeros(1, 1, dtype=D)
-    slow = threading.Thread(target=lambda: NONE.call(waits, x, k=1))
-    fast = threading.Thread(target=lambda: (running.wait(), NONE.call(lambda x, k: x * k, x, k=1), ended.set()))
+    slow = threading.Thread(target=lambda: NO_VALUES.call(waits, x, k=1))
+    fast = threading.Thread(target=lambda: (running.wait(), NO_VALUES.call(lambda x, k: x * k, x, k=1), ended.set()))
     slow.start()
     fast.start()
     slow.join()

@@ -28,15 +28,15 @@ def test_a_value_that_cannot_be_doubled_comes_nearer_to_one() -> None:
 
 
 def test_a_constant_is_changed_where_it_is_read(monkeypatch) -> None:
-    monkeypatch.setattr(chords, "MARGIN", chords.MARGIN)  # is put back
-    with_constant("torchgco.search.chords.MARGIN", "halved")
-    assert chords.MARGIN == 0.55
+    monkeypatch.setattr(chords, "EXTRA", chords.EXTRA)  # is put back
+    with_constant("torchgco.search.chords.EXTRA", "halved")
+    assert chords.EXTRA == 0.55
 
 
 def test_every_row_and_many_numbers_are_varied() -> None:
     found = variants()
     assert sum(kind == "row" for kind, _, _ in found) == len(presets.gco(3).passes)
-    assert {("option", "Follow.pace", "doubled"), ("constant", "torchgco.search.chords.MARGIN", "halved")} <= set(found)
+    assert {("option", "Follow.pace", "doubled"), ("constant", "torchgco.search.chords.EXTRA", "halved")} <= set(found)
     assert not any("record" in name for _, name, _ in found)
 
 

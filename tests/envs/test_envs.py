@@ -10,9 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.engines import compiled
-from tests.missions.missions import far, mission, scene, varied
+from tests.missions.missions import SOLVER, far, mission, scene, varied
 from torchgco import Airframe, InputError, Problem
-from torchgco.missions import Disturbance, Flight, Outcome, RotorPlant
+from torchgco.exploration import SensorMission
+from torchgco.missions import Disturbance, Flight, Outcome, Planner, RotorPlant
 from torchgco.missions.planning_problem import planning_state
 from torchgco.scenarios import Mazes, Vehicle
 
@@ -229,7 +230,9 @@ def _stepped(**options: Any) -> MissionVectorEnv:
     [
         (lambda: MissionVectorEnv(2, problem=varied(2, moving=True), mission=mission()), "problem.constraints"),
         pytest.param(
-            lambda: MissionVectorEnv(2, problem=far(), mission=mission(sensor="lidar")), "mission", marks=compiled
+            lambda: MissionVectorEnv(2, problem=far(), mission=SensorMission(Planner(SOLVER), sensor="lidar")),
+            "mission",
+            marks=compiled,
         ),
         (lambda: MissionVectorEnv(2, problem=far(), mission=mission(latency=1)), "mission"),
         (lambda: MissionVectorEnv(2, problem=scene(torch.zeros(1, 1, 3).double())), "problem.x0"),

@@ -7,7 +7,7 @@ from hydra._internal.hydra import Hydra
 
 from torchgco.experiments import app
 from torchgco.experiments.flying import study
-from torchgco.experiments.results.records import Records
+from torchgco.experiments.results.folder import StudyFolder
 
 
 @pytest.fixture
@@ -37,14 +37,14 @@ def run_until(run, monkeypatch):
     def call(shards: int, *words: str) -> None:
         written = []
 
-        def keep(self, *flown, real=Records.keep):
+        def keep(self, *flown, real=StudyFolder.keep):
             real(self, *flown)
             written.append(flown)
             if len(written) == shards:
                 raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(Records, "keep", keep)
+            patch.setattr(StudyFolder, "keep", keep)
             assert run(*words)[0] == 130
 
     return call

@@ -19,8 +19,8 @@ from torchgco import kernels
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.config.groups import options_of
 from torchgco.experiments.flying import progress, study
-from torchgco.experiments.results.identity import decisive, plain
-from torchgco.experiments.results.records import COLUMNS
+from torchgco.experiments.results.folder import COLUMNS
+from torchgco.experiments.results.identity import decisive
 from torchgco.scenarios import Layouts
 from torchgco.solvers.augmented_lagrangian import OuterLoop
 
@@ -93,7 +93,7 @@ def test_the_configuration_chooses_the_kernels() -> None:
         for name in ("eager", "native"):
             setup = compose([f"device.kernels={name}"])
             assert kernels.native() == (name == "native")
-            assert decisive(plain(setup.config), {})["device"] == {"name": "cpu", "dtype": "float64", "kernels": name}
+            assert decisive(setup.configuration, {})["device"] == {"name": "cpu", "dtype": "float64", "kernels": name}
     finally:
         kernels.use_native(True)
 

@@ -17,7 +17,8 @@ from torchgco.experiments.config.build import Setup, build, compose_config, conf
 from torchgco.experiments.config.groups import FAMILIES, options_of
 from torchgco.experiments.flying.flight import plan_of
 from torchgco.experiments.flying.study import check_mission
-from torchgco.missions import Mission, Planner, RotorPlant
+from torchgco.exploration import SensorMission
+from torchgco.missions import Planner, RotorPlant
 from torchgco.scenarios import Vehicle
 
 DATA = ROOT / "benchmarks" / "data"
@@ -70,7 +71,7 @@ def test_every_scenario_has_a_model_that_the_matrix_names() -> None:
 def test_every_experiment_composes_with_every_scenario_model_and_solver(experiment: str) -> None:
     """As it is, and on every scenario and file; models are named or left to the scenario, solvers take turns."""
     setup = checked(f"experiment={experiment}")
-    assert setup.layouts().count == (setup.config.study.layouts or 64)
+    assert setup.layouts().count == (setup.configuration["study"]["layouts"] or 64)
     turns, named = iter(options_of("solver")[3 * EXPERIMENTS.index(experiment) % 12 :]), cycle((True, False))
     for name, (model, words) in scenes().items():
         solver = next(turns) if name in ("forest", *FILES) else "hold"  # whose configuration is quick to compose
@@ -155,19 +156,22 @@ def test_a_mistake_in_a_vehicle_gets_one_line(words: list[str], line: str) -> No
 
 
 def test_a_registered_mission_is_its_class() -> None:
-    assert compose(["experiment=mission"]).mission == Mission(Planner(presets.gco(3)), plant=RotorPlant(Airframe()))
+    assert compose(["experiment=mission"]).mission == SensorMission(
+        Planner(presets.gco(3)), plant=RotorPlant(Airframe())
+    )
 
 
 def test_a_preset_flies_all_layouts_of_a_file() -> None:
     words = ["experiment=mission_study", "scenario=layouts", WALLS, "solver=hold"]
-    assert compose(words).config.study.layouts is None and compose(words).layouts().count == 32
+    assert compose(words).configuration["study"]["layouts"] is None and compose(words).layouts().count == 32
     assert compose([*words, "study.layouts=3"]).layouts().count == 3
-    assert compose(["experiment=mission_study", "scenario=walls", "solver=hold"]).config.study.layouts == 32
+    walls = compose(["experiment=mission_study", "scenario=walls", "solver=hold"])
+    assert walls.configuration["study"]["layouts"] == 32
 
 
 def test_null_leaves_a_group_out() -> None:
     plain_setup, words = compose([]), ["mission=null", "plant=null", "experiment=null"]
-    assert compose(words).config == plain_setup.config
+    assert compose(words).configuration == plain_setup.configuration
     without = compose(["experiment=mission", "mission=null", "plant=null"])
     assert without.mission is None and compose(["experiment=mission"]).mission is not None
 

@@ -20,8 +20,8 @@ from torchgco.experiments.config.build import compose
 from torchgco.experiments.flying import jobs, progress
 from torchgco.experiments.flying.flight import plan_of
 from torchgco.experiments.results.files import create, write
+from torchgco.experiments.results.folder import StudyFolder
 from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.records import Records
 
 # Two solvers, so that success compares rows of all jobs.
 STUDY = ["solver=al_ilqr", "solver.max_outer_iterations=1", "study.baselines=[hold]", "study.layouts=5", *HOLD[3:]]
@@ -174,12 +174,12 @@ def test_two_studies_that_start_together_do_not_share_a_folder(tmp_path, monkeyp
 
     def refuse_foreign(self) -> None:  # at this moment the other study claims the folder
         monkeypatch.undo()
-        Records(tmp_path, manifest(1)).claim()
+        StudyFolder(tmp_path, manifest(1)).claim()
 
-    monkeypatch.setattr(Records, "_refuse_foreign", refuse_foreign)
+    monkeypatch.setattr(StudyFolder, "_refuse_foreign", refuse_foreign)
     with pytest.raises(InputError, match="seed is 1 there, 0 here"):
-        Records(tmp_path, manifest(0)).claim()
-    Records(tmp_path, manifest(1)).claim()
+        StudyFolder(tmp_path, manifest(0)).claim()
+    StudyFolder(tmp_path, manifest(1)).claim()
 
 
 @pytest.mark.parametrize("name", ["table", "shards/a.npz"])

@@ -203,7 +203,7 @@ def test_a_merged_table_is_written_with_text_and_can_be_merged_again(tmp_path: P
 def test_missions_have_tables_of_their_own_next_to_trajectories() -> None:
     both = trials(*flights("gco", HITS), *missions("gco", "RRRC"), *missions("al_ilqr", "RCTD"))
     single, flown = parts_of(both)
-    assert (single.kind, flown.kind) == ("trajectory", "mission")
+    assert (single.kind.name, flown.kind.name) == ("trajectory", "mission")
     assert len(single.trials) == 32 and len(flown.trials) == 8
     text = format_report([single, flown], "table")
     above, below = text.split("missions in forest (quadrotor), seed 0")

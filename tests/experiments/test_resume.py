@@ -11,7 +11,7 @@ import torch
 
 from tests.experiments.commands import HOLD, TINY, problem_line
 from torchgco import MultiStart
-from torchgco.experiments.results.records import Records
+from torchgco.experiments.results.folder import StudyFolder
 from torchgco.scenarios import Layouts
 from torchgco.solvers import AugmentedLagrangian
 from torchgco.solvers.augmented_lagrangian import OuterLoop
@@ -196,7 +196,7 @@ def test_a_stop_while_success_is_computed_again_damages_nothing(run, filed, tmp_
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Records, "close", close)
+        patch.setattr(StudyFolder, "close", close)
         assert run(*words)[0] == 130
     code, _, err = run(*words)
     assert code == 0, err

@@ -15,12 +15,12 @@ from torchgco.experiments.config.build import compose_config, mission_from, solv
 from torchgco.experiments.config.groups import _tree
 from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.reports import report, view
-from torchgco.experiments.results.identity import digest, plain
+from torchgco.experiments.results.identity import digest
 from torchgco.presets import PRESETS
 from torchgco.solvers import ILQR
 
 RAN: list[object] = []  # what `Own` was made with
-CONFIGURATION = plain(compose_config(["experiment=mission_unknown"]))
+CONFIGURATION = compose_config(["experiment=mission_unknown"])
 WRITES = {"_target_": "pathlib.Path.write_text", "_args_": [{"_target_": "pathlib.Path", "_args_": ["ran"]}, "x"]}
 FOREIGN = {
     "a function of ours": {"_target_": "torchgco.native.compiler.build", "source": "int tgco_x;"},

@@ -13,9 +13,9 @@ import pytest
 from tests.experiments.commands import TINY
 from tests.trials import trials
 from torchgco.experiments.reports.report import main
+from torchgco.experiments.results.folder import read_manifest
 from torchgco.experiments.results.identity import Manifest, digest, layout_digests
 from torchgco.experiments.results.merge import merge
-from torchgco.experiments.results.records import read_manifest
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.experiments.statistics.tables import format_table

@@ -20,7 +20,7 @@ from torchgco.experiments.results.kinds import format_report, parts_of
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
-from torchgco.experiments.statistics.tables import FORMATS, format_frame
+from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
 
 HITS = [i < 30 for i in range(32)]
 
@@ -91,7 +91,7 @@ def read(text: str, form: str) -> pd.DataFrame:
 
 
 @pytest.mark.usefixtures("without_figures")
-@pytest.mark.parametrize("form", FORMATS[1:])
+@pytest.mark.parametrize("form", OUTPUTS[1:])
 def test_stdout_holds_the_table_alone(form: str, sweep: Path, capsys) -> None:
     assert main([str(sweep), "--format", form]) == 0
     captured = capsys.readouterr()

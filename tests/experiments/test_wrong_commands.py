@@ -6,6 +6,7 @@ import errno
 import pickle
 import re
 import zipfile
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
 
 from tests.experiments import commands
 from tests.experiments.commands import HOLD, problem_line
@@ -42,7 +42,7 @@ WRONG = {
     "many stages": (["scenario.stages=1000000000"], "scenario.stages: expected a problem that fits into the free mem"),
     "solver key": (["solver.polish=5"], "solver.polish: expected a key that the configuration has, got polish"),
     "new solver key": (["+solver.foo=1"], "solver.foo: expected an option that Hold has, got foo"),
-    "new mission key": ([*MISSION, "+mission.foo=1"], "mission.foo: expected an option that Mission has, got foo"),
+    "new mission key": ([*MISSION, "+mission.foo=1"], "mission.foo: expected an option that SensorMission has"),
     "new planner key": ([*MISSION, "+mission.planner.foo=1"], "mission.planner.foo: expected an option that Planner"),
     "new key": (["+foo=1"], "foo: expected one of the keys seed, study, model"),
     "no experiment": (["experiment=nope"], "experiment: expected one of feasibility, mission"),
@@ -110,13 +110,13 @@ def test_wrong_words_get_one_line_and_write_nothing(case: str, run, tmp_path) ->
 
 
 @pytest.fixture(scope="module")
-def composed() -> DictConfig:
+def composed() -> dict[str, Any]:
     """The configuration of HOLD; `changed` makes a wrong one of it."""
     return compose_config(HOLD)
 
 
-def changed(config: DictConfig, key: str, value: object) -> DictConfig:
-    held = OmegaConf.to_container(config)
+def changed(config: dict[str, Any], key: str, value: object) -> dict[str, Any]:
+    held = deepcopy(config)
     *path, last = key.split(".")
     node: Any = held
     for name in path:
@@ -125,7 +125,7 @@ def changed(config: DictConfig, key: str, value: object) -> DictConfig:
         del node[last]
     else:
         node[last] = value
-    return OmegaConf.create(held)  # type: ignore[return-value]
+    return held
 
 
 ABSENT = object()

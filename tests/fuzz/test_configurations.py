@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.fuzz.tally import accepted_or_refused, examples
 from torchgco.experiments.config.build import Setup, compose, compose_config
 from torchgco.experiments.flying.flight import plan_of
-from torchgco.experiments.results.identity import flat, plain
+from torchgco.experiments.results.identity import flat
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +46,7 @@ SLOW = ("scenario.num_obstacles", "scenario.num_discs", "scenario.num_boxes", "s
 
 @cache
 def keys(base: str) -> list[str]:
-    found = flat(plain(compose_config(BASES[base])))
+    found = flat(compose_config(BASES[base]))
     return [key for key in found if not key.endswith(("_target_", "_partial_")) and key not in SLOW]
 
 

@@ -168,7 +168,7 @@ def test_many_samples_are_flown_in_blocks(knots: int, native: bool, monkeypatch)
     problem, U = planar_batch(B=3, N=12)
     sampler = MPPI(samples=23, noise_knots=knots, rounds=2, covariance=4.0)
     whole = sampler.improve(problem, U, key(3))[1]
-    monkeypatch.setattr("torchgco.eager.sampling.CHUNK", 10)
+    monkeypatch.setattr("torchgco.eager.sampling.SAMPLES_AT_ONCE", 10)
     torch.testing.assert_close(sampler.improve(problem, U, key(3))[1], whole, rtol=1e-12, atol=1e-12)
 
 

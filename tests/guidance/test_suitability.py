@@ -33,7 +33,7 @@ from torchgco import (
     kernels,
     presets,
 )
-from torchgco.guidance.gco import REACH, _radius
+from torchgco.guidance.gco import R_GUIDE, _radius
 from torchgco.guidance.suitability import TRIAL_SAMPLES, suited_sampler
 from torchgco.native.compiler import find_compiler
 from torchgco.search import Follow, PathProposals
@@ -209,11 +209,11 @@ def test_the_radius_without_spheres_is_a_share_of_the_distance_to_the_goal() -> 
     X = problem.x0.unsqueeze(1).repeat(1, 41, 1)
     X[0, 7, :2] = torch.tensor([3.0, 4.0], dtype=torch.float64)
     far = torch.tensor([2.0, 13.0**0.5], dtype=torch.float64)
-    torch.testing.assert_close(_radius(problem, X), REACH * far)
+    torch.testing.assert_close(_radius(problem, X), R_GUIDE * far)
     assert _radius(make_problem(2, spheres(2)), X).tolist() == [0.1, 0.1]
 
     without_goal = Problem(problem.dynamics, Aimless(), problem.constraints, problem.x0, problem.N)
-    torch.testing.assert_close(_radius(without_goal, X), X.new_tensor([REACH * 5.0, 0.0]))
+    torch.testing.assert_close(_radius(without_goal, X), X.new_tensor([R_GUIDE * 5.0, 0.0]))
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from torchgco import (
     certify,
 )
 from torchgco.dynamics.rollout import open_loop
-from torchgco.experiments.results.records import COLUMNS
+from torchgco.experiments.results.folder import COLUMNS
 from torchgco.judging.certificate import frame_columns
 from torchgco.judging.judge import judge
 

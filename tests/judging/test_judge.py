@@ -94,7 +94,7 @@ def test_spheres_are_measured_as_over_all_segments_one_by_one(
     between = (segment_distance(away[:, :-1], away[:, 1:]) - contact).flatten(1).amin(-1)
     assert stride < 0.1 or bool((between < at).any())
     for block in (1, 1000, 2**18):  # how many at once changes nothing
-        monkeypatch.setattr("torchgco.judging.judge.BLOCK", block)
+        monkeypatch.setattr("torchgco.judging.judge.NUMBERS_AT_ONCE", block)
         measured = sphere_clearance(spheres, X)
         assert torch.equal(measured[0], at) and torch.equal(measured[1], torch.minimum(at, between))
 

@@ -8,7 +8,7 @@ import torch
 
 from tests.maps.test_field import bound, brute_clearance, points_around, random_grid
 from torchgco import Field, FunctionDynamics, Goal, Problem, QuadraticCost, certify, judge
-from torchgco.judging.maps import NEAR, segment_distances
+from torchgco.judging.maps import EXACT_TO, segment_distances
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 
 
@@ -33,7 +33,7 @@ def test_points_deep_inside_and_points_that_are_lost() -> None:
     found = segment_distances(part, p)[0]
     assert bool((found[:2] < 0).all()) and bool(torch.isnan(found[2:4]).all())
     far = 2**0.5 * (100 - 3.5)
-    assert NEAR < float(found[4]) <= far
+    assert EXACT_TO < float(found[4]) <= far
 
 
 def test_clouds_and_empty_maps() -> None:

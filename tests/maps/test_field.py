@@ -247,7 +247,7 @@ def test_a_segment_that_leads_far_beyond_the_map_is_looked_up_near_it_alone(monk
     far = torch.tensor([[[1e7, 0.0], [torch.inf, 0.0], [torch.nan, 1.0]]], dtype=torch.float64)
     looked.clear()
     part.segment_clearance(-far, far)  # no memory for the points between
-    assert max(B * K for B, K in looked) <= field_module.AT_ONCE
+    assert max(B * K for B, K in looked) <= field_module.POINTS_AT_ONCE
 
 
 @pytest.mark.parametrize(

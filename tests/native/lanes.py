@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey, words
-from torchgco.native.codegen.dynamics import JACOBIAN, STEP, DynamicsSource
-from torchgco.native.codegen.emit import PRELUDE, SHARED
+from torchgco.native.codegen.dynamics import JACOBIAN, STEP_FUNCTION, DynamicsSource
+from torchgco.native.codegen.emit import PRELUDE, SHARED_AT
 from torchgco.native.codegen.source import C
 from torchgco.native.compiler import build
 from torchgco.native.declarations import head
@@ -93,8 +93,8 @@ class Model:
     def __init__(self, source: DynamicsSource, real: str = "double", lanes: int = LANES) -> None:
         inputs = [source.n, source.m, source.count, len(source.traced.pattern)]
         self._source = source
-        self._step = Emitted(source.code, STEP, inputs, [source.n], real, lanes, SHARED)
-        self._jacobian = Emitted(source.code, JACOBIAN, inputs, [source.computed], real, lanes, SHARED)
+        self._step = Emitted(source.code, STEP_FUNCTION, inputs, [source.n], real, lanes, SHARED_AT)
+        self._jacobian = Emitted(source.code, JACOBIAN, inputs, [source.computed], real, lanes, SHARED_AT)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """(B, n) by (B, n), (B, m), for the problems 0 to B - 1."""

@@ -26,7 +26,7 @@ from torchgco.kernels import kernels_of
 from torchgco.kernels.in_c import native_options
 from torchgco.lagrangian.state import State
 from torchgco.native import structures
-from torchgco.native.codegen.source import INTERIOR, LANES, SAMPLER, SOLVER, C
+from torchgco.native.codegen.source import INTERIOR, LANES, SAMPLER, SOLVER_LIBRARY, C
 from torchgco.native.compiler import NativeError, build, find_compiler
 from torchgco.native.declarations import Structure, defines, fields, head, load
 from torchgco.native.structures import CONSTANTS, STRUCTURES, End, Options
@@ -112,7 +112,7 @@ def test_a_constant_changes_what_is_compiled(name: str, monkeypatch) -> None:
     engine = engine_of(boxed_batch(2, B=1, N=3)[0])
     assert engine is not None
     vectors = {"REAL": "double", "LANES": LANES}
-    for library in (SOLVER, SAMPLER, INTERIOR):
+    for library in (SOLVER_LIBRARY, SAMPLER, INTERIOR):
         usual = engine.form._written(library, vectors)
         with monkeypatch.context() as patch:
             patch.setitem(CONSTANTS, name, 7)
@@ -120,7 +120,7 @@ def test_a_constant_changes_what_is_compiled(name: str, monkeypatch) -> None:
         for now, before in zip(changed, usual, strict=True):
             own = f"#define {name} {written(name)}\n"
             assert now.source == before.source.replace(own, f"#define {name} 7\n") != before.source
-    files = {file for library in (SOLVER, SAMPLER, INTERIOR) for part in astuple(library) for file in part}
+    files = {file for library in (SOLVER_LIBRARY, SAMPLER, INTERIOR) for part in astuple(library) for file in part}
     assert any(name in (C / file).read_text() for file in files), "no line of C uses it"
 
 
@@ -184,7 +184,7 @@ OF_ILQR: dict[str, tuple[float, ILQR, Callable[[State], None], Callable[[], Prob
     "DAMPING": (0.05, CHOOSY, unchanged, planar, 1),
     "DAMPING_GROWTH": (7.0, CHOOSY, damped, planar, 2),
     "DAMPING_DECAY": (2.0, ILQR(), damped, planar, 1),
-    "ROUNDING": (1e6, ILQR(), unchanged, planar, 1),
+    "ROUNDED_OFF": (1e6, ILQR(), unchanged, planar, 1),
 }
 PRINTED = ILQR(as_printed=True, line_search=Choosy())  # takes the last step length
 OF_LINE_SEARCH = {
@@ -217,10 +217,10 @@ def same(a: State, b: State) -> bool:
 
 @pytest.mark.parametrize("B", [1, 3])
 def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
-    """With LOST = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
+    """With LOST_BY = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
     problem = planar().take(torch.arange(B))
     usual = run(CHOOSY, unchanged, problem, True, 1)
-    monkeypatch.setattr(lifted, "LOST", 0.0)
+    monkeypatch.setattr(lifted, "LOST_BY", 0.0)
     mine, theirs = (run(CHOOSY, unchanged, problem, native, 1) for native in (True, False))
     assert not same(mine, usual) and same(mine, theirs)
 
@@ -243,7 +243,7 @@ def test_every_option_reaches_the_library() -> None:
     want = {
         "rungs": len(search.ladder(False)), "back": 2, "max_iterations": 13, "accept_last": 0, "tolerance": 0.011,
         "absolute_tolerance": 0.0, "ratio_min": search.ratio_min, "ratio_max": search.ratio_max,
-        "smallest": search.smallest, "damp_below": 0.17, "rounding": descent.ROUNDING, "lost": lifted.LOST,
+        "smallest": search.smallest, "damp_below": 0.17, "rounding": descent.ROUNDED_OFF, "lost": lifted.LOST_BY,
         "regularisation_first": descent.REGULARISATION_FIRST, "regularisation_growth": descent.REGULARISATION_GROWTH,
         "regularisation_max": descent.REGULARISATION_MAX, "damping": descent.DAMPING,
         "damping_growth": descent.DAMPING_GROWTH, "damping_decay": descent.DAMPING_DECAY,
@@ -269,8 +269,8 @@ def test_the_collision_penalty_changes_both_kernels(monkeypatch) -> None:
 
 
 OF_ROADMAP = {
-    "SHELLS": {2: (1.4,)}, "RAYS": 5, "MIDWAY": 1, "CLEAR": 0.4, "EDGE_COST": 0.3, "HOPS": 1, "TIE": 0.5, "AROUND": 4.0,
-    "TINY": 3.0, "SMALL": 30.0,
+    "SHELLS": {2: (1.4,)}, "CIRCLE": 5, "MIDWAY": 1, "LEAST_GAP": 0.4, "EDGE_COST": 0.3, "HOPS": 1, "TIE": 0.5,
+    "AROUND": 4.0, "TINY": 3.0, "UNIT": 30.0,
 }  # fmt: skip
 
 

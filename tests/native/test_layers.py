@@ -19,7 +19,7 @@ from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, Interio
 from torchgco.kernels import EagerWarning
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource, trace_dynamics
-from torchgco.native.codegen.emit import SHARED
+from torchgco.native.codegen.emit import SHARED_AT
 from torchgco.native.compiler import find_compiler
 from torchgco.tracing import Traced
 from torchgco.tracing.nets import MOST_WEIGHTS, Call
@@ -153,7 +153,7 @@ static void tgco_all(
 """
     sizes, count = [n, model.m, 0, int(shared(model).numel()), n], source.computed
     head = f"#define NX {n}\n#define NU {model.m}\n#include <string.h>\n"
-    emitted = Emitted(head + code + wrapped, "tgco_all", sizes, [n, count, count, s * s], shared=SHARED)
+    emitted = Emitted(head + code + wrapped, "tgco_all", sizes, [n, count, count, s * s], shared=SHARED_AT)
 
     def called(x: Tensor, u: Tensor, y: Tensor) -> list[Tensor]:
         arrays = x.numpy(), u.numpy(), np.zeros((len(x), 0)), shared(model).numpy(), y.numpy()

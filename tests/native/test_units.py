@@ -13,7 +13,7 @@ from tests.native.test_compiler import compiled, disown, needs_compiler, next_pr
 from tests.problems import assert_same_bits, boxed_batch, planar_batch
 from torchgco import FunctionConstraint, FunctionDynamics, Problem, QuadraticCost
 from torchgco.native import compiler, store
-from torchgco.native.codegen.source import INTERIOR, SAMPLER, SOLVER
+from torchgco.native.codegen.source import INTERIOR, SAMPLER, SOLVER_LIBRARY
 from torchgco.native.compiler import Unit, build
 from torchgco.native.engine import Engine
 
@@ -117,11 +117,11 @@ def test_models_share_the_solvers_units() -> None:
     forms = [
         Engine(one, compiles=False).form for one in (plane, Problem(body, cost, [rows], torch.zeros(1, 4).double(), 3))
     ]
-    for library in (SOLVER, INTERIOR, SAMPLER):
+    for library in (SOLVER_LIBRARY, INTERIOR, SAMPLER):
         (*own, shared), (*others, same) = (form.units(library) for form in forms)
         assert shared == same and not shared.own
         assert all(unit.own for unit in (*own, *others)) and own[0] != others[0]
-    assert forms[0].units(SOLVER)[0] == forms[0].units(INTERIOR)[0]  # compiled once for both
+    assert forms[0].units(SOLVER_LIBRARY)[0] == forms[0].units(INTERIOR)[0]  # compiled once for both
     boxed, _ = boxed_batch(2, B=1, N=3)
     assert Engine(boxed, compiles=False).form.units() == forms[0].units()  # no obstacles change the code
 

@@ -102,7 +102,7 @@ def test_parts_of_a_batch_have_the_bits_of_the_whole(monkeypatch: pytest.MonkeyP
     everything = slice(None)
     whole = distances(everything)
     for size in (1, 3, 7):  # problems at once, or parts of one
-        monkeypatch.setattr("torchgco.obstacles.boxes.DISTANCES_AT_ONCE", size * 6 * boxes.absent.shape[1])
+        monkeypatch.setattr("torchgco.obstacles.boxes.BOX_GAPS_AT_ONCE", size * 6 * boxes.absent.shape[1])
         for part, expected in zip(distances(everything), whole, strict=True):
             assert torch.equal(part, expected)
     assert [d.shape[0] for d in distances(slice(0, 0))] == [0, 0, 0]

@@ -12,8 +12,8 @@ from torch import Tensor
 from tests.problems import quadrotor_batch
 from torchgco import Boxes, Goal, OscillatingBoxes, Problem, QuadraticCost, certify, judge
 from torchgco.base.errors import InputError
+from torchgco.exploration.sensing import World
 from torchgco.missions.contact import Contact
-from torchgco.missions.sensing import World
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 
 B, M, S, N, DT = 3, 4, 2, 6, 0.05

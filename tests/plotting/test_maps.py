@@ -21,7 +21,7 @@ from torchgco.plotting import missions
 from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.course import Course
 from torchgco.plotting.layouts import layout_grid
-from torchgco.plotting.maps import UNKNOWN
+from torchgco.plotting.maps import UNSEEN
 from torchgco.plotting.scene import contacts, scene_of
 from torchgco.plotting.study_figure import study_figure
 
@@ -78,7 +78,7 @@ def blue(figure: Figure) -> int:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     picture = np.asarray(canvas.buffer_rgba())[..., :3]
-    return int((np.abs(picture / 255.0 - to_rgb(UNKNOWN)).max(-1) < 0.01).sum())
+    return int((np.abs(picture / 255.0 - to_rgb(UNSEEN)).max(-1) < 0.01).sum())
 
 
 def check_layouts(first: Axes, short: Axes, away: Axes) -> None:

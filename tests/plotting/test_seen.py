@@ -8,8 +8,7 @@ import torch
 from PIL import Image
 
 from torchgco.base.errors import InputError
-from torchgco.missions.log import MissionLog
-from torchgco.missions.unknown.safety import SeenLog
+from torchgco.missions.log import MissionLog, SeenLog
 from torchgco.plotting.bodies import Ball
 from torchgco.plotting.course import Course
 from torchgco.plotting.seen import seen_animation, seen_figure

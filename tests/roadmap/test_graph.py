@@ -193,7 +193,7 @@ def test_a_problem_has_the_same_bits_in_every_batch() -> None:
     columns = zip(*(vars(part.obstacles.spheres).values() for part in parts), strict=True)
     s = Scene(*ends, Inflated(Solids(*map(torch.cat, columns))), uneven)
     whole, found = Roadmap().paths(s, 3)
-    assert len(whole) > native.PROBLEMS_AT_ONCE
+    assert len(whole) > native.SEARCHES_AT_ONCE
     for rows in (torch.arange(1), torch.tensor([70]), torch.arange(81).flip(0)):
         part = Scene(s.start[rows], s.goal[rows], take(s.obstacles, rows), uneven)
         paths, arrives = Roadmap().paths(part, 3)
@@ -217,7 +217,7 @@ def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch
     assert library_for(s.start) is None
     paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
-    monkeypatch.setattr(native, "SEARCH", Path(__file__))  # not C code
+    monkeypatch.setattr(native, "SEARCH_SOURCE", Path(__file__))  # not C code
     native._library.cache_clear()
     with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
         assert library_for(s.start) is None

@@ -24,7 +24,7 @@ def scene(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(searches, "LONG", 1.01)
     monkeypatch.setattr(searches, "MANY_NODES", 160)
     monkeypatch.setattr(searches, "MANY_NEIGHBOURS", 16)
-    monkeypatch.setattr("torchgco.roadmap.native.PROBLEMS_AT_ONCE", 3)
+    monkeypatch.setattr("torchgco.roadmap.native.SEARCHES_AT_ONCE", 3)
     monkeypatch.setattr(searches, "PROBLEMS_AT_ONCE", 3)
     use_native(request.param == "native")
     yield trunks(B=5, K=14)[0]
@@ -35,7 +35,7 @@ def scene(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
 def test_further_paths_are_those_of_a_search_from_the_beginning(
     scene: Scene, room: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(known_searches, "KEPT", room)
+    monkeypatch.setattr(known_searches, "BYTES_KEPT", room)
     known, one, other = Known(), Roadmap(), Roadmap(num_halton=96)
     first = one.paths(scene, 2, None, known)
     for rows in (SOME, torch.tensor([4]), torch.arange(5)):

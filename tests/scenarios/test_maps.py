@@ -18,7 +18,7 @@ from torchgco import Hold, InputError, judge
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.results.identity import layout_digests
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
-from torchgco.plotting.layouts import STONE, layout_grid
+from torchgco.plotting.layouts import ROCK, layout_grid
 from torchgco.scenarios import Layouts, MapFile, concatenate
 
 # Two rooms of 4 m x 4 m with a door, and a closed one of 1 m x 4 m; cells of 0.25 m.
@@ -184,7 +184,7 @@ def test_pictures_show_the_map(d: int, tmp_path: Path) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = np.asarray(canvas.buffer_rgba())
-    for place, colour in (([3.125, 2.75], STONE), ([3.0, 5.5], "#FFFFFF")):  # in the wall, and in a room
+    for place, colour in (([3.125, 2.75], ROCK), ([3.0, 5.5], "#FFFFFF")):  # in the wall, and in a room
         x, y = figure.axes[0].transData.transform(place)
         assert to_hex(image[len(image) - int(y) - 1, int(x)] / 255).upper() == colour
     assert any(text.get_text().startswith("obstacle") for text in figure.legends[0].get_texts())

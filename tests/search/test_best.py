@@ -14,7 +14,7 @@ from torchgco import GCO, ILQR, AugmentedLagrangian, Goal, LineSearch, Problem, 
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.search.attempts import Best
-from torchgco.search.passes import SEED_STEP
+from torchgco.search.passes import ATTEMPT_SEED_STEP
 from torchgco.solvers.contracts import Advice, Call
 
 
@@ -25,7 +25,7 @@ class Given(GCO):
     levels: tuple[float, ...] = ()
 
     def update(self, problem, X, U, penalty, key) -> Advice:
-        level = self.levels[key.seed // SEED_STEP]
+        level = self.levels[key.seed // ATTEMPT_SEED_STEP]
         return Advice(penalty, torch.full_like(U, level), torch.ones_like(X[:, 0, 0], dtype=torch.bool))
 
 

@@ -39,7 +39,7 @@ def test_obstacles_count_in_the_order(monkeypatch) -> None:
     X = open_loop(problem.dynamics, problem.x0.repeat_interleave(2, dim=0), candidates.U)
     candidates, first = replace(candidates, X=X), torch.ones(4, dtype=torch.bool)
     with_penalty = candidates.order(first)
-    monkeypatch.setattr("torchgco.search.candidates.PENALTY", 1e-12)
+    monkeypatch.setattr("torchgco.search.candidates.CANDIDATE_PENALTY", 1e-12)
     assert with_penalty[1].tolist() == candidates.order(first)[1].tolist()
     assert with_penalty[0].tolist() != candidates.order(first)[0].tolist()
 

@@ -24,7 +24,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.candidates import Candidates
-from torchgco.search.following import CUT, Free, Paths, followed, travel, unconstrained
+from torchgco.search.following import CORNER_DEPTH, Free, Paths, followed, travel, unconstrained
 from torchgco.search.nearby import without_obstacles
 from torchgco.search.proposals import propose
 from torchgco.solvers.ilqr import ILQR
@@ -233,7 +233,7 @@ def test_corners_are_averaged_less_where_the_average_would_cut_an_obstacle() -> 
     centers = followed(corner, *options, spheres, torch.full((2,), 0.3, dtype=torch.float64))
     plain = travel(corner, *options)
     assert torch.equal(centers[1], plain[1])
-    limit = torch.full((2,), CUT * 0.3, dtype=torch.float64)
+    limit = torch.full((2,), CORNER_DEPTH * 0.3, dtype=torch.float64)
     assert [bool(spheres.deeper(points, limit)[0].any()) for points in (plain, centers)] == [True, False]
 
 

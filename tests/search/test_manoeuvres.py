@@ -25,7 +25,7 @@ from torchgco import (
     solve,
 )
 from torchgco.search.manoeuvres import car, timed
-from torchgco.search.poses import NEAR, Poses, clear_at
+from torchgco.search.poses import END_POSE_ARCS, Poses, clear_at
 
 WHEELBASE, STEERING = 1.2, 0.6
 BODY = Body([[0.0, 0.0], [0.6, 0.0], [1.2, 0.0]], 0.4)
@@ -87,7 +87,7 @@ def test_a_path_of_poses_can_be_driven_and_is_clear() -> None:
     start, goal = np.array([1.2, 1.0, 0.2]), np.array([7.0, 0.0, 0.0])
     path = Poses(clear, TIGHT, step).path(start, goal)
     assert path is not None and clear(path).all() and np.array_equal(path[0], start)
-    assert np.hypot(*(path[-1] - goal)[:2]) <= NEAR * step and abs(path[-1, 2]) <= NEAR * TIGHT * step
+    assert np.hypot(*(path[-1] - goal)[:2]) <= END_POSE_ARCS * step and abs(path[-1, 2]) <= END_POSE_ARCS * TIGHT * step
     moved, turned = np.diff(path[:, :2], axis=0), np.diff(path[:, 2])
     mean = path[:-1, 2] + 0.5 * turned
     assert np.allclose(np.abs(moved[:, 0] * np.cos(mean) + moved[:, 1] * np.sin(mean)), step)

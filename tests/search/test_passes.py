@@ -46,7 +46,7 @@ from torchgco.search import (
     Tighten,
     Tube,
 )
-from torchgco.search.table import COLUMNS
+from torchgco.search.table import TABLE_COLUMNS
 from torchgco.solvers.interior import InteriorPoint
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
@@ -259,7 +259,7 @@ def test_the_table_shows_every_pass(name: str, space: int) -> None:
     table = solver.table()
     assert table["pass"].tolist() == [type(one).__name__ for one in solver.passes]
     assert table["name"].tolist() == list(solver.passes.names)
-    assert table.columns.tolist() == list(COLUMNS) and table.index.tolist() == [*range(1, len(solver.passes) + 1)]
+    assert table.columns.tolist() == list(TABLE_COLUMNS) and table.index.tolist() == [*range(1, len(solver.passes) + 1)]
     assert all(isinstance(text, str) for text in table.to_numpy().flatten())
     assert table["problems"].ne("").all()
     rows = [one for one in solver.passes if isinstance(one, PathProposals)]

@@ -193,7 +193,7 @@ FOLLOW = dict(
 )  # fmt: skip
 REFINE = dict(top=1, rounds=1, violation=1e-9, cut=1e-9, needed=True)
 CONSTANTS = {
-    "candidates.TOLERANCE": 0.5, "proposals.PENALTY": 5.0, "following.OFFSET_LASTS": 0.3,
+    "candidates.CANDIDATE_TOLERANCE": 0.5, "proposals.CANDIDATE_PENALTY": 5.0, "following.OFFSET_LASTS": 0.3,
 }  # fmt: skip
 
 

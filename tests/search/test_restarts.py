@@ -39,7 +39,7 @@ from torchgco.base.status import STOPPED
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.search import Follow, FromSamples
-from torchgco.search.passes import SEED_STEP
+from torchgco.search.passes import ATTEMPT_SEED_STEP
 from torchgco.search.proposals import Round
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Call
@@ -64,7 +64,7 @@ def test_sampled_attempts_start_from_the_caught_trajectory_and_the_best_is_kept(
     assert (first.end.status == STOPPED).tolist() == [False, True, True, True]
     for k, attempt in enumerate(attempts):
         assert attempt.rows == [PASSES, SHORT, CLOSED] and isinstance(attempt.guidance, GCO)
-        assert attempt.call.seed == 5 + k * SEED_STEP and attempt.call.ids.tolist() == attempt.rows
+        assert attempt.call.seed == 5 + k * ATTEMPT_SEED_STEP and attempt.call.ids.tolist() == attempt.rows
         assert torch.equal(attempt.call.U0, first.end.last.U[1:])
         assert torch.equal(attempt.call.warm.mu, first.end.last.multipliers.mu[1:])
     for b in (PASSES, SHORT, CLOSED):
@@ -99,7 +99,7 @@ def test_the_first_attempt_is_along_a_path_without_guidance(solves: list[Solve])
     assert attracted.rows == [SHORT] and attracted.penalty is not None
     # Without a path the first attempt is sampled. A second, sampled one follows where the first does not arrive.
     assert sampled.rows == [CLOSED] and again.rows == [CLOSED]
-    assert [s.call.seed for s in (sampled, again)] == [3, 3 + SEED_STEP]
+    assert [s.call.seed for s in (sampled, again)] == [3, 3 + ATTEMPT_SEED_STEP]
 
 
 def test_where_the_first_path_fails_the_best_of_more_candidates_is_proposed(solves: list[Solve]) -> None:
@@ -141,7 +141,7 @@ def test_a_trajectory_that_ends_close_to_the_goal_is_finally_attracted_to_it(
     solution = SOLVER.solve(problem, U0)
     pulled = [s for s in solves if s.penalty is not None]
     assert len(pulled) == attracted
-    monkeypatch.setattr("torchgco.search.attempts.CLOSE", 0.0)
+    monkeypatch.setattr("torchgco.search.attempts.ATTRACTED_WITHIN", 0.0)
     plain = SOLVER.solve(problem, U0)
     away, optimal = ((s.X[:, -1, :2] - torch.tensor([10.0, 0.0])).norm(dim=-1) for s in (solution, plain))
     assert bool(away[SHORT] < 0.9 < optimal[SHORT]) == attracted

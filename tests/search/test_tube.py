@@ -83,7 +83,7 @@ def test_the_cheapest_that_is_feasible_and_arrives_is_kept(monkeypatch, model: D
     monkeypatch.setattr(directly, "solved_nearby", note)
     found = alone(problem, Tube("maps")).solve(problem, rest(problem))
     ((part, end),) = ends
-    assert 1 < part.B <= (tube.TOP if model is STEPS else pursue.TOP)
+    assert 1 < part.B <= (tube.TOP if model is STEPS else pursue.SOLVED_WAYS)
     good = [
         float(end.best.cost[i])
         for i in range(part.B)

@@ -56,7 +56,7 @@ def test_a_bar_appears_where_somebody_watches_a_long_solve(
     ):  # fmt: skip
         monkeypatch.setattr(watching, "watched", lambda seen=seen: seen)
         monkeypatch.setattr(watching, "AFTER", after)
-        monkeypatch.setattr(watching, "STEP", 0.0)
+        monkeypatch.setattr(watching, "BAR_STEP", 0.0)
         torchgco.solve(problem, U0, solver="al_ilqr", verbose=verbose)
         out, err = capsys.readouterr()
         assert out == "" and ("al_ilqr: " in err) == expected

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchgco import Boxes, Capsules, FunctionDynamics, Goal, Problem, QuadraticCost, Solution, Spheres
+from torchgco.exploration.sensing.grid import FREE, OCCUPIED
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.missions.sensing.grid import FREE, OCCUPIED
-from torchgco.missions.unknown.safety import SeenLog
+from torchgco.missions.log import SeenLog
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Flight, flights_of
 from torchgco.view.sensed import Sensed

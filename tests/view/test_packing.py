@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchgco.view.packing import LARGEST, Packing, number
+from torchgco.view.packing import LARGEST_HALF, Packing, number
 
 
 def read(sealed: str) -> Any:
@@ -71,7 +71,7 @@ def test_rounding_of_a_path_does_not_add_up() -> None:
 def test_what_is_too_large_is_cut_off(steps: bool) -> None:
     packing = Packing()
     held = read(packing.sealed({"far": packing.put(np.array([[1e9], [-1e9], [0.0]]), steps)}))["far"]
-    assert np.isfinite(held).all() and held.max() <= LARGEST + 32
+    assert np.isfinite(held).all() and held.max() <= LARGEST_HALF + 32
 
 
 def test_no_array_and_no_row_is_written_too() -> None:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-LETTERS = 200  # of a representation
-FEW = 6  # numbers that are shown themselves
-LONG = 60  # letters of a value
+TEXT_LETTERS = 200  # of a representation
+FEW_NUMBERS = 6  # numbers that are shown themselves
+VALUE_LETTERS = 60  # letters of a value
 
 
 class Brief:
@@ -41,7 +41,7 @@ def brief(part: Any, deep: int = 1) -> str:
         if field.repr and (value := getattr(part, field.name)) is not None and not _is_default(field, value)
     ]
     text = f"{name}({', '.join(shown)})"
-    return text if len(text) <= LETTERS else f"{text[: LETTERS - 4]}...)"
+    return text if len(text) <= TEXT_LETTERS else f"{text[: TEXT_LETTERS - 4]}...)"
 
 
 def _is_default(field: Field[Any], value: Any) -> bool:
@@ -54,7 +54,7 @@ def _is_default(field: Field[Any], value: Any) -> bool:
 
 def _value(value: Any, deep: int) -> str:
     if isinstance(value, Tensor | np.ndarray):
-        if int(np.prod(value.shape)) <= FEW and int(np.prod(value.shape[:-1])) == 1:
+        if int(np.prod(value.shape)) <= FEW_NUMBERS and int(np.prod(value.shape[:-1])) == 1:
             return str([f"{x:.4g}" for x in value.reshape(-1).tolist()]).replace("'", "")
         return f"{type(value).__name__.lower()}{tuple(value.shape)}"
     if isinstance(value, slice):
@@ -66,4 +66,4 @@ def _value(value: Any, deep: int) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str) and value and is_dataclass(value[0]):
         return f"[{', '.join(type(item).__name__ for item in value)}]"
     text = repr(value)
-    return text if len(text) <= LONG and "\n" not in text else f"{text[:LONG].splitlines()[0]}..."
+    return text if len(text) <= VALUE_LETTERS and "\n" not in text else f"{text[:VALUE_LETTERS].splitlines()[0]}..."

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 MAX_LETTERS = 300  # letters of a value in an error
+NAMED = 5  # problems that a warning names
 
 
 class InputError(ValueError):
@@ -33,6 +34,11 @@ def shown(value: object) -> str:
     except ValueError:  # a whole number of more digits than Python writes
         return type(value).__name__
     return text if len(text) <= 80 and "\n" not in text else type(value).__name__
+
+
+def first_line(error: BaseException) -> str:
+    """An error in one line: the first of its text, or its type."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def theirs(error: BaseException) -> BaseException | None:

@@ -13,9 +13,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, first_line
 
-INDEX = 8  # bytes of a row's number
+INDEX_BYTES = 8  # bytes of a row's number
 PART = ("torchgco-", ".part")  # beginning and ending of the name of a file that is still being written
 
 
@@ -89,7 +89,7 @@ def read_arrays(
             with np.load(file, allow_pickle=False) as held:
                 arrays = {name: held[name] for name in held.files}
             longest = max((max(array.shape, default=0) for array in arrays.values() if not array.size), default=0)
-            if INDEX * longest > room:  # no numbers, but as many rows
+            if INDEX_BYTES * longest > room:  # no numbers, but as many rows
                 expected = f"arrays whose rows fit into the {room / 1e9:.3g} GB {limit}"
                 raise InputError(field, expected, f"{path} with {longest:,} rows")
     except FileNotFoundError:
@@ -97,7 +97,7 @@ def read_arrays(
     except InputError:
         raise
     except Exception as error:  # damaged bytes make numpy, zipfile and zlib raise nearly anything
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         if "pickle" in reason:  # NumPy's words recommend to load it all the same
             reason = "of another format, or with Python objects"
         raise InputError(field, "a readable npz file without pickles", f"{path} ({reason})") from None

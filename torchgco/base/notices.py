@@ -11,7 +11,8 @@ import multiprocessing
 import sys
 
 LOG = logging.getLogger("torchgco")
-CLEAR = "\r\x1b[K"  # erases the line of a terminal, such as a progress bar's
+AFTER = 2.0  # s before a bar shows
+CLEAR_LINE = "\r\x1b[K"  # erases the line of a terminal, such as a progress bar's
 
 _speaks: bool | None = None
 
@@ -28,7 +29,7 @@ def notice(text: str, brief: bool = False) -> None:
         LOG.info(text)
         return
     if _may_speak() and sys.stderr is not None and (watched() or not brief):
-        print(f"{CLEAR if _in_terminal() else ''}torchgco: {text}", file=sys.stderr, flush=True)
+        print(f"{CLEAR_LINE if _in_terminal() else ''}torchgco: {text}", file=sys.stderr, flush=True)
 
 
 def watched() -> bool:

@@ -73,7 +73,7 @@ class Increasing(Limit):
         return all(a <= b for a, b in pairwise(value))
 
 
-LONG = 2**63  # integers from here on don't fit into 64 bits
+LONG_INTEGER = 2**63  # integers from here on don't fit into 64 bits
 UNBOUNDED = Limit("or infinity")  # admits infinity, but not NaN
 INCREASING = Increasing("in increasing order")
 
@@ -121,7 +121,7 @@ def _plain(value: Any, rule: Rule, field: str) -> Any:
     """The Python value of a NumPy number, the float of a long integer where one will do; InputError for all else."""
     if isinstance(value, np.generic) and rule.fits(value.item()):
         return value.item()
-    if type(value) is int and abs(value) >= LONG:
+    if type(value) is int and abs(value) >= LONG_INTEGER:
         if abs(value) < sys.float_info.max and rule.fits(float(value)):
             return float(value)
         raise InputError(field, f"{rule.one} of 64 bits", shown(value))
@@ -162,8 +162,8 @@ def _rule(kind: Any) -> Rule | None:
     if origin in (tuple, list, Sequence):
         return _row(args)
     kind = origin or kind
-    if kind in PLAIN:
-        return PLAIN[kind]
+    if kind in PLAIN_RULES:
+        return PLAIN_RULES[kind]
     try:
         isinstance(None, kind)
     except TypeError:  # a protocol that isn't checked at run time, or no class at all
@@ -223,7 +223,7 @@ def _row(kinds: Sequence[Any]) -> Rule | None:
 
 
 def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and -LONG < value < LONG
+    return isinstance(value, int) and not isinstance(value, bool) and -LONG_INTEGER < value < LONG_INTEGER
 
 
 def _is_number(value: Any) -> bool:
@@ -235,7 +235,7 @@ def _is_finite(value: Any) -> bool:
     return (isinstance(value, float) and -math.inf < value < math.inf) or _is_whole(value)
 
 
-PLAIN: dict[Any, Rule] = {
+PLAIN_RULES: dict[Any, Rule] = {
     int: Rule(_is_whole, "a whole number", "whole numbers"),
     float: Rule(_is_finite, "a number", "numbers"),
     bool: Rule(lambda v: isinstance(v, bool), "true or false", "true or false"),

@@ -25,6 +25,7 @@ from torch._C._functorch import peek_interpreter_stack  # type: ignore[import]
 from torchgco.base.errors import InputError, shown
 from torchgco.base.gradients import asks, is_recording, not_recording
 
+CPU = torch.device("cpu")
 # What a user's function raises where it doesn't fit the problem.
 MISTAKES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError)
 

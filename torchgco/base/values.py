@@ -19,7 +19,7 @@ from torchgco.base.tree import PerElement
 
 Knot = int | Tensor | None
 _default = RLock()
-BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+NAMED_PARAMETERS = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Values(PerElement):
         return replace(self, knot_rows=tuple(rows))
 
 
-NONE = Values()
+NO_VALUES = Values()
 
 
 @contextmanager
@@ -135,12 +135,12 @@ def keywords(function: Callable[..., Any]) -> frozenset[str]:
     found = _parameters(function)
     if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in found):
         return _All()
-    return frozenset(p.name for p in found if p.kind in BY_NAME)
+    return frozenset(p.name for p in found if p.kind in NAMED_PARAMETERS)
 
 
 def asks_for_knot(function: Callable[..., Any]) -> bool:
     """Whether a function has an argument k without a default; with one, k is a constant of the user's."""
-    return any(p.name == "k" and p.kind in BY_NAME and p.default is p.empty for p in _parameters(function))
+    return any(p.name == "k" and p.kind in NAMED_PARAMETERS and p.default is p.empty for p in _parameters(function))
 
 
 def _parameters(function: Callable[..., Any]) -> tuple[inspect.Parameter, ...]:

@@ -24,7 +24,7 @@ from torchgco.search.steering import TURNING, WITHIN
 Array = NDArray[np.float64]
 Driver = Callable[[Problem, "Track"], Array]
 
-AHEAD = 4  # stages after which a point's place is predicted
+PREDICTED_STAGES = 4  # stages after which a point's place is predicted
 EVENLY = 0.1  # a point's weakest push, as a share of its strongest, at least
 
 
@@ -113,7 +113,7 @@ def push_of(problem: Problem) -> Array:
     one = problem.take(torch.arange(1, device=problem.x0.device))
     x, u = one.x0, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
     total = x.new_zeros(1, one.n, one.m)
-    for k in range(min(AHEAD, one.N)):
+    for k in range(min(PREDICTED_STAGES, one.N)):
         model = one.dynamics.at(k)
         fx, fu = model.jacobians(x, u)
         total, x = fx @ total + fu, model.step(x, u)
@@ -128,7 +128,7 @@ def drive_point(problem: Problem, track: Track) -> Array:
     push, stages, at = push_of(problem), int(problem.stages[0]), problem.position
     low, high = bounds_of(problem)
     rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
-    inverse, time = np.linalg.pinv(push), AHEAD * float(problem.dynamics.dt)
+    inverse, time = np.linalg.pinv(push), PREDICTED_STAGES * float(problem.dynamics.dt)
     x, U, nearest = problem.x0, rest.clone(), 0
     for k in range(stages):
         p = _numbers(x[0, at])
@@ -143,7 +143,7 @@ def drive_point(problem: Problem, track: Track) -> Array:
 
 def _after(problem: Problem, x: Tensor, rest: Tensor, k: int) -> Tensor:
     """The state after a few stages with the controls at rest."""
-    for i in range(k, min(k + AHEAD, problem.N)):
+    for i in range(k, min(k + PREDICTED_STAGES, problem.N)):
         x = problem.dynamics.at(i).step(x, rest[:, i])
     return x
 

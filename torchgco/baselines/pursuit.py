@@ -32,11 +32,11 @@ from torchgco.solvers.session import Session
 
 Array = NDArray[np.float64]
 
-STEP = 0.5  # radii between nodes of the grid, at most
-NODES = 2**18  # of a grid, about, at most: a search of as many takes a second
+GRID_SPACING = 0.5  # radii between nodes of the grid, at most
+GRID_NODES = 2**18  # of a grid, about, at most: a search of as many takes a second
 LEAST_NODES = 2**14  # and where there is no radius to go by
-FINE = 0.25  # radii between the points of a path
-BESIDE = 4.0  # radii that the grid reaches beyond start, goal and obstacles
+PATH_SPACING = 0.25  # radii between the points of a path
+GRID_REACH = 4.0  # radii that the grid reaches beyond start, goal and obstacles
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class PathPursuit(Solver):
             return None
         long, duration = length(way), float(problem.stages[0]) * float(problem.dynamics.dt)
         unit = R or long / 100.0
-        step = min(FINE * unit, long / 10.0)
+        step = min(PATH_SPACING * unit, long / 10.0)
         points = smoothed(evenly(way, step), self.smoothing * unit / step)
         speed = length(points) / (self.share * duration)
         braking = speed / (BRAKING * duration)
@@ -139,10 +139,10 @@ class PathPursuit(Solver):
 
     def _way(self, problem: Problem, scene: Scene, start: Array, goal: Array, R: float) -> Array | None:
         """The cheapest way (P, d) over a grid, first by steps that are free for the vehicle, then by nodes that are."""
-        low, high = region(scene, BESIDE * R)
+        low, high = region(scene, GRID_REACH * R)
         wide, d = high - low, len(low)
-        least = float(np.prod(wide) / NODES) ** (1.0 / d)
-        spacing = max(STEP * R, least) if R > 0 else float(np.prod(wide) / LEAST_NODES) ** (1.0 / d)
+        least = float(np.prod(wide) / GRID_NODES) ** (1.0 / d)
+        spacing = max(GRID_SPACING * R, least) if R > 0 else float(np.prod(wide) / LEAST_NODES) ** (1.0 / d)
         axes = [torch.arange(int(side / spacing) + 1, dtype=torch.float64) for side in wide]
         nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
         places = problem.x0.new_tensor(low) + spacing * nodes.to(problem.x0)

@@ -13,14 +13,12 @@ from torch import Tensor
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
 from torchgco.base.options import Seconds, Seed, check_value
-from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on
+from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
 from torchgco.compiled.numbers import Numbers, as_floats, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.compiled.stages import moved, stage_of, stages_between
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current
 from torchgco.problem.problem import Problem, current_problem
-
-CPU = torch.device("cpu")
 
 
 class MPPIController:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchgco.api import solve
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Positive, check_value
-from torchgco.base.shapes import check_untransformed, computing_on
+from torchgco.base.shapes import CPU, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
@@ -36,7 +36,6 @@ from torchgco.solvers.ending import constant_cost, least_cost
 from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
 
 SOLVERS = "gco", "interior_point"
-CPU = torch.device("cpu")
 CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEASIBLE, Status.TIME_LIMIT))
 
 

@@ -14,15 +14,13 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Seconds, check_value
 from torchgco.base.status import Status
-from torchgco.compiled.compiled import Answer, Compiled, compile
+from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Answer, Compiled, compile
 from torchgco.compiled.numbers import Numbers, as_floats
 from torchgco.compiled.plan import Plan
 from torchgco.compiled.stages import stage_of, stages_between
 from torchgco.constraints.bounds import RateBounds
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
-
-CONVERGED, FEASIBLE = int(Status.CONVERGED), int(Status.FEASIBLE)
 
 
 class MPC:

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import computing_on
+from torchgco.base.shapes import CPU, computing_on
 from torchgco.compiled.numbers import as_floats
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.problem.between import between
 
-CPU = torch.device("cpu")
-ROUNDING = 1e-9  # of a stage: a time this close before a knot is the knot's
+KNOT_ROUNDING = 1e-9  # of a stage: a time this close before a knot is the knot's
 
 
 class Instant(NamedTuple):
@@ -78,9 +77,9 @@ class Plan:
     def _at(self, t: float, given: Tensor | None) -> Instant:
         B, N, m = self.U.shape
         stages = np.clip((t - self.start) / self.dt, 0.0, N)
-        k = np.minimum(np.floor(stages + ROUNDING), N - 1).astype(int)
+        k = np.minimum(np.floor(stages + KNOT_ROUNDING), N - 1).astype(int)
         share = np.clip(stages - k, 0.0, 1.0)
-        share[share < ROUNDING] = 0.0
+        share[share < KNOT_ROUNDING] = 0.0
         states, rows = self._states_at(k, share), torch.arange(B)
         u = self.U[rows, k].clone()
         if given is not None:

@@ -11,7 +11,7 @@ from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.problem import Problem
 from torchgco.problem.times import times
 
-ROUNDING = 1e-6  # of the stages between two steps: times are sums of periods
+STAGE_ROUNDING = 1e-6  # of the stages between two steps: times are sums of periods
 
 
 def stage_of(problem: Problem) -> float:
@@ -33,7 +33,7 @@ def stage_of(problem: Problem) -> float:
 def stages_between(count: float) -> float:
     """A number of stages, whole where it is but for rounding."""
     whole = round(count)
-    return whole if abs(count - whole) <= ROUNDING * max(1.0, count) else count
+    return whole if abs(count - whole) <= STAGE_ROUNDING * max(1.0, count) else count
 
 
 def moved(values: Tensor, stages: float) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.constraints.base import Constraint, innermost, whole
-from torchgco.constraints.norms import AWAY, NormBounds
+from torchgco.constraints.norms import NO_ROW, NormBounds
 from torchgco.costs.base import add_blocks
 
 
@@ -130,7 +130,7 @@ class GateSquares(Constraint):
     def bind(self, dims: Dimensions) -> Self:
         B, _, d = self.centers.shape
         slopes = self.centers.new_zeros(B, dims.N, 2 * d - 1, d)
-        limits = torch.full_like(slopes[..., 0], -AWAY)  # 0 - 1: no row
+        limits = torch.full_like(slopes[..., 0], -NO_ROW)  # 0 - 1: no row
         bound = replace(self, slopes=slopes, limits=limits, knots=slice(1, dims.N + 1))
         bound.write()
         return bound

@@ -14,11 +14,11 @@ from torchgco.base.shapes import Dimensions, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
-AWAY = -1.0  # the row of a bound that one problem of a batch doesn't have
+NO_ROW = -1.0  # the row of a bound that one problem of a batch doesn't have
 # Length of a vector, in its units, at which a cone's row is smooth, too: smaller ones cost the interior point hundreds
 # of iterations where a vector ends at the tip, as the way to a landing site does.
 TIP = 1e-4
-QUATERNION = "quaternion"
+OF_ATTITUDE = "quaternion"
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class NormBounds(_Vectors):
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         square, rows = self._away(X, U).square().sum(-1), []
         for sign, bound, there in self._sides():
-            rows.append(sign * there / (2.0 * bound) * (square - bound.square()) + (1.0 - there) * AWAY)
+            rows.append(sign * there / (2.0 * bound) * (square - bound.square()) + (1.0 - there) * NO_ROW)
         return torch.stack(rows, dim=-1)
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
@@ -182,9 +182,9 @@ class Cone(_Vectors):
     label: ClassVar[str] = "cone"
 
     def bind(self, dims: Dimensions) -> Self:
-        known = QUATERNION if self.attitude else self.of
-        kind, components = _chosen(known, self.components, ("x", "u", QUATERNION), dims, "cone.of")
-        attitude = kind == QUATERNION
+        known = OF_ATTITUDE if self.attitude else self.of
+        kind, components = _chosen(known, self.components, ("x", "u", OF_ATTITUDE), dims, "cone.of")
+        attitude = kind == OF_ATTITUDE
         if attitude and len(components) != 4:
             raise InputError("cone.of", "the four states (w, x, y, z) of a quaternion", components.tolist())
         kind = "x" if attitude else kind

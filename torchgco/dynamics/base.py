@@ -14,7 +14,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Seconds, check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users
-from torchgco.base.values import NONE, Knot, Values, asks_for_knot, bound_values
+from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS
 
 
@@ -181,4 +181,4 @@ class FunctionDynamics(Dynamics):
     def _called(self, x: Tensor, u: Tensor) -> Tensor:
         if self.k is None and self._depends_on_stage:
             raise InputError("dynamics", "a stage, as in `dynamics.at(k).step(x, u)`", "none")
-        return (self.values or NONE).call(self.function, x, u, k=self.k)
+        return (self.values or NO_VALUES).call(self.function, x, u, k=self.k)

@@ -19,7 +19,7 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 
 Components = tuple[Tensor, ...]
-Row = tuple[float, float, float]
+Triple = tuple[float, float, float]
 Limits = tuple[float | None, ...]
 Texts = tuple[str, ...]
 POSE: Texts = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
@@ -39,7 +39,7 @@ class Airframe:
     """
 
     mass: Annotated[float, Above(0, "kg")] = 1.608
-    inertia: tuple[Row, Row, Row] = (
+    inertia: tuple[Triple, Triple, Triple] = (
         (0.0366, 0.0, 0.0065),
         (0.0, 0.0327, 0.0046),
         (0.0065, 0.0046, 0.0187),
@@ -124,7 +124,7 @@ def _as_rows(inertia: Any) -> Any:
     )
 
 
-def _is_inertia(a: Row, b: Row, c: Row) -> bool:
+def _is_inertia(a: Triple, b: Triple, c: Triple) -> bool:
     """Whether the matrix with these rows is symmetric and positive definite: its leading minors are above 0."""
     minor = a[0] * b[1] - a[1] * b[0]
     # By hand: a first use of PyTorch's linear algebra here would come before `import torchgco` has set it up.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgco.base.autodiff import hessian_forward, jacobian, not_finite
 from torchgco.base.shapes import MISTAKES
 
-AT_ONCE = 2**20  # numbers of w, over all directions, that are differentiated together: bounds the memory
+DIRECTIONS_AT_ONCE = 2**20  # numbers of w, over all directions, that are differentiated together: bounds the memory
 
 Function = Callable[[Tensor], Tensor]  # of w (b, K', v): rows (b, K, p)
 Expansion = Callable[[Function, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -54,7 +54,7 @@ def _rows(values: Tensor, z: Tensor) -> Tensor:
     basis = torch.eye(values.shape[-1], dtype=z.dtype, device=z.device)
     basis = basis.view(-1, *[1] * (values.dim() - 1), values.shape[-1])
     parts = []
-    for some in basis.split(max(1, AT_ONCE // max(1, z.numel()))):
+    for some in basis.split(max(1, DIRECTIONS_AT_ONCE // max(1, z.numel()))):
         many = some.expand(-1, *values.shape)
         found = torch.autograd.grad(values, z, many, retain_graph=True, is_grads_batched=True, allow_unused=True)[0]
         # Slopes of an affine function depend on its weights, which may ask for gradients, and not on z.
@@ -73,7 +73,7 @@ def by_forward(function: Function, w: Tensor, weights: Tensor) -> tuple[Tensor, 
         return torch.func.jvp(torch.func.grad(weighted, has_aux=True), (w,), (direction.expand_as(w),))[1]
 
     basis = torch.eye(w.shape[-1], dtype=w.dtype, device=w.device)
-    H, J = torch.func.vmap(along, chunk_size=max(1, AT_ONCE // max(1, w.numel())))(basis)
+    H, J = torch.func.vmap(along, chunk_size=max(1, DIRECTIONS_AT_ONCE // max(1, w.numel())))(basis)
     return _finite(function, w, weights, function(w), J.movedim(0, -1), H.movedim(0, -1))
 
 

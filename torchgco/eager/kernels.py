@@ -20,7 +20,7 @@ from torchgco.problem.border import ONE_KNOT
 from torchgco.problem.joined import scattered
 from torchgco.problem.problem import Problem
 
-OFFSET = 1e-3  # of the states at which rows are looked at, as a share of 1 + |x|
+STATE_OFFSET = 1e-3  # of the states at which rows are looked at, as a share of 1 + |x|
 LEAST_VIOLATION = 100.0  # units of the last bit of lengths of 1 m, below which a rollout doesn't meet rows
 
 
@@ -98,7 +98,7 @@ def joins_knots(part: Constraint, problem: Problem) -> bool:
     one, part = problem.take(slice(0, 1)), part.take(slice(0, 1))
     X, U = one.at_rest
     z = joined(X, U)
-    z = z + OFFSET * (1.0 + z.abs()) * (1.0 + 0.5 * scattered(z))
+    z = z + STATE_OFFSET * (1.0 + z.abs()) * (1.0 + 0.5 * scattered(z))
     value, n = lambda z: part.value(z[..., :n], z[:, :-1, n:]), problem.n
     place = torch.arange(problem.N + 1, device=z.device)
     for digit in range(problem.N.bit_length()):

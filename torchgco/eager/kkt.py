@@ -8,7 +8,7 @@ from torch import Tensor
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.softness import gives_of
 from torchgco.eager.step import Factors, factor, solve
-from torchgco.lagrangian.kkt import PIVOT, ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
+from torchgco.lagrangian.kkt import LEAST_PIVOT, CLOSING_ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
 
 
 def kkt(
@@ -26,7 +26,7 @@ def kkt(
     sigma = sigma / gives_of(model, slopes, curvature, SLIGHT / STIFF * sigma[:, 0], active)
     stays = torch.ones_like(lam) if give is None else torch.where(active, 1.0 + sigma * give, 1.0)
     H = found.with_squares(torch.where(active, sigma / stays, 0.0))
-    factors = factor(found.F, H, torch.zeros_like(X[:, 0, 0]), PIVOT, model.problem.free_start)
+    factors = factor(found.F, H, torch.zeros_like(X[:, 0, 0]), LEAST_PIVOT, model.problem.free_start)
     sides = zip(right.a, right.b, right.c, strict=True)
     columns = [_solved(found, factors, active, sigma, stays, *side) for side in sides]
     none = (X.new_zeros(0, *shape.shape[1:]) for shape in (right.a, right.b, right.c, right.a[..., 0, 0]))
@@ -52,7 +52,7 @@ def _solved(
     c, a = torch.where(active, c, 0.0), a.clone()
     a[:, -1, n:] = 0.0
     z, y, v = torch.zeros_like(a), torch.zeros_like(b), torch.zeros_like(c)
-    for _ in range(ROUNDS):
+    for _ in range(CLOSING_ROUNDS):
         open_a = a + (found.H @ z.unsqueeze(-1)).squeeze(-1)
         open_a[:, :-1] += (F.mT @ y.unsqueeze(-1)).squeeze(-1)
         open_a[:, 1:, :n] -= y

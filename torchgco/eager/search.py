@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgco.eager import step as riccati
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.rows import Dense, joined
-from torchgco.eager.state import KEPT, Kinds, State, column, evaluate, logarithms, residuals, theta_of
+from torchgco.eager.state import STATE_FIELDS, Kinds, State, column, evaluate, logarithms, residuals, theta_of
 
 # The step -----------------------------------------------------------------------------------------------------------
 
@@ -183,13 +183,13 @@ def _keep(t: State, of: Tensor) -> None:
     """Keep the iterates of the problems `of`."""
     t.kept = tuple(
         torch.where(of.view(-1, *[1] * (old.dim() - 1)), getattr(t, name), old)
-        for name, old in zip(KEPT, t.kept, strict=True)
+        for name, old in zip(STATE_FIELDS, t.kept, strict=True)
     )
 
 
 def go_back(t: State, of: Tensor) -> None:
     """Return to the iterates that were kept, of the problems `of`."""
-    for name, kept in zip(KEPT, t.kept, strict=True):
+    for name, kept in zip(STATE_FIELDS, t.kept, strict=True):
         old = getattr(t, name)
         setattr(t, name, torch.where(of.view(-1, *[1] * (old.dim() - 1)), kept, old))
     t.watching = t.watching & ~of

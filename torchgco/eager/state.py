@@ -18,7 +18,7 @@ from torchgco.base.tree import take as take_rows
 from torchgco.eager.model import Derivatives, Model, Values
 from torchgco.problem.problem import Problem
 
-PAIRS = 64  # entries of a filter; the oldest are forgotten
+FILTERED = 64  # entries of a filter; the oldest are forgotten
 LONGEST_FALL = 50  # reductions of the barrier parameter in one iteration
 
 How = SimpleNamespace  # the options: see solvers.interior.FILTER
@@ -50,7 +50,7 @@ class State:
     phi: Tensor
     highest: Tensor  # theta_max
     lowest: Tensor  # theta_min
-    filter: Tensor  # (b, PAIRS, 2): theta and phi, in their order; infinite where empty
+    filter: Tensor  # (b, FILTERED, 2): theta and phi, in their order; infinite where empty
     last: Tensor  # the last shift that was needed
     forced: Tensor  # the least shift
     entered: Tensor  # theta at the beginning of the restoration
@@ -81,7 +81,7 @@ class State:
             put_rows(getattr(self, f.name), index, getattr(some, f.name))
 
 
-KEPT = "X", "U", "y", "gap", "cost", "c", "s", "z"
+STATE_FIELDS = "X", "U", "y", "gap", "cost", "c", "s", "z"
 
 
 @dataclass(frozen=True)
@@ -125,13 +125,13 @@ def blank(problem: Problem, X: Tensor, U: Tensor, z: Tensor) -> State:
     made = {
         **own, "out": never, "fixes": never, "gives": torch.ones_like(z), "room": torch.ones_like(z), "relaxed": none,
         "mu": zero, "scale": one, "objective": one, "soft": zero, "shift": zero, "theta": zero, "phi": zero,
-        "highest": inf, "lowest": zero, "filter": X.new_full((b, PAIRS, 2), torch.inf), "last": zero, "forced": zero,
+        "highest": inf, "lowest": zero, "filter": X.new_full((b, FILTERED, 2), torch.inf), "last": zero, "forced": zero,
         "entered": zero, "slope": zero, "alpha": zero, "least": inf, "left": inf, "idle": count, "made": count,
         "failures": count, "shortened": count, "ahead": count, "restoring": no, "crawls": no, "rows_relaxed": no,
         "presses": no, "watching": no, "rows": torch.arange(b, device=X.device),
     }  # fmt: skip
     made = {name: value.clone() for name, value in made.items()}
-    return State(**made, kept=tuple(made[name].clone() for name in KEPT))
+    return State(**made, kept=tuple(made[name].clone() for name in STATE_FIELDS))
 
 
 def column(values: Tensor) -> Tensor:

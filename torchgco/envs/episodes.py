@@ -40,8 +40,8 @@ class Episodes:
 
     def __init__(self, mission: Mission, problem: Problem, count: int, control: Control) -> None:
         problem, _, _ = check_flown(mission, problem, 0, None)
-        if mission.sensor != "full" or mission.latency:
-            given = f"a {mission.sensor}" if mission.sensor != "full" else "a latency"
+        if not mission.sees_all or mission.latency:
+            given = "a latency" if mission.sees_all else "a sensor"
             raise InputError("mission", "neither a sensor nor a latency in an environment", given)
         self.mission, self.problem, self.control = mission, problem, control
         self.contacts = Contact.among(problem)

@@ -18,15 +18,15 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, first_line
 from torchgco.base.version import VERSION
-from torchgco.experiments.config.build import forget_composed, recomposer
+from torchgco.experiments.config.build import forget_composed, plain, recomposer
 from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
 from torchgco.experiments.config.groups import ENTRY, config_dir, register_resolver
 from torchgco.experiments.ending import Refused, ended, raised, say, silence
 from torchgco.experiments.flying.jobs import Report
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.identity import decisive, digest, plain, settings_of
+from torchgco.experiments.results.identity import decisive, digest, settings_of
 
 # conf/hydra/launcher extends the plugins' configurations of the same names. Hydra warns that it may stop to join them;
 # ours are whole.
@@ -48,7 +48,7 @@ def study_folder(_root_: Any) -> str:
 
 def _described(_root_: Any) -> str:
     held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
-    solvers = {held["solver"]["name"]: {key: value for key, value in held["solver"].items() if key != "name"}}
+    solvers = {held["solver"]["name"]: settings_of(held)}
     recompose = recomposer(_root_.hydra.overrides.task, _root_.hydra.runtime.config_sources)
     for name in held["study"]["baselines"] or ():
         solvers.setdefault(name, settings_of(recompose(name)))
@@ -74,7 +74,7 @@ def _task(config: DictConfig) -> Report:
 
             noted.raise_late()
             done = run_study(
-                config, folder, recomposer(overrides, job.runtime.config_sources),
+                plain(config), folder, recomposer(overrides, job.runtime.config_sources),
                 lambda: _keep_configuration(config, folder), command=sys.argv[1:] if alone else ["-m", *overrides],
             )  # fmt: skip
     except (InputError, HydraException, OmegaConfBaseException) as error:
@@ -99,8 +99,7 @@ def _is_of_launcher(error: Exception) -> bool:
 
 def _stopped(error: Exception) -> str:
     """A launcher's error as one line."""
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
-    return f"a job was stopped ({reason}); what jobs flew is kept, and the same command resumes"
+    return f"a job was stopped ({first_line(error)}); what jobs flew is kept, and the same command resumes"
 
 
 def _remove_empty(folder: Path) -> None:

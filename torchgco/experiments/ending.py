@@ -6,16 +6,15 @@ import os
 import re
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 from torchgco.base.errors import InputError
+from torchgco.base.signals import handled
 from torchgco.native.compiler import NativeError
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-OWN = (signal.default_int_handler, signal.SIG_DFL)  # handlers of Python and of the system
+OWN_HANDLERS = (signal.default_int_handler, signal.SIG_DFL)  # handlers of Python and of the system
 
 
 class Refused(SystemExit):
@@ -77,17 +76,9 @@ def raised() -> Iterator[Noted]:
 
     A signal that is ignored stays so, as in the background of a shell, and the handler of another program is kept.
     """
-    noted, before = Noted(), {}
-    if threading.current_thread() is threading.main_thread():  # only that one may set handlers and gets signals
-        handlers = {number: signal.getsignal(number) for number in SIGNALS}
-        before = {number: held for number, held in handlers.items() if held in OWN or isinstance(held, Noted)}
-    for number in before:
-        signal.signal(number, noted)
-    try:
+    noted = Noted()
+    with handled(noted, lambda held: held in OWN_HANDLERS or isinstance(held, Noted)):
         yield noted
-    finally:
-        for number, held in before.items():
-            signal.signal(number, held)
 
 
 def say(text: str) -> None:

@@ -27,7 +27,7 @@ BY_STATUS = {
     Status.UNBOUNDED: "Bounds on what grows, or a cost that keeps it small.",
     Status.INVALID_START: "A start x0 outside the obstacles, whose radii here include the vehicle's.",
 }
-UNMOVED = (
+OTHER_START = (
     "No control moves the row named above: the start x0 breaks it. The controls returned are those found for all other "
     "rows."
 )
@@ -38,8 +38,8 @@ NEARER = (
     "A longer horizon N, weaker limits, or a larger radius of the goal; without required=True the solve tells how near "
     "it gets."
 )
-ELSEWHERE = "A goal that no obstacle covers, or a larger radius of it."
-UNKNOWN = (
+OTHER_GOAL = "A goal that no obstacle covers, or a larger radius of it."
+KNOWN_START = (
     "A start where the map knows that it is free; or let unknown cells, which count as occupied, count as free: "
     'DistanceField.of(grid, unknown="free"), on the command line scenario.unknown=free.'
 )
@@ -87,7 +87,7 @@ class Facts:
     def told(self) -> list[str]:
         """Why the solve ended so, in sentences."""
         if self.unmoved:
-            return [UNMOVED]
+            return [OTHER_START]
         if self.radius is None and self.missed is not None:
             return [self.status.sentence, COVERED if self.covered else MISSED.format(missed=self.missed)]
         if self.radius is None:
@@ -100,7 +100,7 @@ class Facts:
 def advice(facts: Facts) -> list[str]:
     """Sentences, the most useful first; none where nothing is amiss."""
     if facts.in_unknown:
-        return [UNKNOWN]
+        return [KNOWN_START]
     if facts.unmoved:
         return [MOVED]
     if facts.radius is not None:
@@ -116,7 +116,7 @@ def advice(facts: Facts) -> list[str]:
     if facts.status in FITS and facts.reached is False:
         found.append("A longer horizon N, or a larger terminal weight: the trajectory stops short of the goal.")
     elif facts.missed is not None and facts.status is Status.INFEASIBLE:
-        found.append(ELSEWHERE if facts.covered else NEARER)
+        found.append(OTHER_GOAL if facts.covered else NEARER)
     elif facts.status in BY_STATUS:
         limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
         row = "the row named above" if facts.named else "one constraint after the other"

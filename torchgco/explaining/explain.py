@@ -28,7 +28,7 @@ from torchgco.problem.times import times
 if TYPE_CHECKING:
     import pandas as pd
 
-WIDTH = 110  # letters of a line
+LINE_WIDTH = 110  # letters of a line
 
 
 class Solved(Protocol):
@@ -229,5 +229,5 @@ def _block(title: str, lines: list[str]) -> str:
     if not title:
         return "\n".join(lines)
     first = f"{title}: "
-    wrapped = [textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ") for line in lines]
+    wrapped = [textwrap.fill(line, LINE_WIDTH, initial_indent="  ", subsequent_indent="    ") for line in lines]
     return "\n".join([first.rstrip(), *wrapped])

@@ -20,7 +20,7 @@ FATES = {
     Fate.UNSOUND: "relaxed, but too deep in an obstacle or away from the goal",
     Fate.TRACKED: "dropped as tracked, others cost less",
 }
-OUTER = 12  # outer iterations that are told, the last ones
+TOLD_ITERATIONS = 12  # outer iterations that are told, the last ones
 
 
 def passes_told(record: SearchRecord, b: int, problems: dict[int, str]) -> list[str]:
@@ -68,8 +68,8 @@ def iterations_told(trace: pd.DataFrame, b: int) -> list[str]:
         f"{', guided' if end.guided else ''}"
         for (attempt, outer), end, count in zip(ends.index, ends.itertuples(), counts, strict=True)
     ]
-    left = len(lines) - OUTER
-    return [f"{left} outer iterations before these", *lines[-OUTER:]] if left > 0 else lines
+    left = len(lines) - TOLD_ITERATIONS
+    return [f"{left} outer iterations before these", *lines[-TOLD_ITERATIONS:]] if left > 0 else lines
 
 
 def is_pathless(record: SearchRecord, b: int) -> bool:

@@ -14,13 +14,13 @@ from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import controls_of, states_of
-from torchgco.judging.worst import NONE, kind_of, worst_rows
+from torchgco.judging.worst import NO_PLACE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
-SHOWN = 4  # runs of knots, or obstacles, that are named
+PLACES_SHOWN = 4  # runs of knots, or obstacles, that are named
 
 
 def number(value: float) -> str:
@@ -28,7 +28,7 @@ def number(value: float) -> str:
     return f"{value:,.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
 
 
-def listed(words: Sequence[object], most: int = SHOWN) -> str:
+def listed(words: Sequence[object], most: int = PLACES_SHOWN) -> str:
     """The first of some words, and how many follow."""
     more = f" and {len(words) - most} more" if len(words) > most else ""
     return ", ".join(map(str, words[:most])) + more
@@ -84,7 +84,7 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     """The row that X (1, N+1, n), U (1, N, m) violates most; None where it violates none."""
     times = None if problem.time is None or t is None else t.unsqueeze(0)
     worst = {name: column[0] for name, column in worst_rows(problem, X, U, times).items()}
-    if worst["constraint"] == NONE:
+    if worst["constraint"] == NO_PLACE:
         return None
     if worst["constraint"] >= len(problem.constraints):
         return f"the bounds of the time, by a factor of {number(worst['violation'])}"

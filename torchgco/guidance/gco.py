@@ -19,7 +19,7 @@ from torchgco.problem.problem import Problem
 from torchgco.solvers.caught import active_counts, caught_knots
 from torchgco.solvers.contracts import Advice
 
-REACH = 0.02  # r_guide as a share of the distance to be flown; the paper's vehicles have radii of 0.017 and 0.03 of it
+R_GUIDE = 0.02  # r_guide as a share of the distance to be flown; the paper's vehicles have radii of 0.017 and 0.03
 DIVERGED = 1e3  # times the cost of staying at the start: a costlier sample mean is not used
 
 
@@ -27,7 +27,7 @@ DIVERGED = 1e3  # times the cost of staying at the start: a costlier sample mean
 class GCO:
     """Where a solved trajectory is caught between obstacles, attract it to a region that MPPI found.
 
-    r_guide is the vehicle's radius, or without spheres and boxes `REACH` times the distance from start to goal
+    r_guide is the vehicle's radius, or without spheres and boxes `R_GUIDE` times the distance from start to goal
     (to the farthest knot where the problem has no goal).
 
     Args:
@@ -102,7 +102,7 @@ def _radius(problem: Problem, X: Tensor) -> Tensor:
         return problem.obstacles[0].vehicle_radius
     at = problem.position
     ends = X[:, 1:, at] if problem.goal is None else problem.goal.position.unsqueeze(1)
-    return REACH * (ends - problem.x0[:, None, at]).square().sum(-1).sqrt().amax(-1)
+    return R_GUIDE * (ends - problem.x0[:, None, at]).square().sum(-1).sqrt().amax(-1)
 
 
 def guide_along(guide: GuideRegion, X_safe: Tensor, caught: Tensor, radius: Tensor) -> GuideRegion:

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from torchgco.base.errors import GuidanceWarning
+from torchgco.base.errors import GuidanceWarning, first_line
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import kernels_of
 from torchgco.problem.problem import Problem
@@ -67,7 +67,7 @@ def failure(trial: Callable[[Problem], None], problem: Problem, dtype: torch.dty
     try:
         trial(problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device)).cast(dtype))
     except Exception as error:  # users' functions may raise anything, and no such error may end the solve
-        return (str(error).splitlines() or [type(error).__name__])[0]
+        return first_line(error)
     return None
 
 

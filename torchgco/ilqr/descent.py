@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torchgco.ilqr.line_search import LineSearch
 
-ROUNDING = 1e-14  # share of L_M: a smaller expected change is rounding error
+ROUNDED_OFF = 1e-14  # share of L_M: a smaller expected change is rounding error
 # mu_r after a failed Cholesky (Algorithm 2, line 9): first value, growth factor, and the limit that ends a problem.
 REGULARISATION_FIRST, REGULARISATION_GROWTH, REGULARISATION_MAX = 1e-6, 10.0, 1e10
 # mu_r after a failed line search: first value in units of `Problem.cost_unit`, factor per failure, divisor per success.

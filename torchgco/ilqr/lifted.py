@@ -18,13 +18,13 @@ from torchgco.lagrangian.lagrangian import Lagrangian
 
 LIFTED_STEPS = 20  # steps at most
 GAIN = 1e-2  # share of L_M by which a rollout must lower it
-LOST = 1e6  # rollouts diverge where even the shortest step makes L_M this many times as large
+LOST_BY = 1e6  # rollouts diverge where even the shortest step makes L_M this many times as large
 
 
 def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Tensor, shortest: float) -> Tensor:
-    """Whether even the shortest step along the gains G (N, B, m, n+1) makes L_M more than `LOST` |merit|, (B,)."""
+    """Whether even the shortest step along the gains G (N, B, m, n+1) makes L_M more than `LOST_BY` |merit|, (B,)."""
     value = lagrangian.value(*closed_loop(lagrangian.problem.dynamics, X, U, G, torch.full_like(merit, shortest)))[1]
-    return ~(value <= LOST * merit.abs())
+    return ~(value <= LOST_BY * merit.abs())
 
 
 def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:

@@ -22,7 +22,7 @@ def iterate(how: Descent, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
     step = backward(F, H, s.regularisation)
     status = torch.full_like(s.rows, Status.RUNNING)
     expected = step.expected_change(torch.ones_like(s.merit)).abs()
-    settled = expected <= descent.ROUNDING * s.merit.abs()
+    settled = expected <= descent.ROUNDED_OFF * s.merit.abs()
     moving = ~step.failed & ~settled
     if bool(step.failed.any()):
         _raise_regularisation(s, step, F, H, status)

@@ -18,7 +18,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 
 BETWEEN = 4  # pieces of a stage, each of which has a contact of its own or none
-ALIKE = 1e-9  # m: depths that differ less are one, as of a way through equal cells
+SAME_DEPTH = 1e-9  # m: depths that differ less are one, as of a way through equal cells
 
 
 def contacts(
@@ -66,7 +66,7 @@ def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """The deepest places (C, d) of each run of pieces, with ends (P+1, d), whose depth (P,) is above 0."""
     middle, touching = 0.5 * (places[1:] + places[:-1]), np.flatnonzero(depth > 0)
     runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
-    found = [middle[run[depth[run] > depth[run].max() - ALIKE]].mean(axis=0) for run in runs if len(run)]
+    found = [middle[run[depth[run] > depth[run].max() - SAME_DEPTH]].mean(axis=0) for run in runs if len(run)]
     return np.array(found).reshape(-1, places.shape[1])
 
 

@@ -35,7 +35,7 @@ from torchgco.problem.problem import Problem, current_problem
 OTHERS_WITHIN = ADMITTED  # how far all constraints but the obstacles may be violated by a feasible trajectory
 SUCCESS_VIOLATION = ADMITTED  # full radii, in metres
 SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
-BLOCK = 2**18  # numbers held at once where distances from spheres are measured: 2 MB
+NUMBERS_AT_ONCE = 2**18  # numbers held at once where distances from spheres are measured: 2 MB
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
     if spheres.centers.shape[1] == 0:
         far = torch.full_like(X[:, 0, 0], torch.inf)
         return far, far
-    rows = max(1, BLOCK // (X.shape[1] * spheres.centers[0].numel()))
+    rows = max(1, NUMBERS_AT_ONCE // (X.shape[1] * spheres.centers[0].numel()))
     starts = (slice(i, i + rows) for i in range(0, X.shape[0], rows))
     at_knots, between = zip(*(_sphere_clearance(spheres.take(some), X[some]) for some in starts), strict=True)
     return torch.cat(at_knots), torch.cat(between)

@@ -20,9 +20,9 @@ from torchgco.maps.distance import DistanceField
 from torchgco.maps.field import BoundField
 from torchgco.maps.grid import OccupancyGrid
 
-NEAR = 2.0  # m: distances up to here are exact, farther ones lower bounds
-LEAST = 1e-12  # m, of a bound's rounding
-AT_ONCE = 2**17  # pairs measured together
+EXACT_TO = 2.0  # m: distances up to here are exact, farther ones lower bounds
+BOUND_ROUNDING = 1e-12  # m, of a bound's rounding
+PAIRS_AT_ONCE = 2**17  # pairs measured together
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Solid:
 def segment_distances(field: BoundField, p: Tensor) -> Tensor:
     """Distances (B, K-1) of the map from the straight segments between points p (B, K, d), m.
 
-    Below `NEAR` close lower bounds, within 1e-9 m, of the signed distances from the nearest cell or point: negative
+    Below `EXACT_TO` close lower bounds, within 1e-9 m, of the signed distances from the nearest cell or point: negative
     where a segment enters one. Farther away they may be loose. Infinite where nothing is occupied, NaN at points that
     are NaN.
     """
@@ -82,8 +82,8 @@ def _distances(solid: Solid, p: Tensor) -> Tensor:
     middle, half = (a + 0.5 * along)[rows].numpy(), 0.5 * along[rows].norm(dim=-1).numpy()
     nearest, _ = solid.tree.query(middle)
     # The distance changes no faster than the point moves, and a solid reaches no farther than `reach`.
-    bound = nearest - half - solid.reach - LEAST
-    close = bound < NEAR
+    bound = nearest - half - solid.reach - BOUND_ROUNDING
+    close = bound < EXACT_TO
     distance = bound.copy()
     distance[close] = np.inf
     distance[close] = _measured(solid, a[rows[close]], along[rows[close]], middle[close], (nearest + half)[close])
@@ -94,12 +94,12 @@ def _distances(solid: Solid, p: Tensor) -> Tensor:
 
 def _measured(solid: Solid, a: Tensor, along: Tensor, middle: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Distances (E,) of the solids from segments from a to a + along (E, d), with one at `least` (E,) at most."""
-    lists = solid.tree.query_ball_point(middle, least + solid.reach + LEAST) if len(middle) else []
+    lists = solid.tree.query_ball_point(middle, least + solid.reach + BOUND_ROUNDING) if len(middle) else []
     near = np.concatenate([np.asarray(some, int) for some in lists]) if len(lists) else np.zeros(0, int)
     segment = np.repeat(np.arange(len(lists)), [len(some) for some in lists])
     distance = np.full(len(middle), np.inf)
-    for first in range(0, len(near), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
+    for first in range(0, len(near), PAIRS_AT_ONCE):
+        part = slice(first, first + PAIRS_AT_ONCE)
         which, center = segment[part], torch.from_numpy(solid.centers[near[part]])
         axes = torch.eye(center.shape[1], dtype=center.dtype).expand(len(center), -1, -1)
         away = closest(axes, center, torch.full_like(center, solid.half), a[which], along[which])

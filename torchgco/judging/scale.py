@@ -8,24 +8,24 @@ from torch import Tensor
 from torchgco.base.draws import scattered
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
-from torchgco.judging.worst import NONE
+from torchgco.judging.worst import NO_PLACE
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
 
 SHARE = 0.05  # of a row's values: a larger violation leaves little of the row
-NOISE = 1e-9  # of states and controls: what this changes a row by is rounding, and doesn't say the row's size
-ROUGH = 1e-6  # where a row has no others, no violation up to this counts as large, which solves may leave
+STATE_NOISE = 1e-9  # of states and controls: what this changes a row by is rounding, and doesn't say the row's size
+LARGE_VIOLATION = 1e-6  # where a row has no others, no violation up to this counts as large, which solves may leave
 
 
 def noise(X: Tensor, U: Tensor) -> Tensor:
     """Violations (B,) up to which no row's can be large, of trajectories X (B, N+1, n), U (B, N, m)."""
     sizes = torch.cat((X.abs().amax(1), U.abs().amax(1)), dim=-1)
     least = torch.where(sizes > 0, sizes, torch.inf).amin(-1)
-    return NOISE * torch.where(torch.isinf(least), 0.0, least)
+    return STATE_NOISE * torch.where(torch.isinf(least), 0.0, least)
 
 
 def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """The place (B,) of a constraint with a violation that is large beside a row's values; `NONE` where there is none.
+    """The place (B,) of a constraint with a violation that is large beside a row's values; `NO_PLACE` without one.
 
     The size of a row is its largest value at rest, and of inequalities along the trajectory, too, where equalities are
     met; the two sides of a bound have one size. Rows that have the value at rest still, such as those of a given start,
@@ -34,9 +34,9 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Args:
         X, U: trajectories, (B, N+1, n) and (B, N, m).
     """
-    place = torch.full((problem.B,), NONE, device=problem.x0.device)
+    place = torch.full((problem.B,), NO_PLACE, device=problem.x0.device)
     problem = within_horizons(problem.held_at(X[:, 0]))
-    moved = tuple(z * (1.0 + NOISE * scattered(z[:1])) for z in (X, U))
+    moved = tuple(z * (1.0 + STATE_NOISE * scattered(z[:1])) for z in (X, U))
     for number, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             continue
@@ -47,7 +47,7 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
         rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
         size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))
-        admitted = torch.where(size > least, torch.maximum(SHARE * size, least), ROUGH)
+        admitted = torch.where(size > least, torch.maximum(SHARE * size, least), LARGE_VIOLATION)
         large = (constraint.violation(X, U) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place

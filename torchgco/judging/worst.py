@@ -12,7 +12,7 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
 
-NONE = -1  # the place of what isn't there
+NO_PLACE = -1  # the place of what isn't there
 
 
 def worst_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = None) -> dict[str, list[Any]]:
@@ -24,9 +24,9 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
     user = problem
     problem, X, U = at_times(problem, X, U, times)
     lost = ~torch.isfinite(X).all(-1)
-    first = torch.where(lost.any(-1), lost.long().argmax(-1), NONE)
+    first = torch.where(lost.any(-1), lost.long().argmax(-1), NO_PLACE)
     largest = X.new_zeros(problem.B)
-    place = torch.full((3, problem.B), NONE, device=X.device)
+    place = torch.full((3, problem.B), NO_PLACE, device=X.device)
     for number, constraint in enumerate(within_horizons(problem).constraints):
         rows = constraint.violation(X, U)
         if rows.shape[0] == 0 or rows[0].numel() == 0:
@@ -38,7 +38,7 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
         place, largest = torch.where(more, found, place), torch.where(more, most, largest)
     where, knot, row = place.tolist()
     kinds = [kind_of(part) for part in user.constraints]
-    names = ["" if i == NONE else kinds[i] if i < len(kinds) else "time" for i in where]
+    names = ["" if i == NO_PLACE else kinds[i] if i < len(kinds) else "time" for i in where]
     return {
         "constraint": where, "name": names, "knot": knot, "row": row, "violation": largest.tolist(),
         "lost_at": first.tolist(),

@@ -22,7 +22,7 @@ from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Facts
 
-KEPT = 64  # engines, the most recent ones
+ENGINES_KEPT = 64  # engines, the most recent ones
 CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
 
 
@@ -112,7 +112,7 @@ def _engine(problem: Problem) -> Engine:
     if after is not None and after.key == before.key and after.covers(engine.captured.traces):
         engine.forget_values()
         _engines[key] = engine, after.facts
-        trim(_engines, KEPT, CAPTURED, lambda kept: kept[0].captured.nbytes)
+        trim(_engines, ENGINES_KEPT, CAPTURED, lambda kept: kept[0].captured.nbytes)
     return engine.with_shared(engine.shared.copy())  # a compiled problem writes into it
 
 

@@ -29,8 +29,8 @@ from torchgco.native.structures import End, Options
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
-NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
-AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
+CONTROL_NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
+AMPLIFIED = 1e6  # times CONTROL_NUDGE: where the states change by less, different last bits don't matter
 ITERATED = "X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"
 
 
@@ -122,9 +122,9 @@ class NativeKernels:
 
     def differing(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         start = problem.held_at(X[:, 0])
-        other = self.engine.open_loop(start, U + NUDGE * U.abs().amax(dim=1, keepdim=True))
-        scale = X.abs().flatten(1).amax(-1).clamp(min=NUDGE)
-        return (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * NUDGE * scale)).nonzero().flatten()
+        other = self.engine.open_loop(start, U + CONTROL_NUDGE * U.abs().amax(dim=1, keepdim=True))
+        scale = X.abs().flatten(1).amax(-1).clamp(min=CONTROL_NUDGE)
+        return (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * CONTROL_NUDGE * scale)).nonzero().flatten()
 
 
 def native_options(how: Descent) -> Options:
@@ -135,7 +135,7 @@ def native_options(how: Descent) -> Options:
         ladder=ladder, rungs=len(ladder), back=-1 if search.back is None else search.back, accept_last=printed,
         ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
         max_iterations=how.max_iterations, tolerance=0.0 if printed else how.tolerance,
-        absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDING, lost=lifted.LOST,
+        absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,
         regularisation_first=descent.REGULARISATION_FIRST, regularisation_growth=descent.REGULARISATION_GROWTH,
         regularisation_max=descent.REGULARISATION_MAX, damping=0.0 if printed else descent.DAMPING,
         damping_growth=descent.DAMPING_GROWTH, damping_decay=descent.DAMPING_DECAY, damp_below=how.damp_below,

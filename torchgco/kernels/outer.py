@@ -15,7 +15,7 @@ from torchgco.native.engine import Engine
 from torchgco.native.structures import End, Options, Outer
 from torchgco.problem.problem import Problem
 
-FLAGS, NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
+OUTER_FLAGS, OUTER_NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
 
 
 class NativeOuter:
@@ -44,8 +44,8 @@ class NativeOuter:
         self.engine, self.state, self.b = engine, s, problem.B
         _make_contiguous(s)
         b = problem.B
-        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in FLAGS}
-        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in NUMBERS}
+        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in OUTER_FLAGS}
+        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in OUTER_NUMBERS}
         self.outcome = torch.zeros(b, dtype=torch.int64)
         m, best = s.multipliers, s.best
         packed = engine.terms(

@@ -21,8 +21,8 @@ STIFF = 1e8
 # Times that curvature: the least share of what the cost lets a row give way. Where units differ, sigma is less, and the
 # row 1e13 times as stiff as the cost: a thousandth of what rounding would hide.
 SLIGHT = 1e-5
-ROUNDS = 4
-PIVOT = 1e-14  # least pivot of the factors, as a share of its entry: where one is less, the minimum isn't strict
+CLOSING_ROUNDS = 4
+LEAST_PIVOT = 1e-14  # least pivot of the factors, as a share of its entry: where one is less, the minimum isn't strict
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchgco.dynamics.rollout import open_loop
 from torchgco.problem.problem import Problem
 
-SIZES = 0.1, 1.0, 10.0, 1e3  # of changes of the controls, beside their own size and one
+CHANGE_SIZES = 0.1, 1.0, 10.0, 1e3  # of changes of the controls, beside their own size and one
 
 
 def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
@@ -29,7 +29,7 @@ def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
         later = later or bool(bad[:, knots > 0].any())
     wave = torch.arange(1.0, U[0].numel() + 1, dtype=U.dtype, device=U.device).mul(1.618).cos().view_as(U[0])
     for way in (wave, torch.ones_like(wave), -torch.ones_like(wave)):
-        for size in SIZES:
+        for size in CHANGE_SIZES:
             other = U + size * (1.0 + U.abs()) * way
             # Rows of the first knot ask for no rollout.
             there = open_loop(problem.dynamics, problem.x0, other) if later else X

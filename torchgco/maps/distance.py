@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.notices import AFTER
 from torchgco.base.options import check_value
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, distances
 from torchgco.maps.points import PointCloud
 
-FINE = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
-NODES, OF_CLOUDS = 2**30, 2**26  # of one field, and of one over clouds, whose distances are looked up one by one
-FAR = 1e6  # m: the distance where nothing is occupied
-MARGIN = 2  # nodes around the points of a cloud
-AT_ONCE = 2**17  # nodes whose distances are looked up together: Ctrl-C and SIGTERM wait for one such piece
-AFTER = 2.0  # s before a bar shows, in a terminal
+FINE_NODES = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
+FIELD_NODES, OF_CLOUDS = 2**30, 2**26  # of one field, and of one over clouds, whose distances are looked up one by one
+ALL_FREE = 1e6  # m: the distance where nothing is occupied
+CLOUD_MARGIN = 2  # nodes around the points of a cloud
+NODES_AT_ONCE = 2**17  # nodes whose distances are looked up together: Ctrl-C and SIGTERM wait for one such piece
 
 Unknown = Literal["occupied", "free"]
 
@@ -64,7 +64,7 @@ class DistanceField:
             source: a grid, or a cloud.
             unknown: what the unknown cells of a grid count as.
             refine: steps of the lattice per cell of a grid, along each axis. None: 2 where that gives at most
-                `FINE` nodes, 1 otherwise. With 1, walls of a single cell have no inside: a trajectory that crosses one
+                `FINE_NODES` nodes, else 1. With 1, walls of a single cell have no inside: a trajectory that crosses one
                 isn't pushed out of it.
             resolution: spacing of the lattice over a cloud, m. None: its radius.
 
@@ -170,7 +170,7 @@ class DistanceField:
 def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> DistanceField:
     if refine is None:
         fine = np.prod([2.0 * size + 1 for size in grid.shape])
-        refine = 2 if fine <= FINE else 1
+        refine = 2 if fine <= FINE_NODES else 1
     else:
         check_value(refine, int, "field.refine")
     if not 1 <= refine <= 8:
@@ -194,7 +194,7 @@ def _signed_distances(cells: np.ndarray, refine: int, spacing: float) -> np.ndar
     from edt import edt
 
     if not cells.any():
-        return np.full([refine * size + 1 for size in cells.shape], FAR, np.float32)
+        return np.full([refine * size + 1 for size in cells.shape], ALL_FREE, np.float32)
     for axis in range(cells.ndim):
         cells = cells.repeat(refine, axis)
     occupied, free = _touched(cells, False), _touched(~cells, True)
@@ -222,13 +222,13 @@ def _of_cloud(cloud: PointCloud, unknown: Unknown, resolution: float | None) -> 
         raise InputError("field.resolution", "a length above 0 m, as the cloud's radius is 0", spacing)
     clouds, d = cloud.clouds(), cloud.d
     ends = [(c.min(0), c.max(0)) if len(c) else (np.zeros(d), np.zeros(d)) for c in clouds]
-    room = cloud.radius + MARGIN * spacing
+    room = cloud.radius + CLOUD_MARGIN * spacing
     origin = np.array([low - room for low, _ in ends])
     with np.errstate(over="ignore"):
         counts = np.max([np.ceil((high - low + 2 * room) / spacing) for low, high in ends], axis=0) + 1
     _check_count(counts.tolist(), OF_CLOUDS, "a larger radius, or `resolution`")
     shape = counts.astype(int)
-    values = np.full((len(clouds), *shape), FAR, np.float32)
+    values = np.full((len(clouds), *shape), ALL_FREE, np.float32)
     for i, points in enumerate(clouds):
         if len(points):
             _write_distances(points, values[i], origin[i], spacing)
@@ -245,14 +245,14 @@ def _write_distances(points: np.ndarray, values: np.ndarray, origin: np.ndarray,
     tree = cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
     first, *others = (o + spacing * np.arange(size) for o, size in zip(origin, values.shape, strict=True))
     plane = np.stack(np.meshgrid(*others, indexing="ij"), axis=-1).reshape(-1, len(others))
-    slabs = [(i, part) for i in range(len(first)) for part in range(0, len(plane), AT_ONCE)]
+    slabs = [(i, part) for i in range(len(first)) for part in range(0, len(plane), NODES_AT_ONCE)]
     for i, part in tqdm(slabs, "distances from points", delay=AFTER, leave=False, dynamic_ncols=True, disable=None):
-        some = plane[part : part + AT_ONCE]
+        some = plane[part : part + NODES_AT_ONCE]
         places = np.column_stack([np.full(len(some), first[i]), some])
-        values[i].reshape(-1)[part : part + AT_ONCE] = tree.query(places, workers=torch.get_num_threads())[0]
+        values[i].reshape(-1)[part : part + NODES_AT_ONCE] = tree.query(places, workers=torch.get_num_threads())[0]
 
 
-def _check_count(counts: list[float], most: int = NODES, way: str = "cells that are larger, or `refine`") -> None:
+def _check_count(counts: list[float], most: int = FIELD_NODES, way: str = "cells that are larger, or `refine`") -> None:
     if np.prod(np.asarray(counts, float)) > most:
         wanted = f"at most {most:,} nodes: {way}"
         raise InputError("field", wanted, " x ".join(f"{count:.0f}" for count in counts))

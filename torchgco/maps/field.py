@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.maps.distance import FAR, DistanceField
+from torchgco.maps.distance import ALL_FREE, DistanceField
 from torchgco.maps.exact import distance_within
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
@@ -22,8 +22,8 @@ from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import dimension, vehicle_radii
 
 Interpolation = Literal["smooth", "linear"]
-STEPS = 0.5  # spacings of the lattice between points at which a segment's distance is looked up
-AT_ONCE = 2**16  # points looked up together
+SEGMENT_STEPS = 0.5  # spacings of the lattice between points at which a segment's distance is looked up
+POINTS_AT_ONCE = 2**16  # points looked up together
 PIECE = 2**10  # of these along one segment
 
 
@@ -78,7 +78,7 @@ class Field(Constraint):
         if field.batch is not None:
             which = torch.arange(dims.B, device=like.device)
         origins = torch.as_tensor(field.origin, dtype=like.dtype, device=like.device)[which]
-        empty = torch.as_tensor(field.values.reshape(len(field.values), -1).min(-1) >= FAR, device=like.device)
+        empty = torch.as_tensor(field.values.reshape(len(field.values), -1).min(-1) >= ALL_FREE, device=like.device)
         absent = empty[which].unsqueeze(-1)
         assert dims.position is not None
         smooth = self.interpolation == "smooth"
@@ -168,13 +168,13 @@ class BoundField(Obstacles):
         # The distance changes no faster than the point moves: of most segments this shows that others are nearer.
         bound = 0.5 * (at_ends[0] + at_ends[1] - along)
         near = ~self.absent & (bound < gap.amin(-1, keepdim=True) + self.field.spacing) if gap.numel() > 0 else gap > 0
-        steps = (along / (STEPS * self.field.spacing)).ceil()
+        steps = (along / (SEGMENT_STEPS * self.field.spacing)).ceil()
         looked = near & (steps > 1) & torch.isfinite(steps)
         for some in (looked & (steps <= PIECE), looked & (steps > PIECE)):
             i, e = some.nonzero(as_tuple=True)
             if len(i) == 0:
                 continue
-            most = max(1, AT_ONCE // (int(steps[i, e].amax().clamp(max=PIECE)) + 1))
+            most = max(1, POINTS_AT_ONCE // (int(steps[i, e].amax().clamp(max=PIECE)) + 1))
             for rows, segments in zip(i.split(most), e.split(most), strict=True):
                 ends = a[rows, segments], b[rows, segments]
                 gap[rows, segments] = self._between(rows, *ends, steps[rows, segments], gap[rows, segments])

@@ -13,8 +13,8 @@ from torchgco.base.errors import InputError, shown
 
 OCCUPIED_FROM = 0.5  # the probability from which a cell counts as occupied
 LETHAL, NO_COST = 254, 255  # costs in ROS's navigation: an obstacle in the cell, and unknown
-LEVEL = 1e-6  # of a quaternion's x, y and z: less is no turn
-CELLS = 2**30  # of one grid: more is a mistake in the resolution
+NO_TURN = 1e-6  # of a quaternion's x, y and z: less is no turn
+LARGEST_GRID = 2**30  # of one grid: more is a mistake in the resolution
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +57,8 @@ class OccupancyGrid:
         axes = "(X, Y)" if d == 2 else "(X, Y, Z)"
         if cells.ndim not in (d, d + 1):
             raise InputError("grid.occupied", f"shape {axes}, or (B, ...), as the origin is {d}-D", cells.shape)
-        if min(cells.shape[-d:]) < 1 or np.prod(cells.shape[-d:], dtype=float) > CELLS:
-            raise InputError("grid.occupied", f"1 to {CELLS:,} cells", cells.shape)
+        if min(cells.shape[-d:]) < 1 or np.prod(cells.shape[-d:], dtype=float) > LARGEST_GRID:
+            raise InputError("grid.occupied", f"1 to {LARGEST_GRID:,} cells", cells.shape)
         if origin.ndim == 2 and (cells.ndim == d or len(origin) != len(cells)):
             expected = "(d,), or (B, d) where there is one grid per problem"
             raise InputError("grid.origin", expected, f"shape {origin.shape} for cells {cells.shape}")
@@ -123,7 +123,7 @@ class OccupancyGrid:
             shape = int(info.height), int(info.width)
         except (AttributeError, TypeError, ValueError):
             raise InputError("grid.message", "a nav_msgs/OccupancyGrid, with info and data", shown(message)) from None
-        if max(abs(turn.x), abs(turn.y), abs(turn.z)) > LEVEL:
+        if max(abs(turn.x), abs(turn.y), abs(turn.z)) > NO_TURN:
             expected = "an origin that isn't turned; `read` turns grids of bags"
             raise InputError("grid.message", expected, f"a quaternion with {turn.x:g}, {turn.y:g}, {turn.z:g}")
         data = data.astype(np.int8) if data.dtype.kind in "iu" else data

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-AT_ONCE = 2**15  # points that are looked up together, about: bounds the memory
+LOOKUPS_AT_ONCE = 2**15  # points that are looked up together, about: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def squares_and_slopes(lattice: Lattice, p: Tensor, cores: Tensor) -> tuple[Tens
 
 def _parts(p: Tensor) -> tuple[Tensor, ...]:
     """Points (B, K, d), some of each problem at a time."""
-    return p.split(max(1, AT_ONCE // max(1, len(p))), dim=1)
+    return p.split(max(1, LOOKUPS_AT_ONCE // max(1, len(p))), dim=1)
 
 
 def distances(lattice: Lattice, p: Tensor, cores: Tensor) -> Tensor:

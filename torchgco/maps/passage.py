@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from torchgco.maps.distance import DistanceField
 
-NODES = 2**26  # of a lattice, at most, whose regions are numbered: 256 MB of numbers
-ROUNDING = 1e-9  # nodes
+PASSAGE_NODES = 2**26  # of a lattice, at most, whose regions are numbered: 256 MB of numbers
+NODE_ROUNDING = 1e-9  # nodes
 
 
 def widest_passage(
@@ -27,7 +27,7 @@ def widest_passage(
         None where a vehicle of `radius` may get there, or the lattice is too large to tell.
     """
     values = field.values[which]
-    if values.size > NODES:
+    if values.size > PASSAGE_NODES:
         return None
     padded = np.pad(values, 1, constant_values=np.inf)
     origin = field.origin[which] - field.spacing
@@ -50,7 +50,7 @@ def widest_passage(
 
 def _near(shape: tuple[int, ...], at: np.ndarray, reach: float) -> tuple[NDArray[np.int64], ...]:
     """Indices of the nodes within `reach` of a place, in nodes; of a place outside, the nearest node."""
-    reach += ROUNDING
+    reach += NODE_ROUNDING
     nearest = np.clip(np.rint(at), 0, np.array(shape) - 1).astype(np.int64)
     axes = [np.arange(max(0, int(np.ceil(x - reach))), min(n - 1, int(np.floor(x + reach))) + 1)
             for x, n in zip(at, shape, strict=True)]  # fmt: skip

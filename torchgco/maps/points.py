@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
-from torchgco.maps.grid import CELLS, OccupancyGrid, coordinates, number
+from torchgco.maps.grid import LARGEST_GRID, OccupancyGrid, coordinates, number
 
-POINTS = 2**28  # of one cloud
+CLOUD_POINTS = 2**28  # of one cloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class PointCloud:
         if points.ndim not in (2, 3) or points.shape[-1] not in (2, 3):
             got = points.shape if points.size else shown(self.points)
             raise InputError("cloud.points", "shape (P, 2), (P, 3) or (B, P, d)", got)
-        if points.shape[-2] > POINTS:
-            raise InputError("cloud.points", f"at most {POINTS:,} points", points.shape)
+        if points.shape[-2] > CLOUD_POINTS:
+            raise InputError("cloud.points", f"at most {CLOUD_POINTS:,} points", points.shape)
         radius = number(self.radius, "cloud.radius")
         if not 0.0 <= radius < np.inf:
             raise InputError("cloud.radius", "a finite length of at least 0 m", radius)
@@ -83,8 +83,8 @@ class PointCloud:
         points = points if len(points) else np.full((1, self.d), np.nan)
         low = np.nan_to_num(points.min(0)) - self.radius - side
         count = np.ceil((np.nan_to_num(points.max(0)) + self.radius + side - low) / side)
-        if np.prod(count) > CELLS:
-            raise InputError("resolution", f"cells of which the cloud takes at most {CELLS:,}", resolution)
+        if np.prod(count) > LARGEST_GRID:
+            raise InputError("resolution", f"cells of which the cloud takes at most {LARGEST_GRID:,}", resolution)
         occupied = np.zeros(count.astype(int), bool)
         points = points[np.isfinite(points[:, 0])]
         own, reach = np.floor((points - low) / side).astype(int), int(np.ceil(self.radius / side))

@@ -14,8 +14,8 @@ from torchgco.maps.distance import DistanceField
 
 Array = NDArray[np.float64]
 
-STEP = 0.5  # radii of the vehicle between nodes, at most: a gap of a radius more than its width has nodes inside
-NODES = 2**21  # of a grid, at most, about: a search of as many takes seconds
+WAY_STEP = 0.5  # radii of the vehicle between nodes, at most: a gap of a radius more than its width has nodes inside
+SPOTS = 2**21  # of a grid, at most, about: a search of as many takes seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +44,13 @@ class Ways:
 
     @classmethod
     def through(cls, field: DistanceField, which: int, radius: float) -> Ways:
-        """Ways through a map, over every so many of its nodes that steps are half a radius, or as `NODES` allows.
+        """Ways through a map, over every so many of its nodes that steps are half a radius, or as `SPOTS` allows.
 
         Args:
             which: the number of the map.
         """
         values = field.values[which]
-        stride = max(1, int(STEP * radius / field.spacing), int(np.ceil((values.size / NODES) ** (1.0 / field.d))))
+        stride = max(1, int(WAY_STEP * radius / field.spacing), int(np.ceil((values.size / SPOTS) ** (1.0 / field.d))))
         some = values[(slice(None, None, stride),) * field.d].astype(np.float64)
         return cls(some, field.origin[which], stride * field.spacing, radius)
 

@@ -12,9 +12,35 @@ from torch import Tensor
 
 from torchgco.missions.planner import Plan
 from torchgco.missions.tracker import Tracking
-from torchgco.missions.unknown.safety import SeenLog
 
-PARTS = ("map_seconds", "field_seconds", "search_seconds")
+TIMED_PARTS = ("map_seconds", "field_seconds", "search_seconds")
+
+
+@dataclass
+class SeenLog:
+    """What a vehicle knew of its grid, period by period.
+
+    Args:
+        corner: (3,), m, where cell (0, 0, 0) begins.
+        shape: number of cells (3,).
+        resolution: side of a cell, m.
+        changes: for each period the flat indices of the cells whose state changed in it, int32, and their new states,
+            uint8; cells are unknown at first.
+        safe: for each period the positions (N+1, 3), m, of the plan that comes to rest.
+    """
+
+    corner: np.ndarray
+    shape: tuple[int, int, int]
+    resolution: float
+    changes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    safe: list[np.ndarray] = field(default_factory=list)
+
+    def state(self, step: int) -> np.ndarray:
+        """The states (X, Y, Z) of all cells in a period."""
+        state = np.zeros(self.shape, np.uint8)
+        for cells, new in self.changes[: step + 1]:
+            state.reshape(-1)[cells] = new
+        return state
 
 
 @dataclass(frozen=True)
@@ -91,6 +117,6 @@ class MissionLog:
     def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
         """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""
         names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
-        names = (*names, "planner_seconds", "tracker_seconds", *(PARTS if self.seen else ()))
+        names = (*names, "planner_seconds", "tracker_seconds", *(TIMED_PARTS if self.seen else ()))
         names = (*names, *(["plan"] if plans else []))
         return {name: getattr(self, name).numpy() for name in names}

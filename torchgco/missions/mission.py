@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
-from torchgco.base.shapes import check_tensor, computing_on
+from torchgco.base.shapes import CPU, check_tensor, computing_on
 from torchgco.base.tree import take
 from torchgco.constraints.gates import has_gates
 from torchgco.dynamics.base import Dynamics
@@ -30,18 +30,13 @@ from torchgco.missions.pilot import KnownMap, Pilot
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.plant import Plant, RotorPlant, flown, hovering
-from torchgco.missions.sensing.sensors import Depth, Lidar
 from torchgco.missions.tracker import Reference, Tracker, Tracking
-from torchgco.missions.unknown.exploration import Exploration
-from torchgco.missions.unknown.explorer import Explorer, SensorName, Unknown
-from torchgco.native.compiler import find_compiler
 from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
-CPU = torch.device("cpu")
 Begin = Callable[[Problem, Tensor, int, Tensor], Pilot]
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
 
@@ -60,11 +55,6 @@ class Mission:
         goal_radius: m, within which the goal counts as reached; None: the problems' own.
         latency: control periods between a measurement and the first use of the plan made from it, 0 or 1. With 1, a
             plan starts where the previous plan leads within the period, and without `first_step`.
-        sensor: what the vehicle knows of the obstacles: "full", all of them from the start, or what a "lidar" or a
-            "depth" camera sees on the way.
-        unknown: what plans make of space that hasn't been seen, with a lidar or a depth camera: "occupied" stay out of
-            it and so can always stop in time, "free" plan as if nothing were there.
-        lidar, depth, explorer: options of the sensors, and of flights with them.
 
     Raises:
         InputError: a field out of its range, or periods that don't fit each other.
@@ -77,18 +67,16 @@ class Mission:
     duration: Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")] = 15.0
     goal_radius: Meters | None = 0.5
     latency: Annotated[int, Within(0, 1, "control periods")] = 0
-    sensor: SensorName = "full"
-    unknown: Unknown = "occupied"
-    lidar: Lidar = field(default_factory=Lidar)
-    depth: Depth = field(default_factory=Depth)
-    explorer: Explorer = field(default_factory=Explorer)
 
     def __post_init__(self) -> None:
         check_options(self, "mission")
-        if self.sensor != "full" and self.latency:
-            raise InputError("mission.latency", "0 with a sensor", self.latency)
         if self.plant.dt != self.tracker.dt:
             raise InputError("tracker.dt", f"the plant's {self.plant.dt} s", self.tracker.dt)
+
+    @property
+    def sees_all(self) -> bool:
+        """Whether vehicles know all obstacles from the start, and don't learn of them by a sensor."""
+        return True
 
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
@@ -99,9 +87,6 @@ class Mission:
             raise InputError("plant.airframe", f"that of the planning model, {planned}", given)
         if self.substeps(float(dynamics.dt)) is None:
             raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
-        if self.sensor != "full" and find_compiler() is None:
-            wanted = "full on a machine without a C compiler: sensors and their maps are computed in C (TORCHGCO_CC)"
-            raise InputError("mission.sensor", wanted, self.sensor)
 
     def substeps(self, period: float) -> int | None:
         """Time steps of the plant in a control period, s; None where they don't fit."""
@@ -111,13 +96,6 @@ class Mission:
     def periods(self, period: float) -> int:
         """Control periods, s, of the mission."""
         return math.ceil(self.duration / period - 1e-9)
-
-    def exploration(self, problem: Problem, seed: int, ids: Tensor) -> Exploration | None:
-        """The planner of missions with a sensor; None where all obstacles are known."""
-        if self.sensor == "full":
-            return None
-        sensor = self.lidar if self.sensor == "lidar" else self.depth
-        return Exploration(self.explorer, self.planner, sensor, self.unknown, problem, seed, ids)
 
     def fly(
         self, problem: Problem, seed: int = 0, ids: Tensor | None = None, report: Report | None = None
@@ -141,8 +119,8 @@ class Mission:
         Raises:
             InputError: as `fly`, and for missions with a sensor, which plan on their maps.
         """
-        if self.sensor != "full":
-            raise InputError("mission.sensor", "full for first plans", self.sensor)
+        if not self.sees_all:
+            raise InputError("mission.sensor", "full for first plans", "a sensor")
         problem, seed, ids = check_flown(self, problem, seed, ids)
         with computing_on(CPU):
             x = hovering(airframe_of(problem.dynamics), problem.x0[:, :3])
@@ -151,8 +129,8 @@ class Mission:
             return self._planner.first(problem, measured(x, noise[:, 0]), seed, ids)
 
     def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
-        """Who plans for vehicles at plants x (B, 17): the planner, or with a sensor the explorer."""
-        return self.exploration(problem, seed, ids) or KnownMap(self._planner, problem, x, seed, ids)
+        """Who plans for vehicles at plants x (B, 17): the planner, which knows all obstacles."""
+        return KnownMap(self._planner, problem, x, seed, ids)
 
     @property
     def _planner(self) -> Planner:

@@ -7,8 +7,8 @@ from typing import Protocol
 
 from torch import Tensor
 
+from torchgco.missions.log import SeenLog
 from torchgco.missions.planner import Plan, Planner
-from torchgco.missions.unknown.safety import SeenLog
 from torchgco.problem.problem import Problem
 
 SEED_STEP = 7_919  # between the seeds of two control steps

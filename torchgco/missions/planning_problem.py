@@ -18,11 +18,11 @@ from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.problem.problem import Problem
 
-PARTS = 4  # of the horizon, with a margin each, where margins grow
+MARGIN_PARTS = 4  # of the horizon, with a margin each, where margins grow
 BLIND = 3  # knots whose positions the controls of a plan can't change, or hardly
 EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
-TINY = 1e-9  # m, against rounding
-KEPT = 0.25  # share of the clearance from contact that an entered margin leaves
+MARGIN_ROUNDING = 1e-9  # m, against rounding
+MARGIN_LEFT = 0.25  # share of the clearance from contact that an entered margin leaves
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class Margin:
         room = torch.full_like(depth, torch.inf)
         if obstacles.absent.shape[1] > 0:
             distance = obstacles.signed_distance(start.unsqueeze(1), start.new_zeros(1))[:, 0]
-            room = ((distance + (1.0 - CONTACT_FACTOR) * obstacles.margins) / CONTACT_FACTOR).amin(-1) - TINY
-        for knots in torch.arange(early + 1, N + 1).chunk(PARTS if self.growth > 0 else 1):
+            room = ((distance + (1.0 - CONTACT_FACTOR) * obstacles.margins) / CONTACT_FACTOR).amin(-1) - MARGIN_ROUNDING
+        for knots in torch.arange(early + 1, N + 1).chunk(MARGIN_PARTS if self.growth > 0 else 1):
             first, last = int(knots[0]), int(knots[-1]) + 1
             by = size + self.growth * 0.5 * (first + last - 1) * dt
             parts.append(_at(obstacles.grown(torch.minimum(by, room)), slice(first, last)))
@@ -127,7 +127,7 @@ class Margin:
             if isinstance(part, Obstacles) and part.absent.shape[1] > 0:
                 size = self.of(part).unsqueeze(-1)
                 distance = part.later(t).signed_distance(p, times).amin(1) - size  # (B, M)
-                most = size + (1.0 - KEPT) * (1.0 - CONTACT_FACTOR) * part.margins
+                most = size + (1.0 - MARGIN_LEFT) * (1.0 - CONTACT_FACTOR) * part.margins
                 depth = torch.maximum(depth, torch.minimum(-distance, most).clamp(min=0.0).amax(-1))
         return depth
 

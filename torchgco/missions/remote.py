@@ -35,7 +35,7 @@ from torchgco.base.options import Seconds, Within, check_options
 from torchgco.base.tree import Rows
 
 HEAD = struct.Struct("<4sHHQd")
-LETTERS, VERSION = b"TGCO", 1
+LETTERS, PROTOCOL = b"TGCO", 1
 AT_ONCE = 32  # vehicles in a datagram: 6.4 kB, which every system sends in one piece
 SENT, ANSWERED = 25, 17  # numbers of a row
 LARGEST = 65_536  # bytes of a datagram
@@ -84,7 +84,7 @@ class RemotePlant:
             line = _line(self.host, self.port)
             for first in range(0, len(rows), AT_ONCE):
                 part, number = rows[first : first + AT_ONCE], next(_numbers)
-                line.send(HEAD.pack(LETTERS, VERSION, len(part), number, self.dt) + part.tobytes())
+                line.send(HEAD.pack(LETTERS, PROTOCOL, len(part), number, self.dt) + part.tobytes())
                 waiting[number] = slice(first, first + len(part))
             while waiting:
                 line.settimeout(max(end - time.monotonic(), 1e-6))
@@ -102,8 +102,8 @@ class RemotePlant:
         if len(data) < HEAD.size or data[:4] != LETTERS or (len(data) - HEAD.size) % (8 * ANSWERED):
             raise InputError("plant", "answers with a head of 24 bytes and 17 float64 a vehicle", f"{len(data)} bytes")
         _, version, _, number, _ = HEAD.unpack_from(data)
-        if version != VERSION:
-            raise InputError("plant", f"answers of version {VERSION}", version)
+        if version != PROTOCOL:
+            raise InputError("plant", f"answers of version {PROTOCOL}", version)
         return number, np.frombuffer(data, "<f8", offset=HEAD.size).reshape(-1, ANSWERED)
 
     def _fitting(self, states: np.ndarray, wanted: int) -> np.ndarray:

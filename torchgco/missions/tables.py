@@ -13,7 +13,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Meters, check_value
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
-from torchgco.missions.log import PARTS, MissionLog
+from torchgco.missions.log import TIMED_PARTS, MissionLog
 from torchgco.missions.outcome import Ending, judge_flight
 from torchgco.problem.problem import Problem
 
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Arrays = Mapping[str, np.ndarray]
-SCALARS = (
+LOG_SCALARS = (
     "cost", "violation", "shifted", "guided", "iterations", "planner_seconds", "tracker_seconds", "tracking_violation",
 )  # fmt: skip
-SENSED = (*PARTS, "safe")  # further ones, of missions with a sensor: safe is 1 where the period held a safe plan
-STATES, ROTORS = 17, 4
+SENSED = (*TIMED_PARTS, "safe")  # further ones, of missions with a sensor: safe is 1 where the period held a safe plan
+STATES, ROTOR_COUNT = 17, 4
 
 
 def packed(arrays: Arrays) -> np.ndarray:
     """The arrays of B missions as one (B, K, W), a row per control step; planned positions come last, if they do."""
     B, K = arrays["cost"].shape
     more = SENSED if "safe" in arrays else ()
-    names = ("x", "commands", *SCALARS, *more, *(["plan"] if "plan" in arrays else []))
+    names = ("x", "commands", *LOG_SCALARS, *more, *(["plan"] if "plan" in arrays else []))
     return np.concatenate([arrays[name].reshape(B, K, -1) for name in names], axis=-1)
 
 
 def unpacked(rows: np.ndarray, substeps: int, sensed: bool = False) -> dict[str, np.ndarray]:
     """The arrays that `packed` made of logs with so many time steps per control step, with a sensor or without."""
     B, K, J = *rows.shape[:2], substeps
-    names = (*SCALARS, *(SENSED if sensed else ()))
-    widths = [(J + 1) * STATES, J * ROTORS, *[1] * len(names)]
+    names = (*LOG_SCALARS, *(SENSED if sensed else ()))
+    widths = [(J + 1) * STATES, J * ROTOR_COUNT, *[1] * len(names)]
     x, commands, *scalars, plan = np.split(rows, np.cumsum(widths), axis=-1)
     arrays = {name: part[..., 0] for name, part in zip(names, scalars, strict=True)}
-    arrays |= {"x": x.reshape(B, K, J + 1, STATES), "commands": commands.reshape(B, K, J, ROTORS)}
+    arrays |= {"x": x.reshape(B, K, J + 1, STATES), "commands": commands.reshape(B, K, J, ROTOR_COUNT)}
     return arrays | ({"plan": plan.reshape(B, K, -1, 3)} if plan.shape[-1] else {})
 
 
@@ -87,7 +87,7 @@ def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances:
 def _commands(u: np.ndarray) -> dict[str, np.ndarray]:
     """Columns of commands (K, J, 4), rpm, NaN after a mission's end: the first of each control step and their range."""
     parts = {"": u[:, 0], "_low": np.fmin.reduce(u, axis=1), "_high": np.fmax.reduce(u, axis=1)}
-    return {f"u{i + 1}{end}": values[:, i] for end, values in parts.items() for i in range(ROTORS)}
+    return {f"u{i + 1}{end}": values[:, i] for end, values in parts.items() for i in range(ROTOR_COUNT)}
 
 
 def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float, airframe: Airframe) -> pd.DataFrame:
@@ -101,13 +101,13 @@ def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float, airframe:
     low, high = airframe.rotor_speeds
     frames = []
     for b, number in enumerate(ids):
-        u = arrays["commands"][b, : _steps(arrays, b)].reshape(-1, ROTORS)
+        u = arrays["commands"][b, : _steps(arrays, b)].reshape(-1, ROTOR_COUNT)
         u = u[: int((~np.isnan(u).all(-1)).sum())]  # of a control step in which the mission ends, a part is flown
         t, x = (part[: len(u) + 1] for part in samples(arrays, b, period))
-        u = np.concatenate((u, u[-1:] if len(u) else np.full((1, ROTORS), np.nan)))
+        u = np.concatenate((u, u[-1:] if len(u) else np.full((1, ROTOR_COUNT), np.nan)))
         columns = {"mission": np.full(len(t), number), "t": t} | {f"x{i}": x[:, i] for i in range(STATES)}
         parts = {"f": x[:, 13:], "u": u, "r": u.clip(low, high)}
-        columns |= {f"{name}{i + 1}": part[:, i] for name, part in parts.items() for i in range(ROTORS)}
+        columns |= {f"{name}{i + 1}": part[:, i] for name, part in parts.items() for i in range(ROTOR_COUNT)}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 
@@ -131,7 +131,7 @@ def mission_row(arrays: Arrays, b: int, period: float, end: Ending, airframe: Ai
     """The columns of mission b that its log decides, but for its clearance at the starts of control steps."""
     t, x = samples(arrays, b, period)
     until = t <= end.flight_time + 1e-9
-    steps = {name: arrays[name][b, : _steps(arrays, b)] for name in (*SCALARS, *SENSED) if name in arrays}
+    steps = {name: arrays[name][b, : _steps(arrays, b)] for name in (*LOG_SCALARS, *SENSED) if name in arrays}
     return {
         "outcome": end.outcome.name,
         "flight_time": end.flight_time,

@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -25,6 +24,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 from torchgco.base.notices import notice
+from torchgco.base.signals import handled
 from torchgco.native import store
 
 # NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Products and sums are
@@ -329,19 +329,11 @@ def _ending(started: Sequence[subprocess.Popen[str]]) -> Iterator[None]:
 @contextmanager
 def _held() -> Iterator[None]:
     """Ctrl-C and SIGTERM wait for the end of this block."""
-    if threading.current_thread() is not threading.main_thread():  # Python handles signals in the main thread alone
-        yield
-        return
     came: list[int] = []
-    usual = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    usual = {number: handler for number, handler in usual.items() if handler not in (signal.SIG_IGN, None)}
-    for number in usual:
-        signal.signal(number, lambda number, frame: came.append(number))
     try:
-        yield
+        with handled(lambda number, frame: came.append(number), lambda own: own not in (signal.SIG_IGN, None)):
+            yield
     finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
         for number in came:
             signal.raise_signal(number)
 
@@ -367,14 +359,8 @@ def _ending_by_sigterm(started: Sequence[subprocess.Popen[str]]) -> Iterator[Non
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+    with handled(end, lambda own: own == signal.SIG_DFL, [signal.SIGTERM]):
         yield
-        return
-    signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _ended(returncode: int) -> str:

@@ -16,11 +16,11 @@ from torchgco.native.codegen.emit import literal
 from torchgco.native.compiler import NativeError, Unit, build
 
 NUMBERS = {"int32_t": ctypes.c_int32, "int64_t": ctypes.c_int64, "double": ctypes.c_double}
-TENSORS = {
+TENSOR_TYPES = {
     "double": torch.float64, "float": torch.float32, "int32_t": torch.int32, "int64_t": torch.int64,
     "uint64_t": torch.int64, "uint8_t": torch.bool,
 }  # fmt: skip
-PLAIN = (int, float, bool)
+PLAIN_NUMBERS = (int, float, bool)
 _set = ctypes.Structure.__setattr__
 INCLUDES = "#define _POSIX_C_SOURCE 199309L /* a clock that nobody sets */\n#include <stdint.h>\n"
 
@@ -79,7 +79,7 @@ class Structure(ctypes.Structure):
         kind = self.kinds.get(name)
         if kind is None:
             raise AttributeError(f"{type(self).__name__} has no field {name}")
-        if type(value) in PLAIN:
+        if type(value) in PLAIN_NUMBERS:
             return _set(self, name, value)
         if isinstance(value, list):
             self.kept.append(value)
@@ -149,7 +149,7 @@ def _in_c(name: str, kind: Any) -> str:
 
 def _held(kind: str) -> torch.dtype | None:
     """What a tensor holds that a pointer of this type points to; None for pointers to structures."""
-    return TENSORS.get(kind.removeprefix("const ").removesuffix(" *"))
+    return TENSOR_TYPES.get(kind.removeprefix("const ").removesuffix(" *"))
 
 
 def _address(value: Any, kind: str, name: str) -> int:

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
-from torchgco.lagrangian.kkt import PIVOT, ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
+from torchgco.lagrangian.kkt import LEAST_PIVOT, CLOSING_ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
 from torchgco.native.codegen.source import INTERIOR, LANES
 from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import Interior, Kkt
 from torchgco.problem.problem import Problem
 
-FEW = 2, 4  # lanes of libraries for few problems
+FEW_LANES = 2, 4  # lanes of libraries for few problems
 
 
 class InteriorEngine:
@@ -35,7 +35,7 @@ class InteriorEngine:
 
     def for_few(self, B: int) -> tuple[ctypes.CDLL, int]:
         """A library for B problems, and how many it solves side by side: lanes without a problem take time, too."""
-        lanes = next((lanes for lanes in FEW if B <= lanes < LANES), LANES)
+        lanes = next((lanes for lanes in FEW_LANES if B <= lanes < LANES), LANES)
         return self._with_lanes(lanes), lanes
 
     def _with_lanes(self, lanes: int) -> ctypes.CDLL:
@@ -102,7 +102,7 @@ class InteriorEngine:
             Kkt.complete(
                 of=packed, active=active.double().contiguous(), give=give, y=costates, left=left, **sides, problems=B,
                 free_start=None if free is None else free.double().contiguous(), count=right.a.shape[0],
-                rounds=ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=PIVOT,
+                rounds=CLOSING_ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=LEAST_PIVOT,
             ),
         )  # fmt: skip
         return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, out["status"] == Status.CONVERGED)

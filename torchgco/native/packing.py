@@ -22,7 +22,7 @@ from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
 # All other constraints, subclasses of these too, are traced.
-KINDS = {
+KIND_OF = {
     ControlBounds: Kind.BOUNDS, StateBounds: Kind.BOUNDS, BoundSpheres: Kind.SPHERES, BoundBoxes: Kind.BOXES,
     BoundField: Kind.FIELD,
 }  # fmt: skip
@@ -79,15 +79,15 @@ def numbers_of(constraint: Constraint, numbers: Tensor | None, problem: Problem)
     if isinstance(parts[0], SOLIDS) and parts[0].stops is not None:
         own["stops"] = array(parts[0].stops.unsqueeze(-1), knots=False)
     if isinstance(constraint, BoundBody):
-        own |= {"lift": array(numbers, knots=True), "balls": len(parts), "kind_of_balls": KINDS[type(parts[0])]}
+        own |= {"lift": array(numbers, knots=True), "balls": len(parts), "kind_of_balls": KIND_OF[type(parts[0])]}
     return own
 
 
 def kind_of(constraint: Constraint) -> Kind:
     """How C computes a constraint's rows; a body is a FUNCTION where its balls are of no other kind."""
     if isinstance(constraint, BoundBody):
-        return Kind.BODY if type(constraint.balls[0]) in KINDS else Kind.FUNCTION
-    return KINDS.get(type(constraint), Kind.FUNCTION)
+        return Kind.BODY if type(constraint.balls[0]) in KIND_OF else Kind.FUNCTION
+    return KIND_OF.get(type(constraint), Kind.FUNCTION)
 
 
 def is_lifted(constraint: Constraint) -> bool:

@@ -21,8 +21,8 @@ from torchgco.obstacles.base import Obstacles, Solids
 if TYPE_CHECKING:
     from torchgco.constraints.base import Constraint
 
-RAYS = 720  # along which the largest ball that a body holds is measured, and ...
-SURE = 0.97  # ... the share of it that counts: between two rays the body may be thinner
+BALL_RAYS = 720  # along which the largest ball that a body holds is measured, and ...
+COUNTED_SHARE = 0.97  # ... the share of it that counts: between two rays the body may be thinner
 PIECES = 4  # of a step, between which the balls move on straight lines
 
 
@@ -103,7 +103,7 @@ class Body:
     def inscribed_radius(self) -> float:
         """The radius of a ball about the position that the body holds, m, close to the largest; 0 if it holds none."""
         alone = float((self.radii - self.offsets.norm(dim=-1)).max())
-        return max(0.0, alone, SURE * float(self._way_out(directions(self.offsets.shape[1])).min()))
+        return max(0.0, alone, COUNTED_SHARE * float(self._way_out(directions(self.offsets.shape[1])).min()))
 
     def _way_out(self, along: Tensor) -> Tensor:
         """How far rays from the position along unit vectors (R, d) stay in the body, (R,), m."""
@@ -149,11 +149,11 @@ def numbers(value: Any, field: str) -> Tensor:
 
 def directions(d: int) -> Tensor:
     """Unit vectors (R, d) all around, in space a Fibonacci lattice."""
-    i = torch.arange(RAYS, dtype=torch.float64, device="cpu")
+    i = torch.arange(BALL_RAYS, dtype=torch.float64, device="cpu")
     if d == 2:
-        angle = 2.0 * math.pi / RAYS * i
+        angle = 2.0 * math.pi / BALL_RAYS * i
         return torch.stack((angle.cos(), angle.sin()), dim=-1)
-    z, angle = 1.0 - (2.0 * i + 1.0) / RAYS, math.pi * (3.0 - math.sqrt(5.0)) * i
+    z, angle = 1.0 - (2.0 * i + 1.0) / BALL_RAYS, math.pi * (3.0 - math.sqrt(5.0)) * i
     flat = (1.0 - z.square()).sqrt()
     return torch.stack((flat * angle.cos(), flat * angle.sin(), z), dim=-1)
 

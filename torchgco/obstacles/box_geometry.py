@@ -19,7 +19,7 @@ from torch import Tensor
 from torchgco.obstacles.base import Solids
 
 Coordinates = Sequence[Tensor]
-SLACK = 1e-9  # share of lengths by which bounds are wider, more than rounding
+BOX_SLACK = 1e-9  # share of lengths by which bounds are wider, more than rounding
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Cuboids(Solids):
     def _reach(self) -> Tensor:
         """Half the side lengths (B, M, d) of boxes along the axes of space that hold the grown ones, m."""
         reach = self.extent + self.radii.unsqueeze(-1)
-        return reach + SLACK * (reach + self.centers.abs())
+        return reach + BOX_SLACK * (reach + self.centers.abs())
 
     def apart(self, a: Tensor, b: Tensor) -> Tensor:
         """Lower bounds (B, V, M) of the distances of segments from a to b (B, V, d): along the axes of space, m."""

@@ -17,7 +17,7 @@ from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
 
-DISTANCES_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
+BOX_GAPS_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
 
 
@@ -203,7 +203,7 @@ class BoundBoxes(Obstacles):
     def _parts(self, points: int) -> list[slice]:
         """The problems of a batch, as many at a time as the processor's cache holds distances of `points` points."""
         B, M = self.absent.shape
-        size = max(B, 1) if self.absent.is_cuda else max(1, DISTANCES_AT_ONCE // max(1, points * M))
+        size = max(B, 1) if self.absent.is_cuda else max(1, BOX_GAPS_AT_ONCE // max(1, points * M))
         return [slice(first, first + size) for first in range(0, max(B, 1), size)]
 
     def _rows(self, p: Tensor) -> Tensor:

@@ -17,14 +17,13 @@ from PIL import Image
 
 from torchgco.base.errors import InputError
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, draw_still, flight, handles, positions
-from torchgco.plotting.maps import UNKNOWN
+from torchgco.plotting.course import VEHICLE_COLOUR, VIEWS, Course, draw_instant, draw_still, flight, handles, positions
+from torchgco.plotting.maps import UNSEEN
 from torchgco.plotting.missions import check_plans
-from torchgco.plotting.style import INK, PALETTE, TITLE, legend, tidy
+from torchgco.plotting.style import DPI, INK, PALETTE, TITLE, legend, tidy
 
 FPS = 5
 MAX_FRAMES = 100  # frames of a mission
-DPI = 80
 PALE = "#C8C8C8"
 
 
@@ -183,7 +182,7 @@ def _palette() -> list[int]:
     """The colours of the drawings, full and paler, as bytes of red, green and blue; the rest is white."""
     times = [draw.NEAR_TO_FAR(share)[:3] for share in np.linspace(0.0, 1.0, 16)]
     full = np.array(
-        [to_rgb(colour) for colour in (INK, VEHICLE, draw.CROSS, draw.EDGE, draw.STONE, UNKNOWN, PALE, *PALETTE)]
+        [to_rgb(colour) for colour in (INK, VEHICLE_COLOUR, draw.CROSS, draw.EDGE, draw.STONE, UNSEEN, PALE, *PALETTE)]
     )
     full = np.concatenate((full, times))
     shades = [1.0 - share * (1.0 - full) for share in (1.0, 0.6, 0.3)]

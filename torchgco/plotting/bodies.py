@@ -15,6 +15,7 @@ from torchgco.judging.judge import segment_distance
 
 Plane = tuple[int, int]  # the two coordinates that a map shows: (0, 1) from above, (0, 2) from the side
 ABOVE: Plane = (0, 1)
+SIDE: Plane = (0, 2)
 ANGLES = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
 RAYS = np.stack((np.cos(ANGLES), np.sin(ANGLES)), axis=-1)  # in which rounded outlines are drawn
 EDGES = np.array([(i, i + bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])  # of a box, by its corners
@@ -141,10 +142,10 @@ class Box:
         return _around(points[:, plane], left) if len(points) else None
 
 
-Body = Ball | Box
+Solid = Ball | Box
 
 
-def bodies(layouts: Mapping[str, np.ndarray], i: int) -> tuple[Body, ...]:
+def bodies(layouts: Mapping[str, np.ndarray], i: int) -> tuple[Solid, ...]:
     """The obstacles present in layout i of the arrays of a layout file."""
     radii = np.asarray(layouts.get("radii", np.empty((i + 1, 0))), dtype=float)[i]
     here = np.flatnonzero(np.isfinite(radii))

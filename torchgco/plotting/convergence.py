@@ -14,9 +14,9 @@ from matplotlib.ticker import MaxNLocator
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.style import INK, legend, panels, tidy
+from torchgco.plotting.trajectory import GUIDED, LIMIT
 
-COLUMNS = ("element", "iteration", "outer", "cost", "guided")
-UPDATE, GUIDED = "#C62828", "#C9E0F4"
+TRACED = ("element", "iteration", "outer", "cost", "guided")
 SHOWN = 4
 LOGARITHMIC = 50.0  # ratio of the largest to the smallest cost from which the axis is logarithmic
 
@@ -32,9 +32,9 @@ def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = Non
     A multiplier update is drawn between the iterations before and after it. Raises InputError for a missing
     column, an empty trace and a problem that isn't in it.
     """
-    missing = [name for name in COLUMNS if name not in trace.columns]
+    missing = [name for name in TRACED if name not in trace.columns]
     if missing or trace.empty:
-        raise InputError("trace", f"rows with columns {', '.join(COLUMNS)}", f"none of {', '.join(missing) or 'them'}")
+        raise InputError("trace", f"rows with columns {', '.join(TRACED)}", f"none of {', '.join(missing) or 'them'}")
     held = trace["element"].unique().tolist()
     shown = held[:SHOWN] if elements is None else list(elements)
     for element in shown:
@@ -49,7 +49,7 @@ def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = Non
         figure,
         [
             Line2D([], [], color=INK, label="cost"),
-            Line2D([], [], color=UPDATE, linewidth=1, label="multiplier update"),
+            Line2D([], [], color=LIMIT, linewidth=1, label="multiplier update"),
             *([Line2D([], [], color=INK, linestyle="--", label="next attempt")] if _restarts(trace) else []),
             Patch(color=GUIDED, label="guidance on"),
         ],
@@ -71,7 +71,7 @@ def _panel(ax: Axes, rows: pd.DataFrame) -> None:
     for first, last in _runs(rows["guided"].to_numpy(dtype=bool)):
         ax.axvspan(iteration[first] - 0.5, iteration[last] + 0.5, color=GUIDED, linewidth=0, zorder=0)
     for change in np.flatnonzero(np.diff(rows["outer"].to_numpy())):
-        ax.axvline((iteration[change] + iteration[change + 1]) / 2, color=UPDATE, linewidth=0.8, alpha=0.7, zorder=1)
+        ax.axvline((iteration[change] + iteration[change + 1]) / 2, color=LIMIT, linewidth=0.8, alpha=0.7, zorder=1)
     ax.plot(iteration, cost, color=INK, linewidth=1.6, marker=".", markersize=4, zorder=2)
     finite = cost[np.isfinite(cost)]
     if finite.size and finite.min() > 0 and finite.max() > LOGARITHMIC * finite.min():

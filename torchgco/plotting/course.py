@@ -18,12 +18,12 @@ from torchgco.base.errors import InputError
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.bodies import Ball, Body
+from torchgco.plotting.bodies import Ball, Solid
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import Scene, contacts, view
 from torchgco.plotting.style import INK, PALETTE
 
-VEHICLE = PALETTE[5]
+VEHICLE_COLOUR = PALETTE[5]
 VIEWS: tuple[draw.Plane, draw.Plane] = (draw.ABOVE, draw.SIDE)
 POSITION = ("x0", "x1", "x2")
 CONTACT: dict[str, Any] = {
@@ -46,7 +46,7 @@ class Course:
         InputError: a goal of another shape.
     """
 
-    bodies: tuple[Body, ...]
+    bodies: tuple[Solid, ...]
     goal: np.ndarray
     goal_radius: float
     vehicle_radius: float = 0.36
@@ -117,7 +117,7 @@ def draw_instant(
     draw.draw_trajectory(ax, plan, infeasible, plane, every=2, size=7.0)
     draw_contacts(ax, course.contacts(track, period), plane)
     at = (float(track[-1, plane[0]]), float(track[-1, plane[1]]))
-    ax.add_patch(Circle(at, course.vehicle_radius, facecolor=VEHICLE, edgecolor=INK, linewidth=0.8, zorder=6))
+    ax.add_patch(Circle(at, course.vehicle_radius, facecolor=VEHICLE_COLOUR, edgecolor=INK, linewidth=0.8, zorder=6))
 
 
 def draw_contacts(ax: Axes, places: np.ndarray, plane: draw.Plane) -> None:
@@ -131,11 +131,11 @@ def handles(course: Course, touched: bool) -> list[Artist]:
     return [*found, *unknown_handles(course.map)]
 
 
-def _is_still(body: Body) -> bool:
+def _is_still(body: Solid) -> bool:
     return isinstance(body, Ball) and not body.moving
 
 
-def _draw_bodies(ax: Axes, course: Course, bodies: Sequence[Body], t: float, at: float, plane: draw.Plane) -> None:
+def _draw_bodies(ax: Axes, course: Course, bodies: Sequence[Solid], t: float, at: float, plane: draw.Plane) -> None:
     """Obstacles at time t, s, filled, and outlined at the vehicle's radius; `at` is its hidden coordinate, m."""
     full: dict[str, Any] = {"facecolor": draw.STONE, "linewidth": 0.5, "alpha": 0.6}
     grown: dict[str, Any] = {"facecolor": "none", "linewidth": 0.7, "linestyle": "--"}

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 from torchgco.judging.judge import SUCCESS_VIOLATION
 from torchgco.plotting.style import INK, legend, panels, solver_colours, tasks_of, tidy
 
-FLOOR = 1e-12
+LOWEST = 1e-12
 SIZE = (5.2, 3.2)  # of a panel, inches
 SPACE = 0.04  # share of the axis left free at both ends
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")  # matplotlib's own formulas take long to load
@@ -53,7 +53,7 @@ def violation_figure(trials: pd.DataFrame) -> Figure:
     tasks = [(title, task) for title, task in tasks_of(trials) if _drawable(task, "violation")]
     figure, axes = panels(len(tasks), 2, SIZE)
     for ax, (title, task) in zip(axes, tasks, strict=True):
-        decades = {name: np.log10(values.clip(FLOOR)) for name, values in _by_solver(task, "violation").items()}
+        decades = {name: np.log10(values.clip(LOWEST)) for name, values in _by_solver(task, "violation").items()}
         # A linear axis of exponents: its lower end stands for all below.
         _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(SUCCESS_VIOLATION))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -65,7 +65,7 @@ def violation_figure(trials: pd.DataFrame) -> Figure:
 
 def _power(exponent: float, _: object) -> str:
     text = f"10{f'{exponent:.0f}'.translate(RAISED)}"
-    return f"≤ {text}" if exponent <= np.log10(FLOOR) else text
+    return f"≤ {text}" if exponent <= np.log10(LOWEST) else text
 
 
 def _drawable(task: pd.DataFrame, column: str) -> bool:

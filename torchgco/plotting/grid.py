@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from torchgco.plotting.bodies import Plane
 from torchgco.plotting.style import INK, TEXT, TITLE, NotebookFigure, legend_columns, tidy
 
-WIDTH = 12.4  # inches, of a figure with columns enough; the others leave room
-TITLED, LEFT, RIGHT, FOOT, GAP = 0.3, 0.6, 0.15, 0.3, 0.2
+GRID_WIDTH = 12.4  # inches, of a figure with columns enough; the others leave room
+TITLED, GRID_LEFT, GRID_RIGHT, GRID_FOOT, GRID_GAP = 0.3, 0.6, 0.15, 0.3, 0.2
 
 
 def grid(
@@ -31,26 +31,26 @@ def grid(
     """
     spans = [(box[1] - box[0]) for box in boxes]
     fewest = max(columns, 2)
-    width = (WIDTH - LEFT - RIGHT - (fewest - 1) * GAP) / fewest
-    wide = LEFT + columns * (width + GAP) - GAP + RIGHT
+    width = (GRID_WIDTH - GRID_LEFT - GRID_RIGHT - (fewest - 1) * GRID_GAP) / fewest
+    wide = GRID_LEFT + columns * (width + GRID_GAP) - GRID_GAP + GRID_RIGHT
     heights = [[width * span[plane[1]] / span[0] for plane in planes] for span in spans]
-    high = sum(TITLED + sum(row) + GAP * len(planes) for row in heights) + FOOT
+    high = sum(TITLED + sum(row) + GRID_GAP * len(planes) for row in heights) + GRID_FOOT
     figure = NotebookFigure(figsize=(wide, high))
     axes, top = [], high
     for row, box in enumerate(boxes):
         top -= TITLED
-        lowest = top - sum(heights[row]) - GAP * (len(planes) - 1)
+        lowest = top - sum(heights[row]) - GRID_GAP * (len(planes) - 1)
         for i in range(row * columns, min((row + 1) * columns, count)):
-            left, upper, panels = LEFT + (i - row * columns) * (width + GAP), top, []
+            left, upper, panels = GRID_LEFT + (i - row * columns) * (width + GRID_GAP), top, []
             for plane, height in zip(planes, heights[row], strict=True):
                 place = (left / wide, (upper - height) / high, width / wide, height / high)
                 panels.append(_axes(figure, place, box, plane, i == row * columns))
-                upper -= height + GAP
+                upper -= height + GRID_GAP
             if i + columns >= count:  # the lowest of its column
                 panels[-1].tick_params(labelbottom=True)
                 panels[-1].set_xlabel("x [m]")
             axes.append(tuple(panels))
-        top = lowest - GAP
+        top = lowest - GRID_GAP
     return figure, axes
 
 

@@ -17,20 +17,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
-from torchgco.plotting.bodies import ABOVE, Ball, Body, Plane
+from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid
 from torchgco.plotting.gates import draw_gates
 from torchgco.plotting.grid import grid, put_head
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
-from torchgco.plotting.style import INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
+from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
 
-STONE, EDGE = "#CFC8BA", "#A39B8B"
-SIDE: Plane = (0, 2)
+ROCK = "#CFC8BA"
 TALLEST = 1.5  # heights of a panel as a share of its width
 TRAIL = 1.0  # s of a moving obstacle's way that are drawn
 # Shares of the way from start to goal: how near obstacles are that a cut misses, how far moving ones that are left out,
 # and what hasn't moved.
-NEAR, FAR, STILL = 0.05, 0.15, 0.01
+NEAR_SHARE, FAR_SHARE, STILL = 0.05, 0.15, 0.01
 INFEASIBLE, SHORT = "infeasible", "feasible, short of the goal"
 MARKED = {
     "contact": "contact", "short": SHORT, "infeasible": "infeasible without contact", "away": "leaves the picture",
@@ -101,7 +100,7 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     for plane, ax in axes.items():
         drawn |= draw_obstacles(ax, scene, i, leads, plane)
         if (own := scene.map_of(i)) is not None:
-            drawn |= draw_map(ax, own, flown(path), plane, scene.margin, (STONE, EDGE))
+            drawn |= draw_map(ax, own, flown(path), plane, scene.margin, (ROCK, EDGE))
         drawn |= _paths(ax, scene, i, here, plane)
         draw_targets(ax, scene, i, plane)
     return drawn
@@ -172,7 +171,7 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass
             if (body.moving and _is_far(scene, i, place)) or (first > 0 and not body.moving):
                 continue
             own, grown = _shapes(body, scene, place, plane)
-            near = place.distance < NEAR * _way(scene, i)
+            near = place.distance < NEAR_SHARE * _way(scene, i)
             if own is not None:
                 held["moving" if body.moving else "own"].append(own)
             if grown is not None and scene.margin > 0 and not body.moving:
@@ -185,10 +184,10 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass
                 held["vehicle"].append(Ball(place.place, scene.margin, np.zeros(scene.dimension)).outline(0.0, plane))
         looks: dict[str, dict[str, Any]] = {
             "near": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.7, "linestyle": ":"},
-            "own": {"facecolor": STONE, "linewidth": 0.0},
+            "own": {"facecolor": ROCK, "linewidth": 0.0},
             "grown": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.6},
             # Several trajectories pass a moving obstacle at several places, which may overlap.
-            "moving": {"facecolor": (*to_rgb(STONE), 0.35), "edgecolor": colour, "linewidth": 0.9, "linestyle": "--"},
+            "moving": {"facecolor": (*to_rgb(ROCK), 0.35), "edgecolor": colour, "linewidth": 0.9, "linestyle": "--"},
             "vehicle": {"facecolor": (*to_rgb(colour), 0.25), "edgecolor": colour, "linewidth": 0.9},
         }
         for zorder, (kind, shapes) in enumerate(held.items()):
@@ -210,10 +209,10 @@ def moving_corners(scene: Scene, i: int, path: np.ndarray) -> list[np.ndarray]:
 
 def _is_far(scene: Scene, i: int, place: Pass) -> bool:
     """Whether a flight stays so far from an obstacle that moves that this isn't drawn."""
-    return place.distance > FAR * _way(scene, i)
+    return place.distance > FAR_SHARE * _way(scene, i)
 
 
-def _shapes(body: Body, scene: Scene, place: Pass, plane: Plane) -> list[np.ndarray | None]:
+def _shapes(body: Solid, scene: Scene, place: Pass, plane: Plane) -> list[np.ndarray | None]:
     """A body, and the same grown by the vehicle's radius: outlines, or cuts in space, None where there is nothing."""
     if scene.dimension == 2:
         return [body.outline(margin, plane, place.t) for margin in (0.0, scene.margin)]
@@ -221,7 +220,7 @@ def _shapes(body: Body, scene: Scene, place: Pass, plane: Plane) -> list[np.ndar
     return [body.section(plane, at, margin, place.t) for margin in (0.0, scene.margin)]
 
 
-def _draw_motion(ax: Axes, body: Body, place: Pass, plane: Plane, colour: str) -> None:
+def _draw_motion(ax: Axes, body: Solid, place: Pass, plane: Plane, colour: str) -> None:
     """A moving body's last second, the time when it is passed, and the vehicle's centre then."""
     way = body.at(np.array([max(0.0, place.t - TRAIL), place.t]))[:, plane]
     ax.plot(*way.T, color=colour, linewidth=0.9, zorder=1)
@@ -234,7 +233,7 @@ def _draw_motion(ax: Axes, body: Body, place: Pass, plane: Plane, colour: str) -
 def moving_handles(whose: str, colour: str) -> list[Artist]:
     """The legend's entries of moving obstacles, drawn when some trajectory passes them."""
     look: dict[str, Any] = {"edgecolor": colour, "linewidth": 0.9}
-    passed = Patch(facecolor=(*to_rgb(STONE), 0.35), linestyle="--", label=f"moving obstacle as {whose} passes", **look)
+    passed = Patch(facecolor=(*to_rgb(ROCK), 0.35), linestyle="--", label=f"moving obstacle as {whose} passes", **look)
     vehicle = Patch(facecolor=(*to_rgb(colour), 0.25), label="and the vehicle then", **look)
     return [passed, vehicle, Line2D([], [], color=colour, linewidth=0.9, label="the obstacle's last second")]
 
@@ -340,7 +339,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str])
     where = f", cut at the height (below: at the y) of {first}" if scene.dimension == 3 else ""
     outline: dict[str, Any] = {"facecolor": "none", "edgecolor": EDGE}
     shapes: dict[str, Artist] = {
-        "own": Patch(facecolor=STONE, label=f"obstacle{where}"),
+        "own": Patch(facecolor=ROCK, label=f"obstacle{where}"),
         "grown": Patch(label="plus the vehicle's radius", **outline),
         "near": Patch(linestyle=":", label=f"near {first}, missed by this cut", **outline),
     }

@@ -12,9 +12,9 @@ from torchgco.maps.distance import DistanceField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.plotting.bodies import Plane
 
-TOUCH = 0.01  # spacings of the lattice: so near counts as inside
-MOST_NODES = 1500  # along an axis of a picture
-UNKNOWN = "#BFD3EA"  # blue and pale, as free is white and what is occupied brown
+INSIDE_WITHIN = 0.01  # spacings of the lattice: so near counts as inside
+PICTURE_NODES = 1500  # along an axis of a picture
+UNSEEN = "#BFD3EA"  # blue and pale, as free is white and what is occupied brown
 
 
 def draw_map(
@@ -32,11 +32,11 @@ def draw_map(
     """
     axes = [field.origin[0, k] + field.spacing * np.arange(size) for k, size in enumerate(field.values.shape[1:])]
     values = _cut(field.values[0], axes, path, plane)
-    steps = [max(-(-size // MOST_NODES), 1) for size in values.shape]
+    steps = [max(-(-size // PICTURE_NODES), 1) for size in values.shape]
     x, y = (axes[k][::step] for k, step in zip(plane, steps, strict=True))
     thin = values[:: steps[0], :: steps[1]].T
     limits, drawn = (ax.get_xlim(), ax.get_ylim()), set[str]()
-    near = TOUCH * field.spacing
+    near = INSIDE_WITHIN * field.spacing
     if (thin <= near).any() and min(thin.shape) > 1:
         ax.contourf(x, y, thin, [-np.inf, near], colors=[colours[0]], zorder=0.1)
         drawn.add("own")
@@ -60,7 +60,7 @@ def unknown_handles(field: DistanceField | None) -> list[Artist]:
     """The legend's entry of the unknown cells, where there are any."""
     if field is None or not has_unknown(field):
         return []
-    return [Patch(facecolor=UNKNOWN, label=f"unknown, counts as {field.unknown}")]
+    return [Patch(facecolor=UNSEEN, label=f"unknown, counts as {field.unknown}")]
 
 
 def _draw_unknown(ax: Axes, field: DistanceField, path: np.ndarray, plane: Plane) -> None:
@@ -73,7 +73,7 @@ def _draw_unknown(ax: Axes, field: DistanceField, path: np.ndarray, plane: Plane
     shown = _cut(cells, middles, path, plane)
     low, high = origin, origin + grid.resolution * np.array(cells.shape)
     extent = (low[plane[0]], high[plane[0]], low[plane[1]], high[plane[1]])
-    look = {"cmap": ListedColormap([UNKNOWN]), "interpolation": "nearest", "origin": "lower", "zorder": 0.15}
+    look = {"cmap": ListedColormap([UNSEEN]), "interpolation": "nearest", "origin": "lower", "zorder": 0.15}
     ax.imshow(np.ma.masked_equal(shown.T, False), extent=extent, aspect=ax.get_aspect(), **look)  # type: ignore[arg-type]
 
 

@@ -24,7 +24,7 @@ from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.course import (
     POSITION,
-    VEHICLE,
+    VEHICLE_COLOUR,
     VIEWS,
     Course,
     draw_instant,
@@ -37,16 +37,15 @@ from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, legend, panels, s
 
 Frames = Mapping[str, pd.DataFrame]  # by solver
 CLOSE = (0.93, 1.12)  # shares shown near the boundaries
-LIMIT, GUIDED = "#C62828", "#C9E0F4"
 ENDS = {
     Outcome.REACHED: "#009E73",
     Outcome.COLLISION: "#D55E00",
     Outcome.TIMEOUT: "#BFBFBF",
     Outcome.DIVERGED: "#4D4D4D",
 }
-NARROW = 0.06  # share of a bar below which no count is written into it
+NARROW_BAR = 0.06  # share of a bar below which no count is written into it
 FLOOR = 1e-16  # N: smallest violation on a logarithmic axis
-AXES = ("x", "y", "z")
+POSITION_AXES = ("x", "y", "z")
 
 
 def compute_figure(frames: Frames, period: float) -> Figure:
@@ -65,16 +64,16 @@ def compute_figure(frames: Frames, period: float) -> Figure:
         values = flight(frame, "t", *parts, "guided")
         t, total = values["t"], values["planner_seconds"] + values["tracker_seconds"]
         for start in t[values["guided"] > 0]:
-            ax.axvspan(start, start + period, color=GUIDED, linewidth=0, zorder=0)
+            ax.axvspan(start, start + period, color=draw.GUIDED, linewidth=0, zorder=0)
         for name, colour in parts.items():
             ax.plot(t, 1e3 * values[name], color=colour, linewidth=1.2, drawstyle="steps-post")
-        ax.axhline(1e3 * period, color=LIMIT, linestyle="--", linewidth=1.0)
+        ax.axhline(1e3 * period, color=draw.LIMIT, linestyle="--", linewidth=1.0)
         ax.set(yscale="log", ylabel="computing time [ms]")
         tidy(ax, f"{solver}: {int((total > period).sum())} of {len(t)} steps above the period")
     axes[-1].set_xlabel("time in the mission [s]")
     lines = [Line2D([], [], color=colour, label=name.split("_")[0]) for name, colour in parts.items()]
-    mark = Line2D([], [], color=LIMIT, linestyle="--", linewidth=1.0, label=f"period, {1e3 * period:.0f} ms")
-    legend(figure, [*lines, mark, Patch(color=GUIDED, label="guidance on")])
+    mark = Line2D([], [], color=draw.LIMIT, linestyle="--", linewidth=1.0, label=f"period, {1e3 * period:.0f} ms")
+    legend(figure, [*lines, mark, Patch(color=draw.GUIDED, label="guidance on")])
     return figure
 
 
@@ -99,14 +98,14 @@ def distance_figure(frames: Frames, course: Course) -> Figure:
             ax.plot(t, near, color=colours[solver], linewidth=1.4)
             ax.plot(t[-1:], near[-1:], color=colours[solver], marker="o", markersize=5, clip_on=title != "")
         ax.axhline(1.0, color=INK, linestyle=":", linewidth=1.2)
-        ax.axhline(CONTACT_FACTOR, color=LIMIT, linestyle="--", linewidth=1.0)
+        ax.axhline(CONTACT_FACTOR, color=draw.LIMIT, linestyle="--", linewidth=1.0)
         ax.set_ylabel("distance / ($r_{obs} + r_{veh}$) [-]")
         tidy(ax, title)
         _metres(ax, course)
     axes[1].set(ylim=CLOSE, xlim=axes[0].get_xlim(), xlabel="time in the mission [s]")
     marks = [
         Line2D([], [], color=INK, linestyle=":", linewidth=1.2, label="planner's boundary, 1.0"),
-        Line2D([], [], color=LIMIT, linestyle="--", linewidth=1.0, label=f"contact, {CONTACT_FACTOR}"),
+        Line2D([], [], color=draw.LIMIT, linestyle="--", linewidth=1.0, label=f"contact, {CONTACT_FACTOR}"),
     ]
     legend(figure, [*(Line2D([], [], color=c, label=solver) for solver, c in colours.items()), *marks])
     return figure
@@ -146,7 +145,7 @@ def snapshots_figure(
     names = draw.handles("knot", "infeasible", "obstacle", "inflated", "start", "goal", knot="plan")
     own = [
         Line2D([], [], color=INK, linewidth=1.4, label="flown"),
-        Line2D([], [], color=VEHICLE, markeredgecolor=INK, marker="o", linestyle="none", label="vehicle"),
+        Line2D([], [], color=VEHICLE_COLOUR, markeredgecolor=INK, marker="o", linestyle="none", label="vehicle"),
     ]
     touched = any(len(course.contacts(track[: step + 1], period)) for step in steps)
     legend(figure, [*names[:2], *own, *names[2:], *handles(course, touched)])
@@ -176,12 +175,12 @@ def commands_figure(frame: pd.DataFrame, airframe: Airframe | None = None) -> Fi
                 low, high = flight(frame, f"{name}_low", f"{name}_high").values()
                 ax.fill_between(t, low, high, color=colour, alpha=0.25, linewidth=0, step="post")
         for mark in marks:
-            ax.axhline(mark, color=LIMIT, linestyle="--", linewidth=1.0)
+            ax.axhline(mark, color=draw.LIMIT, linestyle="--", linewidth=1.0)
         ax.set_ylabel(label)
         tidy(ax)
     axes[1].set_xlabel("time in the mission [s]")
     rotors = [Line2D([], [], color=colour, label=f"rotor {i + 1}") for i, colour in enumerate(PALETTE[:4])]
-    legend(figure, [*rotors, Line2D([], [], color=LIMIT, linestyle="--", linewidth=1.0, label="limits of thrust")])
+    legend(figure, [*rotors, Line2D([], [], color=draw.LIMIT, linestyle="--", linewidth=1.0, label="limits of thrust")])
     return figure
 
 
@@ -199,7 +198,7 @@ def states_figure(frame: pd.DataFrame, goal: np.ndarray) -> Figure:
     grid = figure.subplots(2, 3, sharex=True)
     for i, ax in enumerate(grid[0]):
         _lines(ax, t, x[i : i + 1], PALETTE[i : i + 1], float(goal[i]))
-        ax.set_ylabel(f"position {AXES[i]} [m]")
+        ax.set_ylabel(f"position {POSITION_AXES[i]} [m]")
     below = {
         "velocity [m/s]": x[3:6],
         "Euler angles [deg]": np.rad2deg(euler_angles(x[6:10])),
@@ -307,7 +306,7 @@ def _stack(ax: Axes, y: int, outcomes: pd.Series) -> None:
         count = int((outcomes == end.name).sum())
         if count:
             ax.barh(y, count / n, 0.72, left, color=colour)
-        if count and count / n >= NARROW:
+        if count and count / n >= NARROW_BAR:
             ink = INK if end is Outcome.TIMEOUT else "white"
             ax.text(left + count / n / 2, y, str(count), ha="center", va="center", fontsize=SMALL, color=ink)
         left += count / n if n else 0.0

@@ -21,13 +21,11 @@ from torchgco.constraints import ControlBounds, Separation, StateBounds
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
-from torchgco.plotting.bodies import ABOVE, Plane
+from torchgco.plotting.bodies import ABOVE, SIDE, Plane
 from torchgco.plotting.gates import Outline, draw_gates, outlines
 from torchgco.plotting.layouts import (
-    EDGE,
     MARKED,
-    SIDE,
-    STONE,
+    ROCK,
     draw_obstacles,
     draw_targets,
     marker,
@@ -36,20 +34,20 @@ from torchgco.plotting.layouts import (
 )
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import flown, leaving, passes, view
-from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
+from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
+from torchgco.plotting.trajectory import LIMIT
 from torchgco.plotting.world import World, distances, world_of
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
 
 WIDTH = 9.0  # inches
-COLUMNS = 4  # of histories
+PANELS_ACROSS = 4  # of histories
 PANEL = 1.45  # inches, the height of a history
-TALLEST = 4.2  # inches, the height of a scene
-FEW = 6  # problems that are shown where none are named
+TALLEST_SCENE = 4.2  # inches, the height of a scene
+SHOWN_PROBLEMS = 6  # problems that are shown where none are named
 DRAWN = 9  # knots of a trajectory at which the balls of a body are drawn
-NEAR = 1.0  # spans of the data within which a limit is shown
-LIMIT = "#C62828"
+LIMIT_SPANS = 1.0  # spans of the data within which a limit is shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +74,7 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if at is None else at.stop - at.start, ())
     shared = [courses] if _is_shared(problem, courses) else [[course] for course in courses]
     maps = [_Map.of(problem, group, planes) for group in shared] if planes else []
-    rows = ceil((problem.n + problem.m) / COLUMNS)
+    rows = ceil((problem.n + problem.m) / PANELS_ACROSS)
     wide = WIDTH / len(maps) if maps else WIDTH
     high = max((one.height(wide) for one in maps), default=0.0)
     figure = NotebookFigure(figsize=(WIDTH, high + PANEL * rows), layout="constrained")
@@ -99,7 +97,7 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
 
 def _places(b: Any, B: int) -> list[int]:
     """The places of the problems to show."""
-    places = list(range(min(B, FEW))) if b is None else [b] if isinstance(b, int) else b
+    places = list(range(min(B, SHOWN_PROBLEMS))) if b is None else [b] if isinstance(b, int) else b
     whole = isinstance(places, Sequence) and all(isinstance(i, int) and not isinstance(i, bool) for i in places)
     if not whole or not places or any(not 0 <= i < B for i in places):
         raise InputError("b", f"the place of a problem, 0 to {B - 1}, or a list of some", b)
@@ -183,7 +181,7 @@ class _Map:
 
     def height(self, wide: float) -> float:
         """Inches, for a width in inches."""
-        return min(TALLEST, wide * sum(self.shares)) + 0.45 * len(self.planes)
+        return min(TALLEST_SCENE, wide * sum(self.shares)) + 0.45 * len(self.planes)
 
     def draw(self, figure: SubFigure) -> set[str]:
         """Draw each plane into axes of its own; returns the kinds of what is drawn, for the legend."""
@@ -218,13 +216,13 @@ class _Map:
             leads = {course.colour: passes(scene, 0, course.paths[0]) for course in self.courses}
             drawn |= draw_obstacles(ax, scene, 0, leads, plane)
             if scene.map is not None:
-                drawn |= draw_map(ax, scene.map, lead if len(lead) else scene.start, plane, scene.margin, (STONE, EDGE))
+                drawn |= draw_map(ax, scene.map, lead if len(lead) else scene.start, plane, scene.margin, (ROCK, EDGE))
         hidden = [i for i in range(self.box.shape[1]) if i not in plane]
         at = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
         for part in self.world.others:
             x, y, apart = distances(part, self.box[0], self.box[1], plane, at)
             if bool((apart < 0).any()):
-                ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[STONE], zorder=0.3)
+                ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[ROCK], zorder=0.3)
                 drawn.add("others")
         return drawn
 
@@ -259,10 +257,10 @@ def _some(count: int) -> np.ndarray:
 def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
     """Entries of the legend of all maps."""
     shapes: dict[str, Artist] = {
-        "own": Patch(facecolor=STONE, label="obstacle"),
+        "own": Patch(facecolor=ROCK, label="obstacle"),
         "grown": Patch(facecolor="none", edgecolor=EDGE, label="plus the vehicle's radius"),
         "body": Patch(facecolor="none", edgecolor=INK, label="the vehicle's body, at some knots"),
-        "others": Patch(facecolor=STONE, label="obstacle, plus the vehicle's radius"),
+        "others": Patch(facecolor=ROCK, label="obstacle, plus the vehicle's radius"),
     }
     points: list[Artist] = [
         Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in ("contact", "away") if kind in drawn
@@ -276,8 +274,8 @@ def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
 def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Course], unit: str) -> None:
     """A panel for each state and control."""
     count = problem.n + problem.m
-    rows = ceil(count / COLUMNS)
-    axes = list(figure.subplots(rows, min(COLUMNS, count), squeeze=False, sharex=True).flat)
+    rows = ceil(count / PANELS_ACROSS)
+    axes = list(figure.subplots(rows, min(PANELS_ACROSS, count), squeeze=False, sharex=True).flat)
     names = [one.label for one in (*states_of(problem.dynamics), *controls_of(problem.dynamics))]
     for i, ax in enumerate(axes[:count]):
         state, j = i < problem.n, i if i < problem.n else i - problem.n
@@ -292,7 +290,7 @@ def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Cours
         tidy(ax, names[i])
         ax.title.set_fontsize(TEXT)
         ax.tick_params(labelsize=SMALL - 1)
-        if i + COLUMNS >= count:
+        if i + PANELS_ACROSS >= count:
             ax.set_xlabel(unit, fontsize=SMALL)
             ax.tick_params(labelbottom=True)
     for ax in axes[count:]:
@@ -313,7 +311,7 @@ def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.n
             for course in courses:
                 row = bound[course.b if bound.shape[0] > 1 else 0, :, j].cpu().double().numpy()
                 row = np.broadcast_to(row, (count,))[: len(course.X if state else course.U)]
-                near = np.isfinite(row) & (row >= low - NEAR * span) & (row <= high + NEAR * span)
+                near = np.isfinite(row) & (row >= low - LIMIT_SPANS * span) & (row <= high + LIMIT_SPANS * span)
                 if near.any():
                     t = course.t[: len(row)]
                     mark: dict[str, Any] = {"marker": "_"} if near.sum() == 1 else {}

@@ -11,12 +11,12 @@ import numpy as np
 from torchgco.judging.contact import deepest, map_depth, pieces
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import CONTACT_FACTOR
-from torchgco.plotting.bodies import Body, bodies
+from torchgco.plotting.bodies import Solid, bodies
 from torchgco.scenarios.stored_maps import map_of
 
 Arrays = Mapping[str, np.ndarray]
 SLACK = 0.12  # share of the scene's size by which obstacles and flights that miss the goal may widen a map
-EDGE = 0.03  # share of the scene's size left free around it
+FREE_EDGE = 0.03  # share of the scene's size left free around it
 STRAY = 1.0  # share of the scene's size by which a path may widen a map on each side; one that goes farther is cut
 
 
@@ -35,7 +35,7 @@ class Scene:
         gates: (L, G, d+1) centres and radii of balls to be passed in this order, nan where absent; or None.
     """
 
-    bodies: tuple[tuple[Body, ...], ...]
+    bodies: tuple[tuple[Solid, ...], ...]
     start: np.ndarray
     goal: np.ndarray
     margin: float
@@ -169,7 +169,7 @@ def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: li
     reach = _corners([*edges, *others, corners])
     assert reach is not None
     box = np.clip(reach, corners[0] - SLACK * size, corners[1] + SLACK * size)
-    return box + EDGE * size * np.array([[-1.0], [1.0]])
+    return box + FREE_EDGE * size * np.array([[-1.0], [1.0]])
 
 
 def leaving(box: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -187,7 +187,7 @@ def leaving(box: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float] | Non
     return path[k] + share * step, float(np.arctan2(step[1], step[0]))
 
 
-def _extent(body: Body, margin: float) -> np.ndarray:
+def _extent(body: Solid, margin: float) -> np.ndarray:
     """Lower and upper corner (2, d) of a body at t = 0."""
     reach = body.radius + margin
     return np.stack([body.corners.min(axis=0) - reach, body.corners.max(axis=0) + reach])

@@ -16,16 +16,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
-from torchgco.missions.log import MissionLog
-from torchgco.missions.unknown.safety import SeenLog
+from torchgco.missions.log import MissionLog, SeenLog
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import VEHICLE, Course, draw_contacts, handles
-from torchgco.plotting.style import INK, PALETTE, legend, tidy
+from torchgco.plotting.course import VEHICLE_COLOUR, Course, draw_contacts, handles
+from torchgco.plotting.style import DPI, INK, PALETTE, legend, tidy
 
 CELLS = ("unknown", "known to be free", "known to be occupied")
-STATES = ListedColormap(["#9A9A9A", "#F4F4F4", "#3B3B3B"])
-DPI = 80
-FPS = 10
+SHADES = ListedColormap(["#9A9A9A", "#F4F4F4", "#3B3B3B"])
+SEEN_FPS = 10
 
 
 def seen_figure(log: MissionLog, b: int, course: Course, step: int, reach: float = np.nan) -> Figure:
@@ -60,7 +58,7 @@ def seen_animation(
     steps = int(log.steps()[b])
     seen = _seen(log, b, steps - 1)
     figure = seen_figure(log, b, course, 0, reach)
-    (ax,), writer, state = figure.axes, PillowWriter(fps=FPS), np.zeros(seen.shape, np.uint8)
+    (ax,), writer, state = figure.axes, PillowWriter(fps=SEEN_FPS), np.zeros(seen.shape, np.uint8)
     every = max(1, ceil((steps - 1) / (frames - 1)))
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # the axes stay where they are
@@ -84,7 +82,7 @@ def _seen(log: MissionLog, b: int, step: int) -> SeenLog:
 
 def _handles() -> list[Artist]:
     """Entries of the legend."""
-    cells = [Patch(facecolor=STATES(i), edgecolor=INK, label=label) for i, label in enumerate(CELLS)]
+    cells = [Patch(facecolor=SHADES(i), edgecolor=INK, label=label) for i, label in enumerate(CELLS)]
     rim = Patch(facecolor="none", edgecolor=PALETTE[0], label="obstacle as it is")
     lines = {"flown": INK, "safe plan, to where it rests": PALETTE[2]}
     return [*cells, rim, *(Line2D([], [], color=colour, label=label) for label, colour in lines.items())]
@@ -101,7 +99,7 @@ def _draw(ax: Axes, log: MissionLog, b: int, course: Course, step: int, state: n
     place, t = track[-1], step * log.period
     level = int(np.clip((place[2] - low[2]) / seen.resolution, 0, seen.shape[2] - 1))
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-    ax.imshow(state[:, :, level].T, origin="lower", extent=extent, cmap=STATES, vmin=0, vmax=2, interpolation="nearest")
+    ax.imshow(state[:, :, level].T, origin="lower", extent=extent, cmap=SHADES, vmin=0, vmax=2, interpolation="nearest")
     sections = [body.section(draw.ABOVE, float(place[2]), t=t) for body in course.bodies]
     rims = [section for section in sections if section is not None]
     ax.add_collection(PolyCollection(rims, facecolors="none", edgecolors=PALETTE[0], linewidths=0.8))
@@ -109,11 +107,11 @@ def _draw(ax: Axes, log: MissionLog, b: int, course: Course, step: int, state: n
     ax.plot(*track[:, :2].T, color=INK, lw=1.2)
     ax.plot(*plan[:, :2].T, color=PALETTE[2], lw=1.6)
     ax.plot(*plan[-1, :2], "s", color=PALETTE[2], ms=4)
-    ax.add_patch(Circle((place[0], place[1]), course.vehicle_radius, color=VEHICLE, zorder=5))
+    ax.add_patch(Circle((place[0], place[1]), course.vehicle_radius, color=VEHICLE_COLOUR, zorder=5))
     ax.add_patch(Circle((course.goal[0], course.goal[1]), course.goal_radius, fill=False, color=INK, lw=1.2))
     draw_contacts(ax, course.contacts(track, log.period), draw.ABOVE)
     if np.isfinite(reach):
-        ax.add_patch(Circle((place[0], place[1]), reach, fill=False, color=VEHICLE, lw=0.6, ls=":"))
+        ax.add_patch(Circle((place[0], place[1]), reach, fill=False, color=VEHICLE_COLOUR, lw=0.6, ls=":"))
     ax.set_xlim(extent[:2])
     ax.set_ylim(extent[2:])
     ax.set_aspect("equal")

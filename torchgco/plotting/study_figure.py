@@ -48,8 +48,8 @@ class Print:
 
 # One column, and the width of the page, of papers of the IEEE in two columns.
 PRINTS: dict[Columns, Print] = {"one": Print(3.5, 7.0, 2, 1, 0.55), "two": Print(7.16, 8.0, 3, 2, 0.65)}
-LEFT, RIGHT, GAP, HEAD, FOOT, CHART = 0.46, 0.06, 0.14, 0.17, 0.34, 1.25  # inches
-MARGIN = 0.55  # inches at the left of a chart, whose labels are wider than those of maps
+LEFT, RIGHT, GAP, LEAD, FOOT, CHART = 0.46, 0.06, 0.14, 0.17, 0.34, 1.25  # inches
+STUDY_MARGIN = 0.55  # inches at the left of a chart, whose labels are wider than those of maps
 
 
 def study_figure(
@@ -96,11 +96,11 @@ def _frame(
     columns = legend_columns(handles, form.width * TEXT / form.font)
     top = 0.06 + 1.6 / 72.0 * form.font * ceil(len(handles) / columns)
     stacked = ceil(2 / form.charts)
-    high = top + sum(highs) + HEAD * len(boxes) + FOOT + stacked * (CHART + HEAD + FOOT)
+    high = top + sum(highs) + LEAD * len(boxes) + FOOT + stacked * (CHART + LEAD + FOOT)
     figure = Figure(figsize=(form.width, high))
     y, maps, charts = high - top, [], []
     for row, (box, tall) in enumerate(zip(boxes, highs, strict=True)):
-        y -= HEAD + tall
+        y -= LEAD + tall
         for i in range(row * across, min((row + 1) * across, count)):
             x = LEFT + (i - row * across) * (wide + GAP)
             ax = figure.add_axes((x / form.width, y / high, wide / form.width, tall / high))
@@ -112,10 +112,10 @@ def _frame(
             ax.set(ylabel="y [m]" if i == row * across else "", xlabel="x [m]" if lowest else "")
             maps.append(ax)
     y -= FOOT
-    wide = form.width / form.charts - MARGIN - RIGHT
+    wide = form.width / form.charts - STUDY_MARGIN - RIGHT
     for k in range(2):
         row, column = divmod(k, form.charts)
-        x, low = column * form.width / form.charts + MARGIN, y - HEAD - CHART - row * (HEAD + CHART + FOOT)
+        x, low = column * form.width / form.charts + STUDY_MARGIN, y - LEAD - CHART - row * (LEAD + CHART + FOOT)
         charts.append(figure.add_axes((x / form.width, low / high, wide / form.width, CHART / high)))
     where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.0), "borderpad": 0.2}
     figure.legend(handles=handles, ncols=columns, frameon=False, columnspacing=1.2, fontsize=form.font, **where)

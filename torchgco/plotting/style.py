@@ -40,6 +40,8 @@ KNOWN: dict[str, tuple[str, Dash]] = {
     "path_pursuit": ("#CC6677", DASHES[3]),
 }  # fmt: skip
 INK, FAINT = "#333333", "#BBBBBB"
+EDGE = "#A39B8B"  # of obstacles
+DPI = 80  # of animations
 SMALL, TEXT, TITLE = 8, 9, 10  # points
 IN_NOTEBOOKS = 80  # dots per inch
 

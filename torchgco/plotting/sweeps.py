@@ -14,12 +14,12 @@ from matplotlib.ticker import NullFormatter, NullLocator, PercentFormatter
 from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.style import INK, SMALL, legend, panels, solver_colours, tasks_of, tidy
 
-SIZE = (3.4, 2.8)  # of a panel, inches
+SWEEP_PANEL = (3.4, 2.8)  # of a panel, inches
 DECADES = 50.0  # ratio of the largest to the smallest value from which the axis is logarithmic
 TICKS = 8  # values that are all marked on the axis
-LETTERS = 18  # of the name of a bar group
-ENDS = ("collision", "timeout", "diverged")  # of missions that don't reach the goal
-EFFORT = (
+GROUP_LETTERS = 18  # of the name of a bar group
+FAILED_OUTCOMES = ("collision", "timeout", "diverged")  # of missions that don't reach the goal
+EFFORT_AXES = (
     ("flight_time", "flight_time", "median flight time, reached [s]"),
     ("cost_ratio_median", "cost_ratio_p90", "cost / best, median to 90 %"),
     ("cost_median_reached", "cost_median_reached", "median cost, reached"),
@@ -48,7 +48,7 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
     tasks = list(tasks_of(rows.rename(columns={variable: "value"})))
     shown, effort = _shown(rows), _effort(rows)
     width = len(shown) + (effort is not None)
-    figure, axes = panels(len(tasks) * width, width, SIZE)
+    figure, axes = panels(len(tasks) * width, width, SWEEP_PANEL)
     numeric = pd.api.types.is_numeric_dtype(rows[variable])
     draw, place = (_line, _numbers) if numeric else (_bars, _categories)
     colours = solver_colours(rows["solver"])
@@ -81,14 +81,14 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
 
 def _shown(rows: pd.DataFrame) -> list[str]:
     """The outcomes that have panels."""
-    if f"{ENDS[0]}_n" not in rows.columns:
+    if f"{FAILED_OUTCOMES[0]}_n" not in rows.columns:
         return [name for name in OUTCOMES if rows[f"{name}_n"].sum() > 0]
-    return ["reached", *(name for name in ENDS if rows[f"{name}_count"].sum() > 0)]
+    return ["reached", *(name for name in FAILED_OUTCOMES if rows[f"{name}_count"].sum() > 0)]
 
 
 def _effort(rows: pd.DataFrame) -> tuple[str, str, str] | None:
     """Columns of the last panel, its middle and its upper end, and its label; None where no trial has a value."""
-    found = (held for held in EFFORT if held[0] in rows.columns and rows[held[0]].notna().any())
+    found = (held for held in EFFORT_AXES if held[0] in rows.columns and rows[held[0]].notna().any())
     return next(found, None)
 
 
@@ -124,7 +124,7 @@ def _numbers(row: list[Axes], values: pd.Series) -> dict[object, float]:
 def _categories(row: list[Axes], values: pd.Series) -> dict[object, float]:
     """Name the groups of bars on the axes; returns the middle of each group."""
     found = [str(value) for value in values.unique()]
-    names = [name if len(name) <= LETTERS else f"...{name[-LETTERS:]}" for name in found]
+    names = [name if len(name) <= GROUP_LETTERS else f"...{name[-GROUP_LETTERS:]}" for name in found]
     turned = {"rotation": 20, "ha": "right"} if sum(map(len, names)) > 30 else {}
     for ax in row:
         ax.set_xticks(range(len(found)), names, fontsize=SMALL, **turned)

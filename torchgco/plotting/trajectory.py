@@ -20,14 +20,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.obstacles.base import ADMITTED
+from torchgco.plotting.bodies import ABOVE as ABOVE
+from torchgco.plotting.bodies import SIDE as SIDE
+from torchgco.plotting.bodies import Plane as Plane
+from torchgco.plotting.style import EDGE as EDGE
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT
 
-Plane = tuple[int, int]
-ABOVE: Plane = (0, 1)
-SIDE: Plane = (0, 2)
 # Cool to warm without the green of the plan and the red of the crosses.
 NEAR_TO_FAR = LinearSegmentedColormap.from_list("near_to_far", ["#1B4F9C", "#6A51A3", "#C2608F", "#EE8F3C", "#FBC02D"])
-STONE, EDGE = "#DDD8CD", "#A39B8B"
+STONE = "#DDD8CD"
+LIMIT, GUIDED = "#C62828", "#C9E0F4"
 CROSS, PLAN, SAMPLE, REGION = "#D00000", PALETTE[2], "#8CC8EA", "#BFE5D3"
 
 

@@ -13,11 +13,11 @@ from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
-from torchgco.plotting.bodies import Ball, Body, Box, Plane
+from torchgco.plotting.bodies import Ball, Box, Plane, Solid
 from torchgco.plotting.scene import Scene
 from torchgco.problem.problem import Problem
 
-GRID = 160  # points along x at which the distance from other kinds of obstacles is looked at
+GRID_POINTS = 160  # points along x at which the distance from other kinds of obstacles is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def world_of(problem: Problem, b: int) -> World:
         InputError: dynamics without a position.
     """
     one = problem.take(torch.tensor([b], device=problem.x0.device))
-    by_radius: dict[float, list[Body]] = {}
+    by_radius: dict[float, list[Solid]] = {}
     others, maps = [], []
     for whole in one.obstacles:
         part = whole.inscribed
@@ -75,7 +75,7 @@ def world_of(problem: Problem, b: int) -> World:
     if one.goal is not None:
         goal, radius = one.goal.position.cpu().numpy(), float(one.goal.radius[0])
     dt = float(getattr(one.dynamics, "dt", None) or 0.0)
-    none: dict[float, list[Body]] = {} if maps else {0.0: []}
+    none: dict[float, list[Solid]] = {} if maps else {0.0: []}
     scenes = [
         Scene((tuple(held),), start, goal, vehicle, radius, dt, np.array([b]))
         for vehicle, held in (by_radius or none).items()
@@ -84,7 +84,7 @@ def world_of(problem: Problem, b: int) -> World:
     return World(tuple(scenes), tuple(others), tuple(one.obstacles))
 
 
-def _bodies(part: BoundSpheres | BoundBoxes | BoundOscillatingBoxes) -> list[Body]:
+def _bodies(part: BoundSpheres | BoundBoxes | BoundOscillatingBoxes) -> list[Solid]:
     if isinstance(part, BoundOscillatingBoxes):
         swings = torch.stack((part.amplitudes[0], part.rates[0], part.phases[0]), dim=1).cpu().numpy()
         here = swings[~part.absent[0].cpu().numpy()]
@@ -109,8 +109,8 @@ def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, 
     like = part.vehicle_radius
     wide, high_ = (high - low)[[first, second]]
     x, y = np.meshgrid(
-        np.linspace(low[first], high[first], GRID),
-        np.linspace(low[second], high[second], max(2, round(GRID * float(high_ / wide)))),
+        np.linspace(low[first], high[first], GRID_POINTS),
+        np.linspace(low[second], high[second], max(2, round(GRID_POINTS * float(high_ / wide)))),
     )
     points = np.full((x.size, len(low)), at)
     points[:, first], points[:, second] = x.ravel(), y.ravel()

@@ -28,9 +28,9 @@ from torchgco.dynamics.names import check_names
 from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
-LOST = 1e-2  # share of a derivative by which differences may disagree
+DERIVATIVE_SHARE = 1e-2  # share of a derivative by which differences may disagree
 NOISE = 8.0  # times the rounding error of a difference, or its change with the step
-APART = "values of a problem that depend on its own row alone; numbers per problem belong in `values` or `batched`"
+OWN_ROW = "values of a problem that depend on its own row alone; numbers per problem belong in `values` or `batched`"
 
 ANY_AXES = (
     "the same numbers of a state and control whatever axes lie before the last, (B, n), (B, K, n) or (B, S, n), and "
@@ -277,10 +277,10 @@ def _check_values(
     if both.numel() == 0:
         return both.shape
     for i in (0, 1):
-        alone = _called(field, APART, function, rows[i : i + 1], *(z[i : i + 1] for z in arguments))
-        _check_tensor(field, alone, (1, *both.shape[1:]), both.dtype, APART)
+        alone = _called(field, OWN_ROW, function, rows[i : i + 1], *(z[i : i + 1] for z in arguments))
+        _check_tensor(field, alone, (1, *both.shape[1:]), both.dtype, OWN_ROW)
         if bool(unlike(alone, both[i : i + 1]).any()):
-            raise InputError(field, APART, "other values for a problem alone than beside another one")
+            raise InputError(field, OWN_ROW, "other values for a problem alone than beside another one")
     return both.shape
 
 
@@ -296,16 +296,16 @@ def _check_among_all(
     if B <= 2:
         return
     many = [torch.cat((z[:1].expand(B - 1, *z.shape[1:]), z[1:])) for z in arguments]
-    found = _called(field, APART, function, torch.arange(B, device=rows.device), *many)
-    two = _called(field, APART, function, rows, *arguments)
+    found = _called(field, OWN_ROW, function, torch.arange(B, device=rows.device), *many)
+    two = _called(field, OWN_ROW, function, rows, *arguments)
     if found.shape != (B, *two.shape[1:]) or bool(unlike(found[[0, -1]], two).any()):
-        raise InputError(field, APART, f"other values among {B} problems than among two")
+        raise InputError(field, OWN_ROW, f"other values among {B} problems than among two")
 
 
 def _check_apart(field: str, function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> None:
     """Check that function(rows, *arguments) of two problems is the same beside a third one, whatever that holds."""
     if mixes_problems(function, rows, *arguments):
-        raise InputError(field, APART, "values that change with those of another problem")
+        raise InputError(field, OWN_ROW, "values that change with those of another problem")
 
 
 def _check_axes(
@@ -350,7 +350,7 @@ def _check_slope(
         along = lambda t, dx=dx, du=du: function(x + t * dx, u + t * du)
         wide, close = ((along(t) - along(-t)) / (2.0 * t) for t in (h, 0.25 * h))
         rounding = NOISE * eps * along(0.0).abs() / (0.25 * h)
-        unsure = NOISE * (wide - close).abs() + rounding + LOST * torch.maximum(given.abs(), close.abs())
+        unsure = NOISE * (wide - close).abs() + rounding + DERIVATIVE_SHARE * torch.maximum(given.abs(), close.abs())
         wrong = ((given - close).abs() > unsure) & torch.isfinite(close)
         if bool(wrong.any()):
             b = wrong.nonzero()[0, 0]

@@ -23,7 +23,7 @@ from torchgco.problem.free_start import moved_inside
 from torchgco.problem.goal import Goal, with_goal, without_goal
 
 # A goal that is only stated changes no minimum: where its tensors ask for gradients they are refused when it is bound.
-PARTS = "dynamics", "cost", "constraints", "x0", "time"
+GIVEN_PARTS = "dynamics", "cost", "constraints", "x0", "time"
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Given:
 def _live(fields: Mapping[str, Any]) -> tuple[str, ...]:
     """The fields whose tensors may ask for gradients."""
     goal = fields["goal"]
-    return (*PARTS, "goal") if isinstance(goal, Goal) and goal.required is True else PARTS
+    return (*GIVEN_PARTS, "goal") if isinstance(goal, Goal) and goal.required is True else GIVEN_PARTS
 
 
 def place(part: Any, parts: Sequence[Any]) -> int | None:

@@ -19,7 +19,7 @@ from torchgco.base.shapes import lead
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
-from torchgco.constraints.norms import AWAY
+from torchgco.constraints.norms import NO_ROW
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -32,7 +32,7 @@ from torchgco.problem.in_time import in_time
 from torchgco.problem.problem import Problem
 from torchgco.problem.rates import with_controls_before
 
-FORM = "within horizons"  # what is kept with the form of the problem for this one
+HORIZONS_FORM = "within horizons"  # what is kept with the form of the problem for this one
 
 
 def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
@@ -63,7 +63,7 @@ def within_horizons(problem: Problem) -> Problem:
         "cost": _cost(problem, running),
         "constraints": tuple(_constraint(problem, i) for i in range(len(problem.constraints))),
     }
-    return problem._with(parts, known=problem.known.of_lifted(FORM))
+    return problem._with(parts, known=problem.known.of_lifted(HORIZONS_FORM))
 
 
 def at_rest_after(problem: Problem, U: Tensor) -> Tensor:
@@ -267,7 +267,7 @@ class _Rows(WrappedConstraint):
     batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else AWAY)
+        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else NO_ROW)
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         return self._where(self.constraint.violation(X, U), 0.0)
@@ -275,7 +275,7 @@ class _Rows(WrappedConstraint):
     def at(self, x: Tensor, k: int) -> Tensor:
         rows, knots = self.constraint.at(x, k), self.knots
         place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
-        return torch.where(self.counts[:, place, None, None] > 0, rows, AWAY)
+        return torch.where(self.counts[:, place, None, None] > 0, rows, NO_ROW)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)

@@ -27,7 +27,7 @@ from torchgco.problem.free_time import FreeTime
 from torchgco.problem.problem import Problem
 from torchgco.problem.rates import IN_PLACE
 
-FORM = "in free time"  # what is kept with the form of the problem for this one
+FREE_TIME_FORM = "in free time"  # what is kept with the form of the problem for this one
 PIN = 1e-3  # cost of a next tau that nobody reads, per unit squared, as a share of that of the nominal stages' time
 EQUAL = 1e-6  # difference of two stages of a segment, as a share of the duration: that of times in single precision
 
@@ -56,7 +56,7 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
         "free_start": pad(pad(free, (0, 1), value=True), (0, x0.shape[1] - problem.n - 1)),
         "time": None,
     }
-    whole = problem._with(parts, known=problem.known.of_lifted(f"{FORM} {time.segments}"))
+    whole = problem._with(parts, known=problem.known.of_lifted(f"{FREE_TIME_FORM} {time.segments}"))
     rows = tuple(_constraint(c, problem) for c in problem.constraints)
     object.__setattr__(whole, "constraints", (*rows, *_bounds(whole, time, problem.n)))
     return whole

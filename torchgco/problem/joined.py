@@ -19,8 +19,8 @@ from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.recorder import looks_at_values
 
 FOREIGN = (torch.nan, torch.inf, -torch.inf)
-SIZES = (1.0, 1e3, 1e6)  # of drawn numbers
-NEAR = 1e-3  # by which a neighbour of a row differs, as a share of 1 + |x|
+DRAWN_SIZES = (1.0, 1e3, 1e6)  # of drawn numbers
+NEIGHBOUR_STEP = 1e-3  # by which a neighbour of a row differs, as a share of 1 + |x|
 
 Rows = Callable[..., Tensor]  # of problems (b,) int64, knots (K,) int64 and arguments (b, K, ...): rows (b, K, ...)
 
@@ -90,8 +90,8 @@ def _forms_differ(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[T
 def _suspect(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> int | None:
     """`joined_knots`, and the place of one that changes where the function branches on values."""
     K, one = len(k), rows[:1]
-    drawn = [torch.cat((z, *(size * scattered(z[:1]) for size in SIZES))) for z in arguments]
-    more = torch.cat((rows, one.expand(len(SIZES))))
+    drawn = [torch.cat((z, *(size * scattered(z[:1]) for size in DRAWN_SIZES))) for z in arguments]
+    more = torch.cat((rows, one.expand(len(DRAWN_SIZES))))
     found, each = _tried(together, more, k, *drawn), _tried(alone, more, k, *drawn)
     if found is None or each is None:  # it refuses such states
         found, each = together(rows, k, *arguments), alone(rows, k, *arguments)
@@ -117,7 +117,7 @@ def _foreign(*rows: Tensor) -> Iterator[list[Tensor]]:
     for value in FOREIGN:
         yield [torch.full_like(z[:1], value) for z in rows]
     for z in zip(*(z.split(1) for z in rows), strict=True):
-        yield [part + NEAR * (1.0 + part.abs()) * scattered(part) for part in z]
+        yield [part + NEIGHBOUR_STEP * (1.0 + part.abs()) * scattered(part) for part in z]
 
 
 def _tried(function: Callable[..., Tensor], *arguments: Tensor | int) -> Tensor | None:

@@ -25,7 +25,7 @@ from torchgco.problem.problem import Problem
 
 # Besides obstacles, which read the position alone: kinds that find their states and controls among others, too.
 IN_PLACE = (ControlBounds, StateBounds, NormBounds, Cone, Separation, GoalBall)
-FORM = "with controls before"  # what is kept with the form of the problem for this one
+RATES_FORM = "with controls before"  # what is kept with the form of the problem for this one
 
 
 def with_controls_before(problem: Problem) -> Problem:
@@ -45,7 +45,7 @@ def with_controls_before(problem: Problem) -> Problem:
         "x0": torch.cat((x0, before[:, controls].expand(problem.B, -1)), dim=-1),
         "free_start": None if free is None else torch.nn.functional.pad(free, (0, len(controls))),
     }
-    return problem._with(parts, known=problem.known.of_lifted(FORM))
+    return problem._with(parts, known=problem.known.of_lifted(RATES_FORM))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import Quantity, controls_of, states_of
 from torchgco.problem.between import between
 
-TIME = "t [s]"
+TIME_COLUMN = "t [s]"
 ROUNDING = 1e-9  # of a sample: an end this close after one is that sample's
 
 
@@ -38,7 +38,7 @@ def sampled(dynamics: Dynamics | None, X: Tensor, U: Tensor, t: Tensor, rate: fl
         named = [Quantity(f"x[{i}]") for i in range(X.shape[-1])], [Quantity(f"u[{i}]") for i in range(U.shape[-1])]
     else:
         named = states_of(dynamics), controls_of(dynamics)
-    columns = {TIME: t[k] + h}
+    columns = {TIME_COLUMN: t[k] + h}
     columns |= {one.label: x[:, i] for i, one in enumerate(named[0])}
     if dynamics is not None:
         columns |= _of_position(dynamics, x, u, k, {one.name for one in named[0]}) | dynamics.derived(x, u)

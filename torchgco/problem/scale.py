@@ -13,7 +13,7 @@ from torchgco.dynamics.base import Dynamics
 
 LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
 LEAST_COST = 1e-9  # share of the cost of staying at the start, as which a cost counts at least
-BOUNDED, UNBOUNDED = 3e-5, 1e-10  # controls that cost nothing: as shares of their bounds, of 1 at most; without bounds
+BOUNDED, UNLIMITED = 3e-5, 1e-10  # controls that cost nothing: as shares of their bounds, of 1 at most; without bounds
 NARROW = 0.1  # half the range of controls in units that may be too large for a cost to be tried by one of them
 DWARFS = 100.0  # times the rest of the cost: a smaller constant leaves tests relative to the cost meaningful
 
@@ -50,7 +50,7 @@ def cost_scale(
     if stages is not None:
         own = torch.arange(count, device=total.device) < stages.unsqueeze(-1)
         curvatures, N = torch.where(own.unsqueeze(-1), curvatures, 0.0), stages
-    idle, sizes = torch.full_like(curvatures[:, 0], UNBOUNDED), torch.ones_like(curvatures[:, 0])
+    idle, sizes = torch.full_like(curvatures[:, 0], UNLIMITED), torch.ones_like(curvatures[:, 0])
     if bounds is not None:
         half = 0.5 * bounds.range
         idle = torch.where(torch.isfinite(half), BOUNDED * half.clamp(max=1.0), idle)

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from torchgco.roadmap.clearances import Clearances
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.native_maps import PARTS, SURE, Graph, String, Sweep, library_for
+from torchgco.roadmap.native_maps import SURE_SPACINGS, WAY_PARTS, Graph, String, Sweep, library_for
 
-SIDE = 0.8  # of a cell, in vehicle's radii, where that takes no more cells than admitted
-DEEP = 0.2  # vehicle's radii beneath contact that the way between two blocks may lead
-TIE = 1e-6  # m: so much less clear a node counts, per squared step from the middle of its cell
+BLOCK_SIDE = 0.8  # of a cell, in vehicle's radii, where that takes no more cells than admitted
+BENEATH_CONTACT = 0.2  # vehicle's radii beneath contact that the way between two blocks may lead
+NODE_TIE = 1e-6  # m: so much less clear a node counts, per squared step from the middle of its cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class Blocks:
         )  # fmt: skip
         sweep = Sweep(
             graph=graph, weight=_tensor(weight), seed=_tensor(seeds.astype(np.int64)), seed_cost=_tensor(seed_costs),
-            seeds=len(seeds), deepest=-DEEP * self.radius, cost=cost, before=before, end=-1, **goal,
+            seeds=len(seeds), deepest=-BENEATH_CONTACT * self.radius, cost=cost, before=before, end=-1, **goal,
         )  # fmt: skip
         if not library.tgco_sweep(ctypes.byref(sweep)):
             raise MemoryError("native kernels: no memory")
@@ -111,11 +111,11 @@ class Blocks:
         start, end = self.nodes[a], self.nodes[b]
         long = self.lattice.spacing * np.linalg.norm(end - start, axis=1)
         sure = self.own[a].astype(float) + self.own[b] - long > 0
-        parts = PARTS * np.maximum(self.layers[a], self.layers[b]).astype(np.int64)[:, None]
+        parts = WAY_PARTS * np.maximum(self.layers[a], self.layers[b]).astype(np.int64)[:, None]
         shallow = np.ones(len(a), bool)
-        for part in range(1, 2 * PARTS):
+        for part in range(1, 2 * WAY_PARTS):
             middle = (start * (parts - part) + end * part + parts // 2) // parts
-            shallow &= (part >= parts[:, 0]) | (self.lattice.map.at(middle) > -DEEP * self.radius)
+            shallow &= (part >= parts[:, 0]) | (self.lattice.map.at(middle) > -BENEATH_CONTACT * self.radius)
         return sure | shallow
 
     def _by_scipy(self, weight: Array, seeds: NDArray[np.int64], seed_costs: Array) -> tuple[Array, NDArray[np.int32]]:
@@ -153,7 +153,7 @@ def blocks_of(lattice: Lattice, radius: float, most: int, least: float = 0.0, me
         least: clearance, m, above which a block is free.
         merged: whether cells become one block where that is free for sure.
     """
-    size = max(1, round(SIDE * radius / lattice.spacing))
+    size = max(1, round(BLOCK_SIDE * radius / lattice.spacing))
     while np.prod([-(-n // size) for n in lattice.shape], dtype=float) > most:
         size += 1
     merged = merged and lattice.alone
@@ -174,7 +174,7 @@ def _blocks(clearances: Clearances, size: int, least: float, merged: bool) -> tu
     counts[:d] = [-(-int(n) // size) for n in clearances.size]
     middle = ((np.indices([size] * d) - 0.5 * (size - 1)) ** 2).sum(0)
     # Of equally clear nodes the one next to the cell's middle: far from obstacles blocks are evenly spaced then.
-    tie = (TIE * middle).astype(np.float32)
+    tie = (NODE_TIE * middle).astype(np.float32)
     library = library_for(d)
     if library is None:
         return _by_numpy(clearances, counts, size, least, merged, tie)
@@ -236,7 +236,7 @@ def _clearest(
     own = tie.ravel()
     rough, exact = (raw - own).argmax(1), np.where(raw > 0, fine - own, -np.inf).argmax(1)
     most = np.take_along_axis(raw, rough[:, None], axis=1)[:, 0]
-    near = (most > 0) & (most < SURE * clearances.spacing)
+    near = (most > 0) & (most < SURE_SPACINGS * clearances.spacing)
     place = np.where(near, exact, rough)
     clear = np.where(near, np.take_along_axis(fine, exact[:, None], axis=1)[:, 0], most)
     within = np.stack(np.unravel_index(place, [size] * d), axis=-1)

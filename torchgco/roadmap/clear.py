@@ -12,10 +12,10 @@ from torch import Tensor
 
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.mapped import MARGIN, Price, even, in_each, in_one, length, one_of_each_class, ways_of
+from torchgco.roadmap.mapped import CLOSE_UNITS, Price, even, in_each, in_one, length, one_of_each_class, ways_of
 from torchgco.roadmap.search import HOPS
 
-WIDE = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide
+ROOMY = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide
 AVERAGED = 0.8  # units: the standard deviation over which the corners of a path with few of them are averaged
 
 
@@ -32,12 +32,12 @@ def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
     """
 
     def search(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
-        ways = ways_of(lattice, ends, price, radius, WIDE * unit)
+        ways = ways_of(lattice, ends, price, radius, ROOMY * unit)
         if ways is None:
             return []
         if lattice.d == 3:
             return [ways.path(int(ways.total.argmin()))]
-        wide, near = one_of_each_class(ways), one_of_each_class(ways.nearer(MARGIN * unit))
+        wide, near = one_of_each_class(ways), one_of_each_class(ways.nearer(CLOSE_UNITS * unit))
         kinds = dict.fromkeys([*list(wide)[:count], *list(near)[:count]])
         return [ways.path(wide[kind]) for kind in kinds if kind in wide]
 
@@ -46,11 +46,11 @@ def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
 
 def _clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
     """The cheapest path (HOPS+1, d), its corners averaged; none, or one."""
-    ways = ways_of(lattice, ends, price, radius, WIDE * unit)
+    ways = ways_of(lattice, ends, price, radius, ROOMY * unit)
     if ways is None:
         return []
     path = ways.path(int(ways.total.argmin()))
-    step = max(lattice.spacing, length(path) / (HOPS * WIDE))
+    step = max(lattice.spacing, length(path) / (HOPS * ROOMY))
     points = even(path, max(2, int(np.ceil(length(path) / step)) + 1))
     inner = gaussian_filter1d(points, AVERAGED * unit / step, axis=0, mode="nearest")
     return [even(np.concatenate((ends[:1], inner[1:-1], ends[1:])), HOPS + 1)]

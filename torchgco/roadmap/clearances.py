@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from torchgco.roadmap.native_maps import SURE, Map, map_of, measured
+from torchgco.roadmap.native_maps import SURE_SPACINGS, Map, map_of, measured
 
 Nodes = NDArray[np.int64]
 Numbers = NDArray[np.float64]
 
-WEIGHTS = (0.125, 0.75, 0.125)  # of a quadratic B-spline at a node, along each axis
+SPLINE_WEIGHTS = (0.125, 0.75, 0.125)  # of a quadratic B-spline at a node, along each axis
 
 
 class Clearances:
@@ -68,7 +68,7 @@ class Clearances:
         """Clearances (...) at nodes (..., d), m."""
         distance, held, beyond = self.distances(nodes)
         if self.smooth:
-            near = distance < self.limit + SURE * self.spacing
+            near = distance < self.limit + SURE_SPACINGS * self.spacing
             distance[near] = self._interpolated(held[near])
         return np.where(beyond > 0, np.sqrt(np.maximum(distance, 0.0) ** 2 + beyond), distance) - self.limit
 
@@ -78,7 +78,7 @@ class Clearances:
         square = np.zeros(len(held))
         for steps in product((-1, 0, 1), repeat=self.d):
             near = self.values[tuple(np.clip(held + steps, 0, last).T)].astype(float)
-            weight = np.prod([WEIGHTS[step + 1] for step in steps])
+            weight = np.prod([SPLINE_WEIGHTS[step + 1] for step in steps])
             square += weight * np.where(near < core, core * (2.0 * near - core), near * near)
         square -= 0.25 * self.d * h * h
         return np.where(

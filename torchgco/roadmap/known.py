@@ -15,7 +15,7 @@ from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.points import of_boxes
 from torchgco.roadmap.search import Graph, TorchSearch
 
-KEPT = 2**26  # bytes of graphs and points that are kept for later searches in a scene
+BYTES_KEPT = 2**26  # bytes of graphs and points that are kept for later searches in a scene
 
 
 class Course:
@@ -107,6 +107,6 @@ class Known:
         return points, exists
 
     def _fits(self, size: int) -> bool:
-        fits = self._size + size <= KEPT
+        fits = self._size + size <= BYTES_KEPT
         self._size += size if fits else 0
         return fits

@@ -19,10 +19,10 @@ from torchgco.roadmap.clearances import Clearances
 Array = NDArray[np.float64]
 
 NEXT = 2  # nodes around start and goal from which a way may begin
-KEPT = 8  # maps whose clearances are kept, the most recent ones, by field
-AROUND = 2.0  # vehicle's radii, and at least so many spacings, that the lattice extends beyond a map
-BESIDE = 1.3  # times as large as they are, spheres and boxes beside a map lie within the lattice
-LARGEST = 2**24  # nodes of a lattice; one that would need more doesn't extend to start and goal
+MAPS_KEPT = 8  # maps whose clearances are kept, the most recent ones, by field
+LATTICE_REACH = 2.0  # vehicle's radii, and at least so many spacings, that the lattice extends beyond a map
+BESIDE_MAP = 1.3  # times as large as they are, spheres and boxes beside a map lie within the lattice
+LATTICE_NODES = 2**24  # nodes of a lattice; one that would need more doesn't extend to start and goal
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def lattice_of(fields: Sequence[BoundField], solids: Sequence[Solids], ends: Arr
     points = [ends]
     for part in present:
         here, reach = ~part.absent[0], part.extent[0] + part.radii[0].unsqueeze(-1)
-        points += [(part.centers[0] + side * BESIDE * reach)[here].numpy() for side in (-1.0, 1.0)]
+        points += [(part.centers[0] + side * BESIDE_MAP * reach)[here].numpy() for side in (-1.0, 1.0)]
     clearances = _clearances(first, np.concatenate(points))
     origin = np.asarray(first.origins[0].numpy() - first.field.spacing * clearances.low, np.float64)
     return Lattice(clearances, origin, tuple(others), present)
@@ -142,11 +142,11 @@ def _clearances(field: BoundField, points: Array) -> Clearances:
     """
     R, which = float(field.vehicle_radius[0]), int(field.which[0])
     h, shape = field.field.spacing, np.array(field.field.values.shape[1:])
-    room = int(np.ceil(max(AROUND * R / h, AROUND)))
+    room = int(np.ceil(max(LATTICE_REACH * R / h, LATTICE_REACH)))
     low, high = np.full(len(shape), room), np.full(len(shape), room)
     reach = np.floor((points - field.origins[0].numpy()) / h)
     before, after = np.maximum(low, room - reach.min(0)), np.maximum(high, reach.max(0) + room - shape + 1)
-    if np.prod(before + shape + after) <= max(LARGEST, np.prod(shape + 2.0 * room)):
+    if np.prod(before + shape + after) <= max(LATTICE_NODES, np.prod(shape + 2.0 * room)):
         low, high = before.astype(int), after.astype(int)
     key = (which, R, field.smooth, *low, *high)
     kept = _kept.setdefault(field.field, {})
@@ -154,7 +154,7 @@ def _clearances(field: BoundField, points: Array) -> Clearances:
         values, smooth = field.field.values[which], field.smooth and not bool(field.absent[0, 0])
         numbers = float(field.cores[0]), float(field.limits[0])
         kept[key] = Clearances(values, low, low + shape + high, h, *numbers, smooth)
-        while len(kept) > KEPT:
+        while len(kept) > MAPS_KEPT:
             del kept[next(iter(kept))]
     return kept[key]
 

@@ -30,21 +30,21 @@ from torchgco.roadmap.search import DIVERSITY, HOPS
 # further searches where there is no path yet. Through gaps with less clearance than the nodes are apart no trajectory
 # may fit between its knots.
 SEARCHES = ((2**18, 0.5, True), (2**18, 0.5, False), (2**18, 0.0, False), (2**21, 0.0, False))
-MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
-LEAST = 1e-6  # of the price: no edge may cost nothing
-LONGEST = 2.0  # times as expensive as the cheapest one other paths may be
+CLOSE_UNITS = 0.5  # of closeness: within so many units an edge costs up to double
+LEAST_PRICE = 1e-6  # of the price: no edge may cost nothing
+MOST_EXPENSIVE = 2.0  # times as expensive as the cheapest one other paths may be
 TRIED = 3  # candidates per path in space that are drawn taut, and compared with those before
 COMPARED = 32  # points of a path that are compared
-SAMPLES = 16  # along each axis, at which the price is evaluated
+PRICE_SAMPLES = 16  # along each axis, at which the price is evaluated
 WINDOW = np.arange(-2, 3)  # blocks next to start and goal at which ways begin
-ROUNDS = 4  # of drawing taut, at most, and the gain in length, as a share, below which there is no further one
+TAUT_ROUNDS = 4  # of drawing taut, at most, and the gain in length, as a share, below which there is no further one
 LITTLE = 1e-3
 WINDOWS = (8, 16, 64, 10**6)  # points ahead that are looked at together
 POINTS = 96  # of a path that is drawn taut
-SHORT = 10  # segments, at least, of a path that keeps off others, which it would be drawn onto
-STEPS = 0.5  # units between points at which it is looked for what is near a path
-ROUNDING = 1e-9  # m
-KEY = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
+LEAST_SEGMENTS = 10  # segments, at least, of a path that keeps off others, which it would be drawn onto
+PATH_STEPS = 0.5  # units between points at which it is looked for what is near a path
+MAPPED_ROUNDING = 1e-9  # m
+REGION_SEED = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
 
 Price = Callable[[Array], Array]  # per metre at points (V, d)
 Search = Callable[[Lattice, Array, Price, float, float], list[Array]]  # with the vehicle's radius and the unit, m
@@ -113,7 +113,7 @@ class Ways:
         close = 1.0 + (np.clip(1.0 - blocks.clearance / margin, 0.0, 1.0) if margin > 0.0 else 0.0)  # 0: no obstacles
         rate = _smoothed(price, self.points, blocks.counts)
         usable = (blocks.clearance > least) & np.isfinite(rate)
-        self.weight = np.where(usable, np.maximum(rate, 0.0) * close + LEAST, np.inf)
+        self.weight = np.where(usable, np.maximum(rate, 0.0) * close + LEAST_PRICE, np.inf)
         self.costs, self.seeds = np.empty((2, len(self.weight))), list[tuple[NDArray[np.int64], Array]]()
         self.before = np.empty((2, len(self.weight)), np.int32)
         for i, end in enumerate(ends):
@@ -155,11 +155,11 @@ class Ways:
         """The cheapest way where prices are raised, with corners left out that are near."""
         way = self.blocks.another(raised, *self.seeds[0], self.costs[1], self.before[1])
         path = np.concatenate((self.ends[:1], self.points[way], self.ends[1:]))
-        return tightened(self.blocks.lattice, path, self.least, length(path) / SHORT)
+        return tightened(self.blocks.lattice, path, self.least, length(path) / LEAST_SEGMENTS)
 
     def near(self, path: Array, unit: float) -> NDArray[np.int64]:
         """The blocks nearer than `unit`, m, to a path, which is looked at in steps."""
-        lists = self.tree.query_ball_point(_dense(path, STEPS * unit), unit)
+        lists = self.tree.query_ball_point(_dense(path, PATH_STEPS * unit), unit)
         return np.unique(np.concatenate([np.asarray(some, np.int64) for some in lists]))
 
     @cached_property
@@ -179,11 +179,11 @@ class Ways:
 def _smoothed(price: Price, points: Array, counts: tuple[int, ...]) -> Array:
     """Prices (V,) at points, interpolated between a few of them: costs are smooth, and may be expensive to evaluate."""
     low, high, d = points.min(0), points.max(0), points.shape[1]
-    sizes = [min(n + 1, SAMPLES) for n in counts[:d]]
+    sizes = [min(n + 1, PRICE_SAMPLES) for n in counts[:d]]
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, sizes, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     values = price(grid.reshape(-1, d)).reshape(sizes)
-    share = (points - low) / np.maximum(high - low, ROUNDING) * (np.array(sizes) - 1)
+    share = (points - low) / np.maximum(high - low, MAPPED_ROUNDING) * (np.array(sizes) - 1)
     return map_coordinates(values, share.T, order=1, mode="nearest")
 
 
@@ -191,7 +191,7 @@ def paths(
     lattice: Lattice, ends: Array, price: Price, radius: float, unit: float, count: int, corners: int
 ) -> list[Array]:
     """Up to `count` taut paths (P, d), P <= corners, between two points (2, d), the cheapest first."""
-    ways = ways_of(lattice, ends, price, radius, MARGIN * unit)
+    ways = ways_of(lattice, ends, price, radius, CLOSE_UNITS * unit)
     if ways is None:
         return []
     found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
@@ -230,7 +230,7 @@ def one_of_each_class(ways: Ways) -> dict[int, int]:
     order = np.argsort(total[live], kind="stable")
     _, first = np.unique(kind[order], return_index=True)
     chosen = order[np.sort(first)]
-    chosen = chosen[total[live[chosen]] <= LONGEST * total[live[chosen[0]]]]
+    chosen = chosen[total[live[chosen]] <= MOST_EXPENSIVE * total[live[chosen[0]]]]
     return dict(zip(kind[chosen].tolist(), live[chosen].tolist(), strict=True))
 
 
@@ -253,7 +253,7 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
     ends = np.flatnonzero(np.isfinite(begins))
     best = float(total.min())
     shares = (ways.costs[0][ends] - begins[ends]) / best
-    ends, shares = ends[total[ends] <= LONGEST * best], shares[total[ends] <= LONGEST * best]
+    ends, shares = ends[total[ends] <= MOST_EXPENSIVE * best], shares[total[ends] <= MOST_EXPENSIVE * best]
     order = np.argsort(total[ends] / best - shares, kind="stable")[: TRIED * count]
     found = [ways.taut(int(total.argmin()))]
     for v in ends[order]:
@@ -296,7 +296,7 @@ def _apart(points: Array, other: Array) -> float:
     """The largest distance of points (P, d) from a path, m."""
     a, along = other[:-1], np.diff(other, axis=0)
     toward = points[:, None] - a
-    share = (toward * along).sum(-1) / np.maximum((along * along).sum(-1), ROUNDING)
+    share = (toward * along).sum(-1) / np.maximum((along * along).sum(-1), MAPPED_ROUNDING)
     gap = toward - np.clip(share, 0.0, 1.0)[..., None] * along
     return float(np.sqrt((gap * gap).sum(-1).min(1).max()))
 
@@ -306,7 +306,7 @@ def _apart(points: Array, other: Array) -> float:
 
 def keys(count: int) -> NDArray[np.int64]:
     """Numbers that stand for blocked regions: sums of different ones differ but by rarest chance."""
-    return np.random.default_rng(KEY).integers(-(2**62), 2**62, count, dtype=np.int64)
+    return np.random.default_rng(REGION_SEED).integers(-(2**62), 2**62, count, dtype=np.int64)
 
 
 def swept(lattice: Lattice, path: Array) -> int:
@@ -367,7 +367,7 @@ def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
 
 def least_at(lattice: Lattice, ends: Array) -> float:
     """The clearance of what begins or ends there: an end may be nearer to the map than the constraint admits."""
-    return min(0.0, *lattice.at(ends)) - ROUNDING
+    return min(0.0, *lattice.at(ends)) - MAPPED_ROUNDING
 
 
 def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf) -> Array:
@@ -377,7 +377,7 @@ def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf
         least: clearance of its first and its last segment, m.
         reach: the longest segment, m: with one, corners are left out once.
     """
-    rounds = ROUNDS if reach == np.inf else 0
+    rounds = TAUT_ROUNDS if reach == np.inf else 0
     taut = searched.tightened(lattice, path, least, reach, POINTS, rounds, LITTLE)
     if taut is not None:
         return taut

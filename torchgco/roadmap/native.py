@@ -19,16 +19,16 @@ from torchgco.native.engine import run
 from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
-from torchgco.roadmap.points import MIDWAY, RAYS, SHELLS, directions, of_boxes
-from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Beside, Graph
+from torchgco.roadmap.points import CIRCLE, MIDWAY, SHELLS, directions, of_boxes
+from torchgco.roadmap.search import EDGE_COST, HOPS, LEAST_GAP, TIE, UNIT, Beside, Graph
 
-PROBLEMS_AT_ONCE = 64  # problems searched together
+SEARCHES_AT_ONCE = 64  # problems searched together
 GROUP = 4  # of them, at least so many by each thread
-BLOCK, SIDE = 32, 8  # edges measured side by side; of those near a box, so many at once
+BLOCK, EDGES_AT_ONCE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
-SEARCH, BOXES = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
+SEARCH_SOURCE, BOXES_SOURCE = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
 BOX = Path(__file__).parents[1] / "native" / "c" / "box.h"
-# What box.h needs, for SIDE edges in a vector.
+# What box.h needs, for EDGES_AT_ONCE edges in a vector.
 VECTORS = """
 typedef double V __attribute__((vector_size(SIDE * sizeof(double))));
 typedef __typeof__((V){0} == (V){0}) I;
@@ -81,7 +81,7 @@ class NativeSearch:
         (B, d), (spheres, boxes, _) = start.shape, self.obstacles
         M = spheres.radii.shape[1]
         rays, shell = directions(start, goal), start.new_tensor(SHELLS[d])
-        count, more = M * (RAYS * len(shell) + min(MIDWAY, M)), {}
+        count, more = M * (CIRCLE * len(shell) + min(MIDWAY, M)), {}
         reach = torch.stack(self.obstacles.region(start, goal), dim=1)
         if boxes is not None:
             more["beside"], more["exists"] = beside or of_boxes(boxes, spheres, start, goal)
@@ -92,7 +92,7 @@ class NativeSearch:
             "tgco_graph",
             {"start": start, "goal": goal, "reach": reach, "cube": cube, "rays": rays, "shell": shell, **more},
             {"nodes": made.points, "ends": made.ends, "lengths": made.lengths},
-            spread=len(cube), candidates=count, points=V, edges=K, neighbours=neighbours, hubs=hubs, directions=RAYS,
+            spread=len(cube), candidates=count, points=V, edges=K, neighbours=neighbours, hubs=hubs, directions=CIRCLE,
             shells=len(shell), midway=MIDWAY, extras=more["beside"].shape[1] if more else 0,
         )  # fmt: skip
         return made
@@ -137,7 +137,7 @@ class NativeSearch:
         if boxes is not None:
             more = {"boxes": boxes.radii.shape[1], "box": _numbers(boxes), "largest": boxes.sizes.amax(-1).contiguous()}
         return Arguments(
-            spheres=M, corners=HOPS + 1, margin=self.margin, clear=CLEAR, least=EDGE_COST, tie=TIE,
+            spheres=M, corners=HOPS + 1, margin=self.margin, clear=LEAST_GAP, least=EDGE_COST, tie=TIE,
             centers=spheres.centers.contiguous(), distances=marked(spheres.radii, spheres.absent).contiguous(), **more,
         )  # fmt: skip
 
@@ -162,10 +162,12 @@ def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
 @functools.cache
 def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
     # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
-    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL, "BLOCK": BLOCK, "SIDE": SIDE}
-    own = [VECTORS, BOX.read_text(), BOXES.read_text()] if boxes else []
+    constants = {
+        "DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": UNIT, "BLOCK": BLOCK, "SIDE": EDGES_AT_ONCE,
+    }  # fmt: skip
+    own = [VECTORS, BOX.read_text(), BOXES_SOURCE.read_text()] if boxes else []
     try:
-        return load("\n".join((head([Arguments], [], constants), *own, SEARCH.read_text())), [Arguments])
+        return load("\n".join((head([Arguments], [], constants), *own, SEARCH_SOURCE.read_text())), [Arguments])
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

@@ -15,8 +15,8 @@ from torchgco.kernels import EagerWarning, native
 from torchgco.native.compiler import Compiler, NativeError, find_compiler
 from torchgco.native.declarations import Structure, fields, head, load
 
-SURE = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
-PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at
+SURE_SPACINGS = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
+WAY_PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at
 SOURCE = Path(__file__).parent / "c" / "lattice.c"
 
 
@@ -86,7 +86,7 @@ def library_for(d: int) -> ctypes.CDLL | None:
 def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
     structures = [Map, Graph, Sweep, String]
     try:
-        declared = head(structures, [], {"DIM": d, "PARTS": PARTS, "SURE": SURE})
+        declared = head(structures, [], {"DIM": d, "PARTS": WAY_PARTS, "SURE": SURE_SPACINGS})
         return load(f"{declared}\n{SOURCE.read_text()}", structures)
     except NativeError as error:
         warnings.warn(f"paths in maps are sought by SciPy: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)

@@ -14,7 +14,7 @@ from torchgco.base.tree import take
 from torchgco.obstacles.base import TINY, Solids
 from torchgco.obstacles.box_geometry import Coordinates, Cuboids, at_share, nearest
 
-RAYS = 8  # points of a circle
+CIRCLE = 8  # points of a circle
 SHELLS = {2: (1.05, 1.3), 3: (1.15,)}  # radii of the circles of points around a sphere, by the number of coordinates
 MIDWAY = 4  # nearest neighbours of an obstacle: each gap to one gets a point
 PROJECTIONS = 8  # projections from one box to the other and back; the two points converge to the nearest of both
@@ -26,7 +26,7 @@ def around_spheres(spheres: Solids, start: Tensor, goal: Tensor) -> tuple[Tensor
     rays, shells = directions(start, goal).unsqueeze(1), SHELLS[start.shape[1]]
     o, R = spheres.centers.unsqueeze(2), spheres.radii
     points = [(o + (shell * R)[..., None, None] * rays).flatten(1, 2) for shell in shells]
-    return torch.cat(points, dim=1), (~spheres.absent).repeat_interleave(RAYS, dim=1).repeat(1, len(shells))
+    return torch.cat(points, dim=1), (~spheres.absent).repeat_interleave(CIRCLE, dim=1).repeat(1, len(shells))
 
 
 def between_spheres(spheres: Solids) -> tuple[Tensor, Tensor]:
@@ -37,8 +37,8 @@ def between_spheres(spheres: Solids) -> tuple[Tensor, Tensor]:
 
 
 def directions(start: Tensor, goal: Tensor) -> Tensor:
-    """Unit vectors (B, RAYS, d): all around in the plane, across the line from start to goal (B, d) in space."""
-    angle = torch.arange(RAYS, dtype=start.dtype, device=start.device).view(-1, 1) * (2.0 * math.pi / RAYS)
+    """Unit vectors (B, CIRCLE, d): all around in the plane, across the line from start to goal (B, d) in space."""
+    angle = torch.arange(CIRCLE, dtype=start.dtype, device=start.device).view(-1, 1) * (2.0 * math.pi / CIRCLE)
     cos, sin = angle.cos(), angle.sin()
     if start.shape[1] == 2:
         return torch.cat((cos, sin), dim=-1).expand(start.shape[0], -1, -1)

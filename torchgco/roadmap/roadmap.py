@@ -75,7 +75,7 @@ class Roadmap:
         if scene.obstacles.maps:
             return paths_in_maps(scene if rows is None else scene.take(rows), count, self.max_overlap)
         library = roadmap.library_for(scene.start, scene.obstacles.boxes is not None)
-        most = PROBLEMS_AT_ONCE if library is None else roadmap.PROBLEMS_AT_ONCE
+        most = PROBLEMS_AT_ONCE if library is None else roadmap.SEARCHES_AT_ONCE
         B, d = scene.start.shape
         rows = torch.arange(B, device=scene.start.device) if rows is None else rows
         place, found = torch.full((B,), -1, device=rows.device), torch.zeros_like(rows, dtype=torch.bool)

@@ -17,7 +17,7 @@ from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
 
-LITTLE = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
+LEAST_STAGE_COST = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
 S = TypeVar("S", bound=Solids)
 FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
 
@@ -89,7 +89,7 @@ def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor
     sizes = scene.obstacles.scales
     R = sizes.sum(-1) / (sizes > 0).sum(-1).clamp(min=1)
     resting = _resting_cost(problem.cost, problem.x0, rest[:, :1], problem.position, scene.start.unsqueeze(1))[:, 0]
-    ends_matter = (resting.abs() < LITTLE) & (scene.start != scene.goal).any(-1)
+    ends_matter = (resting.abs() < LEAST_STAGE_COST) & (scene.start != scene.goal).any(-1)
     return R, torch.where(ends_matter, 1.0, resting) / R.pow(4)
 
 

@@ -21,10 +21,10 @@ from torchgco.roadmap.points import around_spheres, between_spheres, of_boxes
 
 HOPS = 64  # edges of a path, at most
 DIVERSITY = 1.0  # extra cost of later paths, as a share, next to an earlier one
-CLEAR = 0.001  # smallest gap between a point and all obstacles, as a share of the largest r_obs + r_veh
+LEAST_GAP = 0.001  # smallest gap between a point and all obstacles, as a share of the largest r_obs + r_veh
 TIE = 1e-12  # share of the cost by which equally cheap paths may differ
 EDGE_COST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing
-SMALL = 1e-9  # m: the margin's unit is at least this
+UNIT = 1e-9  # m: the margin's unit is at least this
 CLASS = 8  # paths are drawn taut in groups: those of up to 8 edges, of up to 16, ...
 
 
@@ -158,8 +158,8 @@ class TorchSearch:
         return torch.where(taken.unsqueeze(-1), _rows(points, best), start.unsqueeze(1)), taken
 
     def _is_free(self, points: Tensor) -> Tensor:
-        """Whether points (B, V, d) are clear of all obstacles by CLEAR times the largest size."""
-        gap = CLEAR * self.obstacles.largest
+        """Whether points (B, V, d) are clear of all obstacles by LEAST_GAP times the largest size."""
+        gap = LEAST_GAP * self.obstacles.largest
         return torch.stack([_outside(part, part.squares(points), gap) for part in self.obstacles.kinds]).all(0)
 
     def _lengths(self, points: Tensor, ends: Tensor) -> Tensor:
@@ -175,7 +175,7 @@ class TorchSearch:
         length = (b - a).square().sum(-1).sqrt().view(ends.shape)
         # Every edge costs something: otherwise paths could circle among points that coincide.
         length = length + EDGE_COST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
-        margin = self.margin * self.obstacles.largest.clamp(min=SMALL).view(-1, 1, 1)
+        margin = self.margin * self.obstacles.largest.clamp(min=UNIT).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
         return torch.where(free, length * close, torch.inf)
 

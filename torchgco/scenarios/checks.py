@@ -17,23 +17,23 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import INCREASING, Above, AtMost, Within, check_value
 from torchgco.obstacles.boxes import UNIT_WITHIN
 
-LARGEST = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
+TOO_LARGE = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
 MOST_OBSTACLES = 100_000  # in a layout that is drawn
-SHORTEST = 5.0  # s of a horizon, at least: to turn, to speed up and to stop
+SHORTEST_HORIZON = 5.0  # s of a horizon, at least: to turn, to speed up and to stop
 TENS = 10
 MOST_STAGES = 10**9  # beyond any memory, and few enough for arithmetic on bytes
 
 
-Coordinate = Annotated[float, Within(-LARGEST, LARGEST, "m")]
-Length = Annotated[float, Within(0, LARGEST, "m")]
-Size = Annotated[float, Above(0, "m"), AtMost(LARGEST, "m")]
-Duration = Annotated[float, Within(0, LARGEST, "s")]
-TimeStep = Annotated[float, Above(0, "s"), AtMost(LARGEST, "s")]
-Speed = Annotated[float, Within(0, LARGEST, "m/s")]
-Pace = Annotated[float, Within(1e-3, LARGEST, "m/s")]
+Coordinate = Annotated[float, Within(-TOO_LARGE, TOO_LARGE, "m")]
+Length = Annotated[float, Within(0, TOO_LARGE, "m")]
+Size = Annotated[float, Above(0, "m"), AtMost(TOO_LARGE, "m")]
+Duration = Annotated[float, Within(0, TOO_LARGE, "s")]
+TimeStep = Annotated[float, Above(0, "s"), AtMost(TOO_LARGE, "s")]
+Speed = Annotated[float, Within(0, TOO_LARGE, "m/s")]
+Pace = Annotated[float, Within(1e-3, TOO_LARGE, "m/s")]
 Stages = Annotated[int, Within(1, MOST_STAGES)]
 Number = Annotated[int, Within(0, MOST_OBSTACLES)]
-Density = Annotated[float, Within(0, LARGEST)]
+Density = Annotated[float, Within(0, TOO_LARGE)]
 Range = Annotated[tuple[Coordinate, Coordinate], INCREASING]
 Sizes = Annotated[tuple[Size, Size], INCREASING]
 Speeds = Annotated[tuple[Speed, Speed], INCREASING]
@@ -47,7 +47,7 @@ SCALARS: dict[str, Any] = {"vehicle_radius": Length, "goal_radius": Size, "dt": 
 
 def stages_for(way: float, pace: float, dt: float) -> int:
     """Stages of `dt`, s, for a way, m, at a mean speed, m/s: in tens, so that many layouts have as many."""
-    return max(1, math.ceil(max(way / pace, SHORTEST) / (TENS * dt)) * TENS)
+    return max(1, math.ceil(max(way / pace, SHORTEST_HORIZON) / (TENS * dt)) * TENS)
 
 
 def stages(value: Any, count: int) -> int | np.ndarray | None:
@@ -321,8 +321,8 @@ def ids(value: Any, count: int) -> np.ndarray:
 
 
 def _bounded(values: np.ndarray, field: str) -> None:
-    """Raise InputError where a value exceeds LARGEST; NaN passes."""
-    _none_of(np.abs(values) > LARGEST, field, f"values of at most {LARGEST:g} in size", values)
+    """Raise InputError where a value exceeds TOO_LARGE; NaN passes."""
+    _none_of(np.abs(values) > TOO_LARGE, field, f"values of at most {TOO_LARGE:g} in size", values)
 
 
 def _none_of(bad: Any, field: str, expected: str, values: np.ndarray) -> None:

@@ -19,7 +19,7 @@ from torchgco.scenarios.plans import Canvas, rooms, track
 
 PLANS = 50  # that are drawn for one layout, at most, until one has ends that are far enough apart
 SURE = 1.1  # radii that the way from start to goal is free for
-CLEAR = 1.5  # radii that start and goal are away from all walls
+ENDS_CLEAR = 1.5  # radii that start and goal are away from all walls
 
 Lanes = Annotated[tuple[Annotated[int, Within(2, 1000)], Annotated[int, Within(2, 1000)]], INCREASING]
 
@@ -124,7 +124,7 @@ class Floors(Scenario):
             rooms(rng, canvas, self.thickness, self.room, self.door, self.loops, self.furniture, self.piece)
         field = DistanceField.of(OccupancyGrid(canvas.occupied, np.zeros(2), self.resolution))
         ways = Ways.through(field, 0, SURE * self.vehicle_radius)
-        free = np.flatnonzero(ways.distance.ravel() > CLEAR * self.vehicle_radius)
+        free = np.flatnonzero(ways.distance.ravel() > ENDS_CLEAR * self.vehicle_radius)
         start = int(rng.choice(free)) if ends is None else ways.node(ends[0])
         far, _ = ways.costs(ways.places(start))
         if ends is None:

@@ -17,7 +17,7 @@ from torchgco.scenarios.quadrotor import Quadrotor
 
 MOST_GATES = 100
 Gates = Annotated[tuple[Annotated[int, Within(1, MOST_GATES)], Annotated[int, Within(1, MOST_GATES)]], INCREASING]
-Factor = Annotated[float, Above(0), AtMost(checks.LARGEST)]
+Factor = Annotated[float, Above(0), AtMost(checks.TOO_LARGE)]
 Angle = Annotated[float, Within(0, 3.1415926535, "rad")]
 
 # Foehn, Romero and Scaramuzza, "Time-optimal planning for quadrotor waypoint flight" (Science Robotics, 2021): start,

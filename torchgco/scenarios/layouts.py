@@ -31,7 +31,7 @@ BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 SINES = ("box_amplitudes", "box_rates", "box_phases")
 GATES = ("gate_centers", "gate_radii")
 TIME = "free_time"
-NAMED = (
+NAMED_ARRAYS = (
     *REQUIRED,
     "velocities",
     *BOXES,
@@ -188,7 +188,7 @@ class Layouts:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays that a file of these layouts holds, by name, without those that are None."""
-        held = {name: np.asarray(getattr(self, name)) for name in NAMED if getattr(self, name) is not None}
+        held = {name: np.asarray(getattr(self, name)) for name in NAMED_ARRAYS if getattr(self, name) is not None}
         held |= {} if self.map is None else map_arrays(self.map)
         if not np.array_equal(self.ids, np.arange(self.count)):
             held[IDS] = self.ids
@@ -254,12 +254,12 @@ class Layouts:
         for name in REQUIRED:
             if name not in held:
                 raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(held)}")
-        known = (*NAMED, *stored_maps.NAMES, IDS)
+        known = (*NAMED_ARRAYS, *stored_maps.MAP_ARRAYS, IDS)
         for name in held:
             if name not in known:
                 raise InputError(f"layouts.{name}", f"only {', '.join(known)}", f"this one in {path}")
         ids = held.pop(IDS, np.empty(0, np.int64))
-        there = {name: held.pop(name) for name in stored_maps.NAMES if name in held}
+        there = {name: held.pop(name) for name in stored_maps.MAP_ARRAYS if name in held}
         return cls(**held, map=map_of(there), name=path.stem, ids=ids)  # type: ignore[arg-type]
 
 

@@ -24,9 +24,9 @@ from torchgco.scenarios.layouts import Layouts
 
 VEHICLE_RADIUS, GOAL_RADIUS = 0.25, 0.3  # m, where neither the command nor the file says them
 CLEAR = 1.2  # drawn places are as free as for a vehicle of this many radii
-PACES = {2: 0.7, 3: 2.0}  # m/s, by the dimension of space
+DRAWN_PACES = {2: 0.7, 3: 2.0}  # m/s, by the dimension of space
 READ = "resolution", "radius", "origin", "height", "topic", "layer", "box", "solid"  # fields that `read` takes
-APART = 0.4  # share of the free space's diagonal that drawn starts and goals are apart, at least
+ENDS_APART = 0.4  # share of the free space's diagonal that drawn starts and goals are apart, at least
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ class MapFile(Scenario):
 
     def _position(self, value: Any, name: str) -> np.ndarray:
         place = coordinates(value, f"scenario.{name}")
-        if place.shape != (self.dimension,) or not (np.abs(place) <= checks.LARGEST).all():
-            expected = f"{self.dimension} coordinates within {checks.LARGEST:g} m, as the map is {self.dimension}-D"
+        if place.shape != (self.dimension,) or not (np.abs(place) <= checks.TOO_LARGE).all():
+            expected = f"{self.dimension} coordinates within {checks.TOO_LARGE:g} m, as the map is {self.dimension}-D"
             raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
         return place
 
@@ -134,7 +134,7 @@ class MapFile(Scenario):
             return self.start, self.goal
         given = self.goal if self.start is None else self.start
         places = self._free(given)
-        apart = APART * math.dist(places.min(0), places.max(0))
+        apart = ENDS_APART * math.dist(places.min(0), places.max(0))
         for _ in range(MAX_DRAWS):
             first = places[rng.integers(len(places))] if given is None else given
             second = places[rng.integers(len(places))]
@@ -147,7 +147,7 @@ class MapFile(Scenario):
     def _stages_between(self, start: np.ndarray, goal: np.ndarray) -> int:
         assert self.vehicle_radius is not None
         way = shortest_way(self.map, self.vehicle_radius, start, goal)
-        pace = PACES[self.dimension] if self.pace is None else self.pace
+        pace = DRAWN_PACES[self.dimension] if self.pace is None else self.pace
         return checks.stages_for(math.dist(start, goal) if way is None else way, pace, self.dt)
 
     def _free(self, near: np.ndarray | None) -> np.ndarray:

@@ -18,7 +18,7 @@ from torchgco.scenarios.layouts import Layouts
 TRAP = ((0.0, -0.25), (0.1, 0.0), (0.12, 0.25), (0.0, 0.5), (-0.2, 0.6), (-0.2, -0.35))
 
 
-Bound = Annotated[float, Within(-checks.LARGEST, checks.LARGEST, "m/s^2")]
+Bound = Annotated[float, Within(-checks.TOO_LARGE, checks.TOO_LARGE, "m/s^2")]
 
 
 @dataclass(frozen=True, kw_only=True)

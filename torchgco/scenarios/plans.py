@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 RIM = 0.4  # m of solid around a plan
-LEAST = 0.6  # share of the space that a plan of rooms fills along each axis, at least
+LEAST_FILLED = 0.6  # share of the space that a plan of rooms fills along each axis, at least
 LONGER = 0.8  # probability that a room is divided across its longer side
 WHOLE = 5.0  # squares of the least width: a room as large as so many is divided for sure, smaller ones more seldom
-TRIES = 10  # places that are tried for a wall
+WALL_TRIES = 10  # places that are tried for a wall
 JAMB = 0.2  # m of wall on either side of a door
 OFF = 0.3  # m that furniture keeps off doors
 TURNED = 0.5  # probability that a piece of furniture stands at an angle
@@ -63,7 +63,7 @@ def rooms(
 ) -> None:  # fmt: skip
     """Draw rooms; the options are those of `Floors`."""
     low = np.full(2, RIM)
-    high = low + rng.uniform(LEAST, 1.0, 2) * (canvas.size - 2 * RIM)
+    high = low + rng.uniform(LEAST_FILLED, 1.0, 2) * (canvas.size - 2 * RIM)
     canvas.fill(low, high, False)
     openings: list[tuple[Array, Array]] = []
     left = [(low, high)]
@@ -95,7 +95,7 @@ def _wall(
 
     A wall doesn't end at a door.
     """
-    for _ in range(TRIES):
+    for _ in range(WALL_TRIES):
         longer = int(np.argmax(high - low))
         axis = longer if rng.uniform() < LONGER else 1 - longer
         thick = math.exp(rng.uniform(math.log(thickness[0]), math.log(thickness[1])))
@@ -146,7 +146,7 @@ def track(
     pitch = wide + math.exp(rng.uniform(math.log(thickness[0]), math.log(thickness[1])))
     most = 1 + int((size[1 - along] - wide) / pitch)
     count = max(1, min(int(rng.integers(lanes[0], lanes[1] + 1)), most))
-    reach = rng.uniform(LEAST, 1.0) * size[along] - wide
+    reach = rng.uniform(LEAST_FILLED, 1.0) * size[along] - wide
     across = RIM + 0.5 * wide + pitch * np.arange(count)
     ends = RIM + 0.5 * wide + reach * rng.uniform(0.0, TURNS, count + 1)  # of lane i: at i and i + 1
     ends[1::2] = 2 * RIM + wide + reach - ends[1::2]

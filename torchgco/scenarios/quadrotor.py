@@ -14,7 +14,7 @@ from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts
 
-STATES = 14  # [p, v, q, w, a]
+PLANNING_STATES = 14  # [p, v, q, w, a]
 MOST_HOLES = 1000  # in a wall
 
 
@@ -40,7 +40,7 @@ class Quadrotor(Family):
     @property
     def states(self) -> int:
         """n of the model that flies among them."""
-        return STATES
+        return PLANNING_STATES
 
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:
         return np.array(position, np.float64)

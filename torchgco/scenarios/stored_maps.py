@@ -13,7 +13,7 @@ from torchgco.maps.points import PointCloud
 
 GRID = ("map_occupied", "map_origin", "map_resolution")
 CLOUD = ("map_points", "map_radius")
-NAMES = (*GRID, *CLOUD, "map_unknown")
+MAP_ARRAYS = (*GRID, *CLOUD, "map_unknown")
 
 
 def map_arrays(field: DistanceField) -> dict[str, np.ndarray]:
@@ -33,7 +33,7 @@ def map_of(arrays: Mapping[str, np.ndarray]) -> DistanceField | None:
     Raises:
         InputError: arrays of a map of which some are missing or malformed, named `layouts.<array>`.
     """
-    held = [name for name in NAMES if name in arrays]
+    held = [name for name in MAP_ARRAYS if name in arrays]
     if not held:
         return None
     kind = CLOUD if "map_points" in arrays else GRID

@@ -14,7 +14,7 @@ from torchgco.scenarios.base import MAX_DRAWS
 from torchgco.scenarios.layouts import Layouts
 from torchgco.scenarios.quadrotor import Quadrotor
 
-UPRIGHT = 0.35  # share of bars that stand upright; of the others every second one lies along y, the rest along x
+UPRIGHT_SHARE = 0.35  # share of bars that stand upright; of the others every second one lies along y, the rest along x
 TILL = 20  # moments of the time of grace at which boxes are looked at
 
 
@@ -86,7 +86,7 @@ class Trefoils(Quadrotor):
         centers = rng.uniform(low, high, (count, 3))
         sx, sy, sz = rng.uniform(*self.scales, (3, cubes))
         offset, rate = rng.uniform(*self.offsets, cubes), 1.0 / rng.uniform(*self.slower, cubes)
-        upright = rng.uniform(size=count - cubes) < UPRIGHT
+        upright = rng.uniform(size=count - cubes) < UPRIGHT_SHARE
         across = rng.uniform(size=count - cubes) < 0.5
         half = np.full((count, 3), 0.5 * self.side)
         half[cubes:] = 0.5 * self.bars[0]

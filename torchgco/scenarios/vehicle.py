@@ -30,9 +30,9 @@ from torchgco.problem.problem import Problem
 from torchgco.scenarios.base import Family, Scenario
 from torchgco.scenarios.layouts import SINES, Layouts
 
-STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
-LIMITS = ("control_lower", "control_upper")
-CONTROLS = ("control_weight", "control_reference", *LIMITS)
+STATE_ARRAYS = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
+CONTROL_LIMITS = ("control_lower", "control_upper")
+CONTROL_ARRAYS = ("control_weight", "control_reference", *CONTROL_LIMITS)
 # The models of conf/model: dimension of space and number of states.
 BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "quadrotor": (3, 14), "rotors": (3, 13)}
 # Share of the control weights that is left, per second, where time is the cost: without any, controls that time doesn't
@@ -101,11 +101,11 @@ class Vehicle:
                 raise InputError(f"vehicle.{name}", f"{n} numbers", repr(getattr(self, name)))
         if self.arrives is not None and not all(i < n for i in self.arrives):
             raise InputError("vehicle.arrives", f"some of the states 0..{n - 1}", repr(self.arrives))
-        for names, length in ((STATES, n), (CONTROLS, m)):
+        for names, length in ((STATE_ARRAYS, n), (CONTROL_ARRAYS, m)):
             for name in names:
                 if len(getattr(self, name)) != length:
                     raise InputError(f"vehicle.{name}", f"{length} numbers", repr(getattr(self, name)))
-        for name in LIMITS:
+        for name in CONTROL_LIMITS:
             self.limits(name)
 
     @classmethod
@@ -154,7 +154,7 @@ class Vehicle:
         Raises:
             InputError: none in a place where the dynamics have no limit either.
         """
-        own = getattr(self.dynamics, "control_limits", ([None] * self.dynamics.m,) * 2)[LIMITS.index(name)]
+        own = getattr(self.dynamics, "control_limits", ([None] * self.dynamics.m,) * 2)[CONTROL_LIMITS.index(name)]
         found = list[float]()
         for i, (given, limit) in enumerate(zip(getattr(self, name), own, strict=True)):
             bound = limit if given is None else given

@@ -26,7 +26,7 @@ from torchgco.solvers.contracts import Call, Callback, Guidance, Progress, RowEn
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.interior import InteriorPoint
 
-CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
+ATTRACTED_WITHIN = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
 
 
 class Best:
@@ -261,9 +261,9 @@ class Search:
         if when != "caught":
             stopped = stopped & ~self.best.arrived()
         if when == "far":
-            stopped = stopped & ~self.best.arrived(CLOSE)
+            stopped = stopped & ~self.best.arrived(ATTRACTED_WITHIN)
         elif when == "close":
-            stopped = stopped & self.best.arrived(CLOSE)
+            stopped = stopped & self.best.arrived(ATTRACTED_WITHIN)
         elif when == "unproposed":
             stopped = stopped & ~self.proposed
         return stopped.nonzero().flatten()

@@ -24,8 +24,8 @@ from torchgco.solvers.contracts import Call
 from torchgco.solvers.ilqr import ILQR, descend
 
 CANDIDATES_AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
-PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
-TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
+CANDIDATE_PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
+CANDIDATE_TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
 LINE_SEARCH = LineSearch(back=2)
 Watch = Callable[[int, int], None]  # is called with the candidates solved so far, and of how many
 
@@ -59,7 +59,7 @@ class Refine:
 
 def inner_solver(iterations: int, share: float = 1.0) -> ILQR:
     """The inner solver of candidates, with a share of their tolerance."""
-    return ILQR(tolerance=share * TOLERANCE, max_iterations=iterations, line_search=LINE_SEARCH)
+    return ILQR(tolerance=share * CANDIDATE_TOLERANCE, max_iterations=iterations, line_search=LINE_SEARCH)
 
 
 def unwatched(done: int, total: int) -> None:
@@ -160,7 +160,7 @@ class Candidates:
         """
         everyone = torch.arange(self.live.numel(), device=sound.device)
         lam = tuple(self.U.new_zeros(everyone.numel(), *shape) for shape in self.problem.row_shapes)
-        multipliers, rows = Multipliers(lam, PENALTY * self.unit), sound.nonzero().flatten()
+        multipliers, rows = Multipliers(lam, CANDIDATE_PENALTY * self.unit), sound.nonzero().flatten()
         if refine.top == 1 or rows.numel() == 0:
             return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
         part, inner = self.of(rows), inner_solver(iterations, 0.1)
@@ -186,7 +186,7 @@ class Candidates:
         """
         merit, first = torch.full_like(self.unit, torch.inf), first & self.live
         for rows in self.parts():
-            merit[rows] = value(self.lagrangian(rows, PENALTY), self.X[rows], self.U[rows])[1]
+            merit[rows] = value(self.lagrangian(rows, CANDIDATE_PENALTY), self.X[rows], self.U[rows])[1]
         merit, order = merit.nan_to_num(torch.inf).view(-1, self.count).sort(dim=-1, stable=True)
         later = (~first).view(-1, self.count).gather(1, order).to(torch.int8)
         later, again = later.sort(dim=-1, stable=True)

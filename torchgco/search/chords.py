@@ -25,7 +25,7 @@ from torchgco.search.converge import continued, mapped
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
 
-MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
+EXTRA = 1.1  # times the missing clearance: by how much obstacles grow in a round
 IN_MAPS = 2  # times as many rounds, which are short there
 GROWN_BARRIER = 1e-4  # of warm solves among grown obstacles, which lie deeper than rounding
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
@@ -117,7 +117,7 @@ def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) ->
     for _ in range(rounds):
         if rows.numel() == 0 or call.late:
             break
-        by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
+        by[rows] += (-EXTRA * now[rows]).clamp(min=MIN_GROWTH * limit)
         old, part = take(best, rows), call.take(rows)
         part = replace(part, problem=part.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
         serves, now[rows] = once(rows, part, old, clearance[rows])

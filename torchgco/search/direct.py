@@ -24,7 +24,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import mapped
-from torchgco.search.nearby import FREE, without_obstacles
+from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.pursue import pursue
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
@@ -78,7 +78,7 @@ class Direct(Row):
         bare = without_obstacles(call.problem)
         bound = torch.full_like(call.problem.x0[:, 0], -torch.inf)
         if bare is not None:
-            free = FREE.solved(replace(call, problem=bare))
+            free = WITHOUT_OBSTACLES.solved(replace(call, problem=bare))
             bound = free.best.cost
             search.best.end.iterations[rows] += free.iterations
         solver = InteriorPoint()

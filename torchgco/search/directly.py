@@ -18,7 +18,7 @@ from torchgco.search.candidates import Candidates, Refine, Refined
 from torchgco.search.converge import solved_nearby
 from torchgco.solvers.interior import InteriorPoint
 
-DEEP = 0.8  # depth in an obstacle, in R, of candidates that come after all others
+LAST_DEPTH = 0.8  # depth in an obstacle, in R, of candidates that come after all others
 CUT = 0.3  # depth between two knots, in R, of solved ones that don't count: a step through a wall can't be repaired
 # From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
 SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
@@ -34,7 +34,7 @@ def in_order(candidates: Candidates) -> Tensor:
     for rows in candidates.parts():
         merit[rows] = candidates.of(rows).cost.total(candidates.X[rows], candidates.U[rows])
     order = merit.nan_to_num(torch.inf).view(-1, candidates.count).argsort(dim=-1, stable=True)
-    deep, dead = candidates.penetration() > DEEP * candidates.R, ~candidates.live
+    deep, dead = candidates.penetration() > LAST_DEPTH * candidates.R, ~candidates.live
     last = torch.where(dead, 2, deep.to(torch.int8)).view(-1, candidates.count)
     return order.gather(1, last.gather(1, order).argsort(dim=-1, stable=True))
 

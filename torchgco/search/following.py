@@ -31,9 +31,9 @@ from torchgco.solvers.ilqr import descend
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
 LIMITS_PENALTY = 10.0  # of limits on states, where these alone bind, in q0 / R^4
 ROUNDS = 5  # of `iterations`, at most, while a candidate isn't near the goal
-SHORTEST = 0.05  # share of the horizon between departure and arrival
+LEAST_SHARE = 0.05  # share of the horizon between departure and arrival
 LAST_PART = 0.1  # of the distance to the goal: the last part is approached slowly
-CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
+CORNER_DEPTH = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
 DEPTH_POINTS = 64  # points of a path at which its depth is measured, about
 
 
@@ -170,7 +170,7 @@ class Follow:
             assert free is not None
             shares = ((free.share * free.slower).unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
             latest = self.pace * shares.flatten().repeat_interleave(paces)
-            arrive = torch.minimum(arrive, latest.clamp(min=self.depart + SHORTEST))
+            arrive = torch.minimum(arrive, latest.clamp(min=self.depart + LEAST_SHARE))
         return self.along(candidates, paths, arrive, paces)
 
     def along(self, candidates: Candidates, paths: Paths, arrive: Tensor, paces: int) -> Candidates:
@@ -204,7 +204,7 @@ class Follow:
             assert gates.places is not None
             places, stages = (part.repeat_interleave(each, dim=0) for part in (gates.places, problem.stages))
             last = places[:, -1]
-            return timed(path, places, last + arrive.clamp(SHORTEST, 1.0) * (stages - last), N)
+            return timed(path, places, last + arrive.clamp(LEAST_SHARE, 1.0) * (stages - last), N)
         center = path[:, -1:].repeat(1, N + 1, 1)
         for horizon in problem.stages.unique().tolist():
             rows = (problem.stages == horizon).nonzero().flatten()
@@ -282,7 +282,7 @@ def followed(
     each, some = path.shape[0] // max(1, B), torch.arange(B, device=path.device)  # the problems with deep paths
     while some.numel() > 0 and smoothing * N >= 2.0:
         points = center.view(B, each, N + 1, -1)[some, :, :: max(1, N // DEPTH_POINTS)]
-        deep = obstacles.deeper(points.flatten(1, 2), CUT * R).view(*points.shape[:3]).any(-1)
+        deep = obstacles.deeper(points.flatten(1, 2), CORNER_DEPTH * R).view(*points.shape[:3]).any(-1)
         rows = (some.unsqueeze(-1) * each + torch.arange(each, device=path.device))[deep]
         if rows.numel() == 0:
             break

@@ -20,14 +20,14 @@ from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.scene import scales, scene_of
 from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
-from torchgco.search.chords import MARGIN
+from torchgco.search.chords import EXTRA
 from torchgco.search.directly import solved
-from torchgco.search.poses import STEP, Poses, clear_at
-from torchgco.search.steering import SAME, alike, heading_and_speed, sampled
+from torchgco.search.poses import ARC_LENGTH, Poses, clear_at
+from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
 
-ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
-PACES = 0.6, 0.8, 1.0  # shares of the horizon in which a path is driven: each is a start of the interior point
-DOES = f"a path of poses, forwards and backwards, at {len(PACES)} paces; interior point from each"
+GROWTH_ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
+PATH_PACES = 0.6, 0.8, 1.0  # shares of the horizon in which a path is driven: each is a start of the interior point
+MANOEUVRES_TEXT = f"a path of poses, forwards and backwards, at {len(PATH_PACES)} paces; interior point from each"
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def car(problem: Problem) -> Car | None:
     heading, speed = places
     if not alike(seen.rates[:, heading], z[0, :, speed] * seen.slopes[:, heading, speed]):
         return None  # it turns at rest, too
-    on = (seen.slopes[:, heading].abs() > SAME).any(0)
+    on = (seen.slopes[:, heading].abs() > SAME_MODEL).any(0)
     on[speed] = False
     corners = z.repeat(1, 2, 1)
     low, high = seen.box
@@ -92,7 +92,7 @@ def manoeuvre(search: Search) -> None:
         return
     rows, made = made
     grown = torch.zeros_like(made.R[:: made.count])
-    for number in range(ROUNDS):
+    for number in range(GROWTH_ROUNDS):
         ends = solved(search, rows, made, grown if number > 0 else None)
         good = ends.cost.isfinite()
         clearance = torch.full_like(ends.cost, torch.inf)
@@ -102,7 +102,7 @@ def manoeuvre(search: Search) -> None:
         again = ((lacks < 0.0) & torch.isfinite(lacks)).nonzero().flatten()
         if again.numel() == 0 or search.call.late:
             return
-        grown = grown[again] - MARGIN * lacks[again]
+        grown = grown[again] - EXTRA * lacks[again]
         rows, made = rows[again], _of_problems(made, again)
 
 
@@ -131,13 +131,13 @@ def _made(search: Search, rows: Tensor) -> tuple[Tensor, Candidates] | None:
     at = torch.tensor(some, device=rows.device)
     search.best.worked[rows[at]] = True
     R, unit = scales(problem, scene, rest)
-    U, live = rest[at].unsqueeze(1).repeat(1, len(PACES), 1, 1), torch.ones_like(R[at].bool())
-    made = Candidates.begin(problem.take(at), U, R[at], unit[at], live.unsqueeze(1).expand(-1, len(PACES)))
+    U, live = rest[at].unsqueeze(1).repeat(1, len(PATH_PACES), 1, 1), torch.ones_like(R[at].bool())
+    made = Candidates.begin(problem.take(at), U, R[at], unit[at], live.unsqueeze(1).expand(-1, len(PATH_PACES)))
     return rows[at], replace(made, X=torch.cat([one for one in found if one is not None]))
 
 
 def _driven(problem: Problem) -> Tensor | None:
-    """States (len(PACES), N+1, n) of a batch of one along a manoeuvre to the goal; None where none is found."""
+    """States (len(PATH_PACES), N+1, n) of a batch of one along a manoeuvre to the goal; None where none is found."""
     vehicle = car(problem)
     if vehicle is None:
         return None
@@ -147,7 +147,7 @@ def _driven(problem: Problem) -> Tensor | None:
     end = np.append(goal.position[0].double().cpu().numpy(), np.nan)
     if goal.state is not None:
         end[2] = float(goal.state[0, heading])
-    space = Poses(clear_at(problem, heading), vehicle.curvature, STEP * vehicle.radius)
+    space = Poses(clear_at(problem, heading), vehicle.curvature, ARC_LENGTH * vehicle.radius)
     # Where the pose at the end is known, it is the one with less room, and the search begins there.
     known = not np.isnan(end[2])
     path = space.path(end, start) if known else space.path(start, end)
@@ -156,8 +156,8 @@ def _driven(problem: Problem) -> Tensor | None:
     if known:
         path = path[::-1]
     K = int(problem.stages[0])
-    X = problem.x0.repeat(len(PACES), problem.N + 1, 1)
-    for x, share in zip(X, PACES, strict=True):
+    X = problem.x0.repeat(len(PATH_PACES), problem.N + 1, 1)
+    for x, share in zip(X, PATH_PACES, strict=True):
         poses, speeds = timed(path, K, share, K * float(problem.dynamics.dt))
         x[: K + 1, at], x[: K + 1, heading] = x.new_tensor(poses[:, :2]), x.new_tensor(poses[:, 2])
         x[1 : K + 1, vehicle.speed] = x.new_tensor(speeds[1:])

@@ -28,8 +28,8 @@ from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 
 DETOUR = math.sqrt(2.0)  # ways this many times as long as the straight one stay within half of its length from it
-FREE = InteriorPoint(tolerance=1e-4, max_iterations=100)  # of trajectories without obstacles
-FEWER = 0.5  # share of a problem's obstacles that must be far from a trajectory, for leaving any out of its refining
+WITHOUT_OBSTACLES = InteriorPoint(tolerance=1e-4, max_iterations=100)  # of trajectories without obstacles
+FAR_ONES = 0.5  # share of a problem's obstacles that must be far from a trajectory, for leaving any out of its refining
 
 
 class Nearby:
@@ -61,7 +61,7 @@ class Nearby:
     @classmethod
     def along(cls, call: Call, X: Tensor) -> Nearby | None:
         """A call without the obstacles farther from X (B, N+1, n) than a mean one is thick; None where few are."""
-        return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids), FEWER)
+        return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids), FAR_ONES)
 
     @classmethod
     def _where(cls, call: Call, near: Callable[[Obstacles, Solids], Tensor | None], share: float) -> Nearby | None:

@@ -24,9 +24,9 @@ from torchgco.search.proposals import WHEN
 from torchgco.search.row import Row
 from torchgco.solvers.caught import StopWhenCaught
 
-WITHIN = 0.95  # share of the goal tolerance to which trajectories are attracted
-STIFF = 1e3  # weight of that attraction, in units of cost per radius^4
-SEED_STEP = 1_000_003  # between the seeds of two attempts
+ATTRACTED_TO = 0.95  # share of the goal tolerance to which trajectories are attracted
+ATTRACTION = 1e3  # weight of that attraction, in units of cost per radius^4
+ATTEMPT_SEED_STEP = 1_000_003  # between the seeds of two attempts
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class FromSamples(Row):
             warm = replace(start.multipliers, mu=torch.fmax(start.multipliers.mu, search.rejected[rows]))
             call = replace(call, warm=warm, outer=search.caught.outer[rows])
         else:
-            call = replace(call, seed=call.seed + SEED_STEP * draw)
+            call = replace(call, seed=call.seed + ATTEMPT_SEED_STEP * draw)
         search.best.improve(rows, call, guidance=search.guidance, guide_first=True)
 
 
@@ -203,8 +203,8 @@ def _goal_region(problem: Problem) -> GuideRegion:
     """A ball around the goal for the last knot, slightly smaller than the goal tolerance."""
     near = goal_tolerance(problem)
     assert near is not None and problem.goal is not None
-    size = WITHIN * near
+    size = ATTRACTED_TO * near
     radius = problem.x0.new_full((problem.B, problem.N + 1), torch.inf)
     radius[:, -1] = size
     center = problem.goal.position.unsqueeze(1).expand(-1, problem.N + 1, -1).contiguous()
-    return GuideRegion(center, radius, STIFF * cost_unit(problem) / size.pow(4), problem.position)
+    return GuideRegion(center, radius, ATTRACTION * cost_unit(problem) / size.pow(4), problem.position)

@@ -25,12 +25,12 @@ from torchgco.roadmap.lattice import Array
 
 CURVATURES = -1.0, -0.5, 0.0, 0.5, 1.0  # of the arcs, as shares of the tightest
 TIGHTEST = 0.9  # share of the vehicle's largest curvature: steering from side to side takes a part of the way, too
-STEP = 0.5  # length of an arc in radii of the largest ball
+ARC_LENGTH = 0.5  # length of an arc in radii of the largest ball
 CELL = 0.6  # side of a cell as a share of an arc: each arc leaves its cell; with 0.7 two of 12 slots had no path
 CUSP = 2.0  # arcs that a change between forwards and backwards costs: the vehicle stops and steers again
-NEAR = 0.5  # arcs within which a pose counts as that at the end of the path
-AT_ONCE = 2048  # poses that are measured together: bounds the memory
-MOST = 1_000_000  # poses that are kept, at most: bounds the time, to about six seconds
+END_POSE_ARCS = 0.5  # arcs within which a pose counts as that at the end of the path
+POSES_AT_ONCE = 2048  # poses that are measured together: bounds the memory
+MOST_POSES = 1_000_000  # poses that are kept, at most: bounds the time, to about six seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class _Wave:
         near = self._near(pose)
         if near.any():
             return int(place[near][way[near].argmin()])
-        if self.count > MOST:
+        if self.count > MOST_POSES:
             self.open.clear()
             return None
         s, k = self.space.step, TIGHTEST * self.space.curvature
@@ -123,10 +123,10 @@ class _Wave:
             self.open.setdefault(int(one), []).append((pose[some], way[some], ahead[some], place[some]))
 
     def _near(self, pose: Array) -> NDArray[np.bool_]:
-        near = np.hypot(*(pose[:, :2] - self.target[:2]).T) <= NEAR * self.space.step
+        near = np.hypot(*(pose[:, :2] - self.target[:2]).T) <= END_POSE_ARCS * self.space.step
         if math.isnan(self.target[2]):
             return near
-        return near & (np.abs(pose[:, 2] - self.target[2]) <= NEAR * self.space.curvature * self.space.step)
+        return near & (np.abs(pose[:, 2] - self.target[2]) <= END_POSE_ARCS * self.space.curvature * self.space.step)
 
     def _cell(self, pose: Array, ahead: Array) -> NDArray[np.int64]:
         """A number for the cell of each pose, and the way it is driven to."""
@@ -145,7 +145,7 @@ def clear_at(problem: Problem, heading: int) -> Callable[[Array], NDArray[np.boo
         states[0, :, at], states[0, :, heading] = x0.new_tensor(poses[:, :2]), x0.new_tensor(poses[:, 2])
         good = torch.ones(len(poses), dtype=torch.bool, device=x0.device)
         for part in problem.obstacles:
-            for some in good.nonzero().flatten().split(AT_ONCE):
+            for some in good.nonzero().flatten().split(POSES_AT_ONCE):
                 good[some] = _clear(part, states[:, some])
         return good.cpu().numpy()
 

@@ -31,9 +31,9 @@ from torchgco.roadmap.homotopy import classes
 from torchgco.roadmap.known import Known
 from torchgco.roadmap.legs import paths_through
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
+from torchgco.search.candidates import CANDIDATE_PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
 from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
-from torchgco.search.nearby import FREE, without_obstacles
+from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.record import comparison
 from torchgco.search.row import Row
 from torchgco.solution import SearchRecord
@@ -46,7 +46,7 @@ WHEN = {
     "unproposed": "caught, without a proposal",
 }
 PATHS_AT_ONCE = 1536  # paths of all problems that are compared and tracked together: bounds the memory
-ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
+SAME_COST = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
 
 
 class Proposal(NamedTuple):
@@ -210,7 +210,7 @@ class PathProposals(Row):
         candidates = Candidates.begin(problem, starts.repeat(1, K, 1, 1), paths.R, paths.unit, live, watch)
         tracked = follow.track(candidates, paths, free)
         relaxed, sound = self.relax(tracked.pick(tracked.order(tracked.arrive())[:, : self.relax_top]))
-        order = relaxed.order(sound, ALIKE)[:, : self.refine.top]
+        order = relaxed.order(sound, SAME_COST)[:, : self.refine.top]
         picked = sound[relaxed.rows(order).flatten()]
         refined = relaxed.pick(order).refined(picked, self.refine, follow.iterations)
         best, some = refined.best, paths.live.any(-1)
@@ -225,7 +225,7 @@ class PathProposals(Row):
     def relax(self, candidates: Candidates) -> tuple[Candidates, Tensor]:
         """The candidates, solved further without a guide, and whether they are sound, (B * count,)."""
         if self.relax_iterations > 0:
-            relaxed = candidates.solved(inner_solver(self.relax_iterations), PENALTY)
+            relaxed = candidates.solved(inner_solver(self.relax_iterations), CANDIDATE_PENALTY)
             # A candidate that falls back into the trap, where waiting is cheaper, stays as tracked.
             keeps = (relaxed.arrive() | ~candidates.arrive()).view(-1, 1, 1)
             X, U = torch.where(keeps, relaxed.X, candidates.X), torch.where(keeps, relaxed.U, candidates.U)
@@ -299,7 +299,7 @@ class Part:
         bare = without_obstacles(self.problem.take(rows)) if rows.numel() > 0 else None
         if bare is None or len(bare.constraints) == len(bare.obstacles):
             return least
-        end = FREE.solved(Call.checked(bare, self.rest[rows]))
+        end = WITHOUT_OBSTACLES.solved(Call.checked(bare, self.rest[rows]))
         self.proposal.iterations[rows] += end.iterations
         return torch.where(end.best.violation <= ADMITTED, end.best.cost, least)
 

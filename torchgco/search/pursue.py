@@ -29,22 +29,22 @@ from torchgco.search.steering import Steered, Tracks, driven, speed_limit, steer
 
 PURSUED_AT_ONCE = 16  # problems: bounds the memory
 FREE_ITERATIONS = 40  # of the trajectory without constraints, at most
-ROADMAP, PATHS = Roadmap(max_overlap=0.02), 6  # between bodies, before those of one homotopy class are merged
+WAY_ROADMAP, PATHS = Roadmap(max_overlap=0.02), 6  # between bodies, before those of one homotopy class are merged
 WAYS = 3  # of different homotopy classes
-PACES = 6  # at which a way is driven
+WAY_PACES = 6  # at which a way is driven
 # The fastest pace takes half the time that the trajectory without constraints takes for as long a way, the slowest a
 # share of the horizon; the others lie between, by equal ratios.
-FASTEST, LATEST_FREE, LATEST = 0.5, 0.55, 0.75
+AT_BEST, LATEST_FREE, LATEST = 0.5, 0.55, 0.75
 SHORTEST = 0.01  # share of the horizon that such a trajectory counts for, at least
-TOP = 4  # candidates that are solved, the cheapest as driven
+SOLVED_WAYS = 4  # candidates that are solved, the cheapest as driven
 FINE = 0.25  # R between the points of a way
 ROUNDED = 2.0  # R: the standard deviation over which its corners are averaged
-AHEAD = 2.4  # R that the vehicle looks ahead
+LOOK_AHEAD = 2.4  # R that the vehicle looks ahead
 DOES = (
     f"what drives along its heading is steered along ways that keep clear, of {WAYS} to {2 * WAYS} classes, "
-    f"{PACES} paces, forwards and backwards; interior point from the {TOP} cheapest"
+    f"{WAY_PACES} paces, forwards and backwards; interior point from the {SOLVED_WAYS} cheapest"
 )
-EACH = 2 * PACES  # candidates of a way: forwards and backwards at each pace
+EACH = 2 * WAY_PACES  # candidates of a way: forwards and backwards at each pace
 
 
 def pursue(search: Search, rows: Tensor) -> None:
@@ -59,7 +59,7 @@ def pursue(search: Search, rows: Tensor) -> None:
         return
     search.best.worked[rows] = True
     paths, candidates = _candidates(part, found)
-    chosen = candidates.pick(in_order(candidates)[:, :TOP])
+    chosen = candidates.pick(in_order(candidates)[:, :SOLVED_WAYS])
     search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
     ends = solved(search, rows, chosen)
     for place, (ways, _) in enumerate(found):
@@ -95,7 +95,7 @@ def _ways(part: Part, b: int) -> list[Array]:
     if part.scene.obstacles.maps:
         return Roadmap().clear_ways(part.scene, b, WAYS)
     rows = torch.tensor([b], device=part.rest.device)
-    paths = part.seek(rows, (ROADMAP,), PATHS)
+    paths = part.seek(rows, (WAY_ROADMAP,), PATHS)
     corners = paths.corners[0][paths.live[0]].double().cpu().numpy()
     return [way[np.append(True, np.any(way[1:] != way[:-1], axis=1))] for way in corners]
 
@@ -114,10 +114,10 @@ def _tracks(vehicle: Steered, ways: list[Array], duration: float, free: float) -
     longest, lengths = max(map(len, ways)), np.array([length(way) for way in ways])
     points = np.stack([np.concatenate((way, np.repeat(way[-1:], longest - len(way), axis=0))) for way in ways])
     last, steps = np.array([len(way) - 1 for way in ways]), lengths / np.array([len(way) - 1 for way in ways])
-    first = FASTEST * np.clip(np.nan_to_num(free * lengths, nan=np.inf), SHORTEST, LATEST_FREE)[:, None]
-    shares = first * (LATEST / first) ** np.linspace(0.0, 1.0, PACES)
+    first = AT_BEST * np.clip(np.nan_to_num(free * lengths, nan=np.inf), SHORTEST, LATEST_FREE)[:, None]
+    shares = first * (LATEST / first) ** np.linspace(0.0, 1.0, WAY_PACES)
     speed = (lengths[:, None] / (shares * duration)).repeat(2, axis=1).ravel()
-    ahead = round(AHEAD / FINE)
+    ahead = round(LOOK_AHEAD / FINE)
     limit = np.zeros(points.shape[:2])
     for own, way, step in zip(limit, ways, steps, strict=True):
         own[: len(way)] = speed_limit(vehicle, way, step, ahead)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients_at_once
+from torchgco.base.errors import NAMED
 from torchgco.base.shapes import computing_on
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.problem.problem import Problem
@@ -18,16 +19,15 @@ from torchgco.roadmap.geometry import length
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 
-SAMPLES = 64  # states and controls at which a step's length is looked at
+STEP_SAMPLES = 64  # states and controls at which a step's length is looked at
 WIDE = 3.0  # the range, around 0, of what has no bounds
 INERT = 1e-9  # slope, as a share of the largest, of what a step's length doesn't depend on
 CLIMBS = 40  # rounds of ascent from the samples, which halve a step of half the box to 5e-13 of it
-NAMED = 5  # problems that the sentence names
 WIDER, GROWN = 100.0, 0.01  # times that range, in which what has no bounds may raise the acceleration by this share
-TINY = 1e-12  # m^2/s^2: squared speeds below it count as it
+LEAST_SPEED = 1e-12  # m^2/s^2: squared speeds below it count as it
 FEWER = 4  # one in so many samples shows how strong the acceleration is
-SHORT = 1e-6  # s, over which a change of velocity is measured
-SEED = 0x5EED
+SHORT_TIME = 1e-6  # s, over which a change of velocity is measured
+REACH_SEED = 0x5EED
 
 
 def short_horizons(problem: Problem) -> str | None:
@@ -139,7 +139,7 @@ class _Box(NamedTuple):
     bounded: Tensor  # (B, n + m) bool; the others lie within `WIDE` around 0
     least: Tensor  # (B, 1, n + m)
     most: Tensor
-    z: Tensor  # (B, 2 SAMPLES, n + m): samples, and corners
+    z: Tensor  # (B, 2 STEP_SAMPLES, n + m): samples, and corners
     depends: Tensor  # (n + m,) bool: on what the way of a stage does
 
     @classmethod
@@ -149,8 +149,8 @@ class _Box(NamedTuple):
             return None
         low, high = bounds_at_inner_knots(problem)
         bounded = torch.isfinite(low) & torch.isfinite(high)
-        draws = torch.Generator("cpu").manual_seed(SEED)  # the same for every problem and device
-        share = torch.rand(1, SAMPLES, problem.n + problem.m, dtype=low.dtype, generator=draws, device="cpu")
+        draws = torch.Generator("cpu").manual_seed(REACH_SEED)  # the same for every problem and device
+        share = torch.rand(1, STEP_SAMPLES, problem.n + problem.m, dtype=low.dtype, generator=draws, device="cpu")
         share = share.to(low.device)
         least, most = (torch.where(bounded, *ends).unsqueeze(1) for ends in ((low, -WIDE), (high, WIDE)))
         z = least + share * (most - least)
@@ -187,8 +187,8 @@ def _push(problem: Problem, z: Tensor) -> Tensor:
     field, at, n = problem.dynamics.field, problem.position, problem.n
     x, u = z[..., :n], z[..., n:]
     rate = field(x, u)
-    change = (field(x + SHORT * rate, u)[..., at] - field(x - SHORT * rate, u)[..., at]) / (2.0 * SHORT)
-    return (rate[..., at] * change).sum(-1) / rate[..., at].square().sum(-1).clamp(min=TINY).sqrt()
+    change = (field(x + SHORT_TIME * rate, u)[..., at] - field(x - SHORT_TIME * rate, u)[..., at]) / (2.0 * SHORT_TIME)
+    return (rate[..., at] * change).sum(-1) / rate[..., at].square().sum(-1).clamp(min=LEAST_SPEED).sqrt()
 
 
 def _climbed(value: Callable[[Tensor], Tensor], z: Tensor, least: Tensor, most: Tensor, climbs: int) -> Tensor:

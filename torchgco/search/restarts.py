@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 PASSES = Passes((Solve(), PathProposals(), FromProposal(), FromSamples("unproposed"), IntoGoal(), ClearChords()))
 
-PACES = 0.7, 1.0, 1.4  # of the times found, where the time is free: each is a search of its own
+TIME_PACES = 0.7, 1.0, 1.4  # of the times found, where the time is free: each is a search of its own
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Restarts(Solver):
         bodies = (part.absent.shape[1] > 0 if isinstance(part, Obstacles) else True for part in problem.geometric)
         if not any(bodies):
             return self.interior.choosing_time(problem)
-        return Chooser(self, self.interior, self.local.violation_tolerance, paces=PACES)
+        return Chooser(self, self.interior, self.local.violation_tolerance, paces=TIME_PACES)
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""

@@ -18,7 +18,7 @@ from torchgco.search.row import Row
 from torchgco.search.starts import Starts
 
 REPAIRED = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)  # of candidates that lie deep in an obstacle
-DEEP = 0.5  # how deep these may lie, in R
+INSIDE_DEPTH = 0.5  # how deep these may lie, in R
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Paths(Row):
             first, when="unproposed", roadmaps=(), follow=(near, replace(near, obstacles=0.0)), relax_top=None
         )
         if self.refined == 1:
-            again = replace(again, refine=REPAIRED, max_penetration=DEEP)
+            again = replace(again, refine=REPAIRED, max_penetration=INSIDE_DEPTH)
         more = () if self.max_gap is None else (self._more(first),)
         steps = first, *more, again, FromProposal(), IntoGoal()
         return (*steps, self._thorough(first), FromProposal()) if self.refined == 1 else steps
@@ -123,7 +123,7 @@ class Paths(Row):
         count = 2 * self.num_paths
         return replace(
             first, when="costly", roadmaps=(self.roadmap, denser), num_paths=count,
-            follow=(self.follow, closer(self.follow)), relax_top=count, refine=REPAIRED, max_penetration=DEEP,
+            follow=(self.follow, closer(self.follow)), relax_top=count, refine=REPAIRED, max_penetration=INSIDE_DEPTH,
             max_gap=self.max_gap,
         )  # fmt: skip
 

@@ -24,8 +24,8 @@ from torchgco.roadmap.lattice import Array
 from torchgco.search.reach import WIDE, bounds_at_inner_knots
 
 SAMPLES = 16  # states and controls at which the equations are looked at
-GRID = 65  # values of a control at which its effect is tabulated
-SAME = 1e-9  # share by which equations may differ from those of a vehicle that drives along its heading
+TABLED = 65  # values of a control at which its effect is tabulated
+SAME_MODEL = 1e-9  # share by which equations may differ from those of a vehicle that drives along its heading
 SEED = 0x57EE
 TURNING = 3.0  # rad/s of turn rate per rad of error in the heading
 WITHIN = 0.95  # share of the range of the controls that is used
@@ -35,11 +35,11 @@ CREEP = 0.3  # share of its speed that a vehicle keeps that can't turn on the sp
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What a control u does, at `GRID` values of it between its bounds."""
+    """What a control u does, at `TABLED` values of it between its bounds."""
 
     control: int
-    u: Array  # (GRID,)
-    effect: Array  # (GRID,), ascending
+    u: Array  # (TABLED,)
+    effect: Array  # (TABLED,), ascending
 
     def inverse(self, effect: Array) -> Array:
         """The control that has an effect, within the bounds."""
@@ -114,7 +114,7 @@ def steered(problem: Problem) -> Steered | None:
     push = _by_one_control(slopes[:, speed], n, None)
     if turn is None or push is None or turn == push:
         return None
-    by_curvature = bool((slopes[:, heading, speed].abs() > SAME).any())
+    by_curvature = bool((slopes[:, heading, speed].abs() > SAME_MODEL).any())
     tables = _tables(problem, z[:1, :1], low, high, heading, speed, (push, turn))
     if tables is None or (by_curvature and not alike(rates[:, heading], x[0, :, speed] * slopes[:, heading, speed])):
         return None
@@ -126,7 +126,7 @@ def heading_and_speed(x: Tensor, velocity: Tensor, slopes: Tensor) -> tuple[int,
 
     The velocity turns with the heading and grows with the speed, by as much, and depends on nothing else.
     """
-    depends = (slopes.abs() > SAME).any(1).any(0).nonzero().flatten().tolist()
+    depends = (slopes.abs() > SAME_MODEL).any(1).any(0).nonzero().flatten().tolist()
     if len(depends) != 2 or max(depends) >= x.shape[1]:
         return None
     for heading, speed in (depends, depends[::-1]):
@@ -138,7 +138,7 @@ def heading_and_speed(x: Tensor, velocity: Tensor, slopes: Tensor) -> tuple[int,
 
 def _by_one_control(slopes: Tensor, n: int, also: int | None) -> int | None:
     """The one control on which a rate with slopes (S, n + m) depends, besides a state; None where it isn't so."""
-    depends = (slopes.abs() > SAME).any(0).nonzero().flatten().tolist()
+    depends = (slopes.abs() > SAME_MODEL).any(0).nonzero().flatten().tolist()
     others = [i for i in depends if i != also]
     return others[0] - n if len(others) == 1 and others[0] >= n else None
 
@@ -150,8 +150,8 @@ def _tables(
     n, made = problem.n, []
     for control, rate in zip(controls, (speed, heading), strict=True):
         ends = 0.5 * (1.0 - WITHIN), 0.5 * (1.0 + WITHIN)
-        u = low[n + control] + torch.linspace(*ends, GRID, dtype=z.dtype, device=z.device) * (high - low)[n + control]
-        each = z.repeat(1, GRID, 1)
+        u = low[n + control] + torch.linspace(*ends, TABLED, dtype=z.dtype, device=z.device) * (high - low)[n + control]
+        each = z.repeat(1, TABLED, 1)
         each[..., speed], each[0, :, n + control] = 1.0, u
         effect = problem.dynamics.field(each[..., :n], each[..., n:])[0, :, rate]
         order = slice(None) if bool(effect[-1] > effect[0]) else slice(None, None, -1)
@@ -163,7 +163,7 @@ def _tables(
 
 
 def alike(a: Tensor, b: Tensor) -> bool:
-    return bool((a - b).abs().amax() <= SAME * (1.0 + b.abs().amax()))
+    return bool((a - b).abs().amax() <= SAME_MODEL * (1.0 + b.abs().amax()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +247,7 @@ def _steered(
     if not vehicle.by_curvature:
         turn = np.clip(turn, turns[0], turns[-1])
         return push, turn, (vehicle.push.inverse(push), vehicle.turn.inverse(turn))
-    slow = np.abs(speed) < SAME
+    slow = np.abs(speed) < SAME_MODEL
     curvature = np.clip(turn / np.where(slow, 1.0, speed), turns[0], turns[-1])
     curvature = np.where(slow, np.clip(np.sign(turn * wanted) * turns[-1], turns[0], turns[-1]), curvature)
     mean = speed + 0.5 * dt * push

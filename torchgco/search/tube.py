@@ -23,18 +23,18 @@ from torchgco.search.candidates import Candidates
 from torchgco.search.converge import mapped
 from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Follow, Free, Paths
-from torchgco.search.manoeuvres import DOES as MANOEUVRES
+from torchgco.search.manoeuvres import MANOEUVRES_TEXT as MANOEUVRES
 from torchgco.search.manoeuvres import manoeuvre
 from torchgco.search.proposals import Part
 from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
 from torchgco.search.row import Row
 
-AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
+TRACKED_AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
 # Tracked candidates lie a small part of R inside an obstacle, from where the interior point leads out of it again; from
 # deeper than `DEEP` it rarely does. A spring, or a wider tube, leaves most of them there.
 FOLLOW = Follow(smoothing=0.02, tube=0.05, stiffness=(200.0, 2000.0), iterations=40)
-TURN = 0.5  # share of a control's range by which a vehicle is turned on the spot over the first tenth of the horizon
-STILL = 1e-9  # share of the distance to the goal by which it may move then
+SPUN_BY = 0.5  # share of a control's range by which a vehicle is turned on the spot over the first tenth of the horizon
+TURN_WITHIN = 1e-9  # share of the distance to the goal by which it may move then
 LATEST_FIRST = 0.55  # share of the horizon: the slowest that the first pace is
 ROADMAP = Roadmap()
 PACES = 4  # at which each path is tracked
@@ -104,7 +104,7 @@ class Tube(Row):
         if rows.numel() == 0:
             return
         each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
-        for some in rows.split(max(1, AT_ONCE // each)):
+        for some in rows.split(max(1, TRACKED_AT_ONCE // each)):
             if search.call.late:
                 return
             self._some(search, some)
@@ -148,12 +148,12 @@ def _starts(problem: Problem, rest: Tensor) -> tuple[Tensor, Tensor]:
     """
     assert problem.goal is not None
     m, at = problem.m, problem.position
-    axes = [tuple(TURN * sign if i == j else 0.0 for j in range(m)) for i in range(m) for sign in (1.0, -1.0)]
+    axes = [tuple(SPUN_BY * sign if i == j else 0.0 for j in range(m)) for i in range(m) for sign in (1.0, -1.0)]
     starts = replace(FOLLOW, initial_offsets=tuple(axes)).starts(problem, rest)
     each = torch.arange(problem.B, device=rest.device).repeat_interleave(starts.shape[1])
     X = open_loop(problem.take(each), starts.flatten(0, 1)).unflatten(0, starts.shape[:2])
     away, size = (X - X[:, :1]).abs(), problem.goal.distance(problem.x0[:, at])
-    stays = away[..., at].amax((-1, -2)) <= STILL * size.unsqueeze(-1)
+    stays = away[..., at].amax((-1, -2)) <= TURN_WITHIN * size.unsqueeze(-1)
     usable = stays & (away.amax((-1, -2)) > 0.0)
     usable[:, 0] = True
     some = usable.any(0).nonzero().flatten()

@@ -25,7 +25,7 @@ from torchgco.sensitivity.points import Points, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
-NEAR = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
+EXACT_STEP = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
 SERVED = "a problem in float64"
 
 
@@ -103,7 +103,7 @@ def attached(
         at = points.take(rows)
         live = _live(asked, at, rows)
         found_at = residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
-        near = _step_left(at, found_at) <= NEAR
+        near = _step_left(at, found_at) <= EXACT_STEP
         if not bool(near.all()):
             points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
             rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)

@@ -33,12 +33,12 @@ from torchgco.solvers.session import Session
 POLISH = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8, max_iterations=40)
 # Share of 1 + the largest state or control by which a polish may move one. A solver ends where a share STATIONARY of
 # the cost may be left to save, which is of second order in what moves.
-STAYS = STATIONARY**0.5
-LEFT = 1e-6  # of rows' right hand sides of 1: what dependent rows leave open is about 1, others leave rounding
+STATIONARY_MOVE = STATIONARY**0.5
+LEFT_OPEN = 1e-6  # of rows' right hand sides of 1: what dependent rows leave open is about 1, others leave rounding
 # s z = mu at the end of a polish, 1e-13: where slack and multiplier are within this factor of each other, both about
 # sqrt(mu), which of them is 0 at the minimum isn't known.
 TOLD = 1e2
-SAME = 1e-4  # share by which derivatives with and without such rows may differ
+SAME_SLOPES = 1e-4  # share by which derivatives with and without such rows may differ
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> P
         weak = (untold.any(-1) & (reason == Why.DIFFERENTIABLE)).nonzero().flatten()
         reason[weak] = _weakness(problem.take(weak), result.take(weak), active[weak], untold[weak])
     found = solve_at(problem, result, active, probe(problem, active), give)
-    for where, why in ((~(found.left.amax(0) <= LEFT), Why.DEPENDENT_ROWS), (~found.definite, Why.NOT_STRICT)):
+    for where, why in ((~(found.left.amax(0) <= LEFT_OPEN), Why.DEPENDENT_ROWS), (~found.definite, Why.NOT_STRICT)):
         reason[where & (reason == Why.DIFFERENTIABLE)] = int(why)
     return Points(result, problem, growth, active, found.costates, reason, give, gap)
 
@@ -117,7 +117,7 @@ def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, re
     call = replace(Call.checked(asked, old.U, warm=old.multipliers), X0=old.X)
     end = POLISH.solved(call, smoothing=smoothing)
     new = Session(call, RAW).trajectories(end)
-    stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STAYS
+    stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STATIONARY_MOVE
     stays = end.status == SOLVED if smoothing > 0 else stays
     stays &= ~(chord_clearance(part, new.X) < chord_clearance(part, old.X).clamp(max=0.0))
     leaves = (stays | (end.status == SOLVED)) & leaves_goal(part, new.X, old.X)
@@ -200,4 +200,4 @@ def _weakness(problem: Problem, solution: Solution, active: Tensor, untold: Tens
     for rows in (active | untold, active & ~untold):
         z.append(solve_at(problem, solution, rows, probe(problem, rows)).z[0].flatten(1))
     change, size = (z[0] - z[1]).abs().amax(-1), torch.maximum(z[0].abs(), z[1].abs()).amax(-1)
-    return torch.where(change <= SAME * size, int(Why.DIFFERENTIABLE), int(Why.WEAKLY_ACTIVE))
+    return torch.where(change <= SAME_SLOPES * size, int(Why.DIFFERENTIABLE), int(Why.WEAKLY_ACTIVE))

@@ -32,7 +32,7 @@ from torchgco.solvers.session import Session
 PENALTY_MAX = 1e12  # ceiling of mu
 HALVED = 0.5  # of a violation: the least that an outer iteration with a growing penalty should give
 SETTLED = 1e-3  # share of J_var: a solve ends once an inner solve changes it by less and is feasible
-PASSES = 256  # problems times passes in one native call: between calls, an interrupt can end the solve
+PASSES_AT_ONCE = 256  # problems times passes in one native call: between calls, an interrupt can end the solve
 HOLD = 2.0  # penalty on an abandoned trajectory, as a multiple of the extra cost of its replacement
 
 
@@ -223,7 +223,7 @@ class OuterLoop:
         elif self._guided or self.call.callback is not None or self.call.deadline is not None:
             passes.run(1)
         else:
-            passes.run_half(PASSES)
+            passes.run_half(PASSES_AT_ONCE)
         status = passes.outcome.clone()
         going = (passes.ended & (status == Status.RUNNING)).nonzero().flatten()
         if self._guided and going.numel() > 0:

@@ -21,7 +21,7 @@ from torchgco.problem.problem import Problem
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
-FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
+FIRST, STRONGER, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
 HIDES = (
     0.1  # the error of a curvature by rounding, times the states' and controls' size squared, as a share of that unit
 )
@@ -55,7 +55,7 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         # Where a control costs nothing, or rounding spoils the Hessian, regularisation still gives gains.
         if not bool(step.failed.any()):
             break
-        mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
+        mu = torch.where(step.failed, FIRST * STRONGER**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
     cost = least_cost(problem) + (problem.cost.total(X, U) - constant_cost(problem)).abs()

@@ -16,16 +16,16 @@ from torchgco.problem.problem import Problem
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ilqr import ILQR, descend
 
-GAVE_UP = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE, Status.NON_FINITE
+WITHOUT_END = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE, Status.NON_FINITE
 HEAVY = 1e11  # penalty beside which a cost of one unit counts for nothing
 STUCK = 1e-3  # share of the squared violation that one Gauss-Newton step could save: about 1 where it can be closed
-LEAST = 1e-9  # regularisation of that step, as a share of the largest entry of its Hessians
-SEARCH = ILQR(max_iterations=200, tolerance=1e-12)
+STEP_REGULARISATION = 1e-9  # regularisation of that step, as a share of the largest entry of its Hessians
+REPAIR = ILQR(max_iterations=200, tolerance=1e-12)
 
 
 def least_violated(call: Call, end: SolveEnd, tolerance: float) -> SolveEnd:
     """The same, with STALLED where a solve failed and no step from its end lowers the violation any further."""
-    failed = torch.stack([end.status == status for status in GAVE_UP]).any(0)
+    failed = torch.stack([end.status == status for status in WITHOUT_END]).any(0)
     rows = (failed & ~(end.best.violation <= tolerance)).nonzero().flatten()
     if rows.numel() == 0 or call.late:
         return end
@@ -49,7 +49,7 @@ def least_violation(problem: Problem, U: Tensor) -> tuple[Tensor, Tensor, Tensor
     """
     cost_unit(problem)
     given = Multipliers.zero(problem, HEAVY)
-    end, status = descend(SEARCH, Lagrangian(problem.in_cost_units(), given, None, phr=True), U)
+    end, status = descend(REPAIR, Lagrangian(problem.in_cost_units(), given, None, phr=True), U)
     failed = (status == Status.NON_FINITE) | (status == Status.NOT_POSITIVE_DEFINITE)
     return end.X, end.U, ~failed & (left_to_close(problem, end.X, end.U) <= STUCK)
 
@@ -65,6 +65,6 @@ def left_to_close(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         constraint.accumulate(X, U, c, (c != 0).to(c.dtype), H)
         squares = squares + 0.5 * c.square().sum(-1).sum(-1)
     H = H.transpose(0, 1)
-    step = backward(linearise(problem, X, U), H, LEAST * H.abs().amax(dim=(0, 2, 3)))
+    step = backward(linearise(problem, X, U), H, STEP_REGULARISATION * H.abs().amax(dim=(0, 2, 3)))
     saved = -step.expected_change(torch.ones_like(squares)) / squares
     return torch.where(step.failed, torch.nan, saved)

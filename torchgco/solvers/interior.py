@@ -36,7 +36,7 @@ from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
 
-AT_ONCE = 256  # problems between two reports of progress
+REPORTED_AT_ONCE = 256  # problems between two reports of progress
 ROUGH, FEW = 1e-2, 60  # tolerance, and iterations, of a trajectory whose time is to be freed next
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 # In brackets: the names of Waechter and Biegler (2006). Constants without such a name are not in the paper.
@@ -166,7 +166,7 @@ class InteriorPoint(Solver):
         end.best.cost[:], end.best.violation[:] = guess.cost, guess.violation
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
-        for part in rows.split(AT_ONCE):
+        for part in rows.split(REPORTED_AT_ONCE):
             if call.late:
                 end.status[part] = Status.TIME_LIMIT
                 continue

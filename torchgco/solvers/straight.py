@@ -14,7 +14,7 @@ from torchgco.constraints.gates import gates_of
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 
-STEPS = 20  # of Gauss and Newton towards the rows of the last knot
+NEWTON_STEPS = 20  # of Gauss and Newton towards the rows of the last knot
 SOFT = 1e-12  # regularisation of a step, as a share of the largest entry of J J'
 
 
@@ -99,7 +99,7 @@ def asked_of_the_end(problem: Problem) -> Tensor:
     if not parts:
         return z
     rows = lambda z: torch.cat([last_rows(part, problem, z) for part in parts], dim=-1)
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         try:
             c, (J,) = rows(z), jacobian(rows, z)
         except MISTAKES:  # rows that PyTorch can't differentiate forwards: the guess stays where it is

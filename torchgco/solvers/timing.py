@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import HorizonWarning
+from torchgco.base.errors import NAMED, HorizonWarning
 from torchgco.base.status import Status
 from torchgco.base.tree import put, spread, take
 from torchgco.costs.base import WrappedCost
@@ -26,15 +26,14 @@ from torchgco.problem.in_time import factors_in, in_time, states_in_time, times_
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.history import appended, in_units
-from torchgco.solvers.steering import Steering
+from torchgco.solvers.linear_time import LinearTime
 from torchgco.solvers.straight import Legs, straight_line
 
-LONG = 1.5  # the first time that is held, as a multiple of an estimate
-LONGER = 2.0  # the next one, of the one before
+HELD_FIRST = 1.5  # the first time that is held, as a multiple of an estimate
+HELD_NEXT = 2.0  # the next one, of the one before
 AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
 BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
-NEAR = 0.1  # difference of two times, as a share, that makes no other search
-NAMED = 5  # problems that the warning names
+SAME_TIME = 0.1  # difference of two times, as a share, that makes no other search
 
 
 class Runs(Protocol):
@@ -76,13 +75,13 @@ class Timed:
         assert problem.time is not None
         self.time, line = problem.time, straight_line(problem)
         legs, U, N = Legs.of(problem, line[:, -1]), call.U0[..., : problem.m], problem.N
-        steering = Steering(problem, line if legs is None else _to_the_farthest(problem, line, legs))
+        steering = LinearTime(problem, line if legs is None else _to_the_farthest(problem, line, legs))
         estimate = steering.factors().unsqueeze(-1)
         if legs is not None:
             each = legs.stage_factors(torch.where(estimate.isnan(), 1.0, estimate), N)
             of_stages = torch.nn.functional.one_hot(self.time.of_stages(N), self.time.count).to(each)
             estimate = each @ of_stages / of_stages.sum(0)
-        own = LONG * torch.where(estimate.isnan(), 1.0, estimate)
+        own = HELD_FIRST * torch.where(estimate.isnan(), 1.0, estimate)
         self.own = own.clamp(self.time.least, self.time.most)
         self.first = self._first(estimate)
         X, U = (line, U) if call.X0 is not None or legs is not None else steering.guess(self.first.amax(-1), U)
@@ -104,7 +103,7 @@ class Timed:
             again += short
             left = (~over | short) & (guess < time.most).any(-1)
             rows = rows[left[rows]]
-            guess, given = torch.minimum(LONGER * guess, time.most), False
+            guess, given = torch.minimum(HELD_NEXT * guess, time.most), False
             if self.call.late:
                 break
         self._freed_where_none_is()
@@ -112,7 +111,7 @@ class Timed:
         return self._found
 
     def _first(self, estimate: Tensor) -> Tensor:
-        """The factors (B, S) to begin with: the guess, or `LONG` times the estimate (B, 1 or S), which may be NaN.
+        """The factors (B, S) to begin with: the guess, or `HELD_FIRST` times the estimate (B, 1 or S), perhaps NaN.
 
         A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end; beside
         states to begin with it counts all the same.
@@ -191,7 +190,7 @@ class Timed:
         """
         if not self.chooser.paces:
             return
-        far = ((self.first / self.own - 1.0).abs() > NEAR).any(-1)
+        far = ((self.first / self.own - 1.0).abs() > SAME_TIME).any(-1)
         # Where legs between gates have times of their own, other paces of all of them have found nothing better.
         alone = self.through_gates and self.time.count > 1
         for pace in (None, *(() if alone else self.chooser.paces)):

@@ -11,9 +11,9 @@ from torchgco.problem.problem import Problem
 from torchgco.solvers.ending import STATIONARY, constant_cost
 
 # Falls of the cost from that of the guess, as multiples of the size of that cost plus the cost unit of all stages.
-DEEP = 1e6  # a fall that asks for a closer look
+DEEP_FALL = 1e6  # a fall that asks for a closer look
 BOTTOMLESS = 1e20  # one that needs none: IPOPT's diverging_iterates_tol
-FAR = 1e6  # times 1 + the guess's own controls: a way of controls that asks for a look
+FAR_CONTROLS = 1e6  # times 1 + the guess's own controls: a way of controls that asks for a look
 FARTHER = 10.0, 1e3, 1e6  # times the way from the guess, for that look
 GROWING = 1e-3  # controls that moved by less than this share of the largest move stay where they are
 
@@ -28,8 +28,8 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     """
     unit = problem.N * cost_unit(problem)
     way = (found.U - U0).abs().flatten(1).amax(-1) / (1.0 + U0.abs().flatten(1).amax(-1))
-    open_ended = (left > STATIONARY) | (way >= FAR)
-    falls = ((found.cost < -DEEP * unit) | open_ended) & (found.violation <= tolerance)
+    open_ended = (left > STATIONARY) | (way >= FAR_CONTROLS)
+    falls = ((found.cost < -DEEP_FALL * unit) | open_ended) & (found.violation <= tolerance)
     rows = falls.nonzero().flatten()
     if rows.numel() == 0:
         return falls
@@ -39,7 +39,7 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     farther, clear = _farther(held, U0, U, tolerance)
     costs = torch.stack([cost, *farther])
     fall, size, times = before - costs, before.abs() + unit, cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
-    linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP * size)
+    linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP_FALL * size)
     rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
     without = (cost - constant_cost(held)).abs() + unit
     by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]

@@ -7,12 +7,11 @@ import time
 from collections import Counter
 from typing import Any
 
-from torchgco.base.notices import watched
+from torchgco.base.notices import AFTER, watched
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Progress, RowEnd
 
-AFTER = 2.0  # s without a bar
-STEP = 0.1  # s between two drawings of the bar
+BAR_STEP = 0.1  # s between two drawings of the bar
 
 
 class Watcher:
@@ -43,7 +42,7 @@ class Watcher:
         elif now.candidates is None and not self.tabled and now.passes >= self.next:
             self.next = 2 * now.passes
             self._say(f"pass {now.passes:4d}: {_problems(now.rows.numel())}, {now.finished} of {now.total} ended")
-        if self.bar is not None and (late := time.monotonic()) - self.drawn > STEP:
+        if self.bar is not None and (late := time.monotonic()) - self.drawn > BAR_STEP:
             self.drawn = late
             state = "" if now.candidates is None else "candidates {}/{}".format(*now.candidates)
             self.bar.set_postfix_str(state, refresh=False)

@@ -18,7 +18,7 @@ import torch
 from torch.utils._pytree import tree_map
 
 from torchgco.tracing.arrays import NoCounterpart, boxed
-from torchgco.tracing.operations import OPERATIONS, WHOLE, is_logical, to_single, to_truth, wrapped
+from torchgco.tracing.operations import OPERATIONS, WHOLE_NUMBERS, is_logical, to_single, to_truth, wrapped
 from torchgco.tracing.recorder import Operation, Slot, name_of
 
 # Operations that convert their first argument to `dtype`, where that is given, before they compute.
@@ -35,7 +35,7 @@ def replay(operation: Operation, known: dict[Slot, Any], precision: torch.dtype)
         NoCounterpart: a type or an argument that has none.
     """
     name, made = name_of(operation.function), operation.outputs
-    function = WHOLE.get(name, OPERATIONS[name]) if _is_whole(made[0].dtype) else OPERATIONS[name]
+    function = WHOLE_NUMBERS.get(name, OPERATIONS[name]) if _is_whole(made[0].dtype) else OPERATIONS[name]
     args, kwargs = operation.filled(known)
     if name in REDUCTIONS and kwargs.get("dtype") is not None:
         args = (_as_type(args[0], kwargs["dtype"], operation.inputs[:1], known, precision), *args[1:])

@@ -32,7 +32,7 @@ from torchgco.tracing.trust import (
     BY_NAME,
     ELSEWHERE,
     HEAP,
-    OPERATIONS,
+    OPERATION_TYPES,
     is_fixed,
     is_library,
     is_made,
@@ -42,8 +42,8 @@ from torchgco.tracing.trust import (
     tells_settings,
 )
 
-MOST = 50_000  # facts of a problem: with more of them a trace is as quick
-FEW = 10_000  # numbers of a tensor of torchgco's own parts that are compared by content
+MOST_FACTS = 50_000  # facts of a problem: with more of them a trace is as quick
+COMPARED_NUMBERS = 10_000  # numbers of a tensor of torchgco's own parts that are compared by content
 PLAIN = {bool, int, str, bytes, torch.dtype, torch.device, *map(type, (None, ..., NotImplemented))}
 TENSORS = {Tensor, torch.nn.Parameter}
 # What Python and decorators write into a class; no code reads numbers there.
@@ -54,7 +54,7 @@ BESIDES = {
 }  # fmt: skip
 # What tensors know of their past, and what was asked of them: it changes without any change of theirs.
 HISTORY = {"grad", "_grad", "grad_fn", "is_leaf", "_version", "retains_grad", "_backward_hooks", "_base"}
-ABSENT = "absent"
+NO_ATTRIBUTE = "absent"
 
 
 class Unseen(Exception):
@@ -114,7 +114,7 @@ class Facts:
             self._class(thing)
         elif isinstance(thing, np.generic):
             self._scalar(thing)
-        elif isinstance(thing, OPERATIONS):
+        elif isinstance(thing, OPERATION_TYPES):
             if not is_fixed(thing):
                 raise Unseen(str(thing))
             self.same(thing)
@@ -124,7 +124,7 @@ class Facts:
 
     def note(self, *facts: Hashable) -> None:
         self._found.append(facts)
-        if len(self._found) > MOST:
+        if len(self._found) > MOST_FACTS:
             raise Unseen("too much")
 
     def same(self, thing: Any) -> None:
@@ -190,7 +190,7 @@ class Facts:
             try:
                 self.walk(cell.cell_contents)
             except ValueError:  # not filled yet
-                self.note(ABSENT)
+                self.note(NO_ATTRIBUTE)
         self._all((function.__defaults__, function.__kwdefaults__))
         self.same(function.__code__)
         if vars(function):
@@ -209,7 +209,7 @@ class Facts:
             if name in known or name in usual:
                 self.walk(known[name] if name in known else usual[name])
             else:
-                self.note(ABSENT)
+                self.note(NO_ATTRIBUTE)
         return None
 
     def _method(self, method: types.MethodType) -> None:
@@ -342,7 +342,7 @@ class Facts:
             self.note(name)
             if name in own:
                 self._form(value)
-            elif of_torchgco and isinstance(value, Tensor) and value.numel() <= FEW:
+            elif of_torchgco and isinstance(value, Tensor) and value.numel() <= COMPARED_NUMBERS:
                 self.note(value.dtype, value.shape, value.detach().cpu().contiguous().numpy().tobytes())
             else:
                 self.walk(value)

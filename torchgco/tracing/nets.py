@@ -24,7 +24,7 @@ MOST_WEIGHTS = 300_000  # of all networks of a function: beyond, PyTorch's produ
 LINE = 8  # numbers of a line of the cache
 PRODUCTS = ("aten.addmm", "aten.mm")
 # Operations that keep the rows and neurons of an array, whatever they make of its shape.
-SHAPES = ("view", "reshape", "_unsafe_view", "unsqueeze", "squeeze", "expand", "clone", "alias", "detach", "_to_copy")
+RESHAPES = ("view", "reshape", "_unsafe_view", "unsqueeze", "squeeze", "expand", "clone", "alias", "detach", "_to_copy")
 LINEAR = ("add", "sub", "rsub", "neg", "full_like", "zeros_like", "ones_like")
 CURVED = (
     "mul", "div", "reciprocal", "pow", "square", "sqrt", "rsqrt", "abs", "sign", "sin", "cos", "tan", "asin", "acos",
@@ -32,7 +32,7 @@ CURVED = (
     "elu", "log_sigmoid_forward", "relu", "leaky_relu", "softplus", "gelu", "where", "clamp", "clamp_min", "clamp_max",
     "hardtanh", "maximum", "minimum", "lt", "le", "gt", "ge", "eq", "ne", "logical_and", "logical_or", "logical_not",
 )  # fmt: skip
-KEEPS = {f"aten.{name}" for name in SHAPES} | {"prims.convert_element_type"}
+KEEPS = {f"aten.{name}" for name in RESHAPES} | {"prims.convert_element_type"}
 NEURONWISE = {f"aten.{name}" for name in (*LINEAR, *CURVED)}
 
 

@@ -314,7 +314,7 @@ def _whole_power(a: np.ndarray, exponent: Any) -> np.ndarray:
 
 
 # The counterparts where the result is an integer.
-WHOLE: dict[str, Callable] = {
+WHOLE_NUMBERS: dict[str, Callable] = {
     "aten.bitwise_and": _refused,
     "aten.bitwise_or": _refused,
     "aten.bitwise_not": _unary(lambda x: -x - 1),

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
-MOST = 50_000  # code objects whose names are kept
+MOST_CODES = 50_000  # code objects whose names are kept
 # Packages whose functions compute by their arguments alone, and whose classes keep what they know in `vars`.
 TRUSTED = {
     "torch", "torchgco", "numpy", "math", "cmath", "operator", "builtins", "functools", "itertools", "collections",
     "dataclasses", "enum", "abc", "typing", "types", "copy", "contextlib", "numbers", "string", "warnings",
 }  # fmt: skip
-APART = "numpy.random", "torch.jit", "torch._C", "torch.hub"  # parts of them that do otherwise
+UNTRUSTED_PARTS = "numpy.random", "torch.jit", "torch._C", "torch.hub"  # parts of them that do otherwise
 # Names by which these packages' functions read from elsewhere, be it global or an attribute.
 ELSEWHERE = {
     "globals", "locals", "eval", "exec", "compile", "open", "input", "breakpoint", "__import__", "__builtins__",
@@ -34,7 +34,7 @@ HEAP = 1 << 9  # the flag of classes that a program has made
 
 def is_trusted(module: str | None) -> bool:
     """Whether the functions of a module compute by their arguments alone."""
-    return module is not None and module.partition(".")[0] in TRUSTED and not module.startswith(APART)
+    return module is not None and module.partition(".")[0] in TRUSTED and not module.startswith(UNTRUSTED_PARTS)
 
 
 def is_library(thing: types.FunctionType | type | types.ModuleType) -> bool:
@@ -103,7 +103,7 @@ def read_by(code: types.CodeType) -> Code:
     """What a code object reads; looked at once for each."""
     known = _codes.get(id(code))
     if known is None:
-        if len(_codes) > MOST:
+        if len(_codes) > MOST_CODES:
             _codes.clear()
         reads, names = dict[str, None](), set(code.co_names)
         for step in dis.get_instructions(code):
@@ -122,4 +122,4 @@ def read_by(code: types.CodeType) -> Code:
 
 _codes: dict[int, Code] = {}  # holds the code objects: their identities aren't used again
 _IN_C = types.MethodDescriptorType, types.WrapperDescriptorType
-OPERATIONS = np.ufunc, torch._ops.OpOverload, torch._ops.OpOverloadPacket
+OPERATION_TYPES = np.ufunc, torch._ops.OpOverload, torch._ops.OpOverloadPacket

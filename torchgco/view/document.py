@@ -20,7 +20,7 @@ from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
 from torchgco.view.vehicles import Look
 
-SHARED = 500  # obstacles of one kind from which on layouts with the same ones share them
+SHARED_FROM = 500  # obstacles of one kind from which on layouts with the same ones share them
 
 
 @dataclass
@@ -90,7 +90,7 @@ class Document:
 
     def _placed(self, packing: Packing, shapes: Shapes, middle: np.ndarray) -> dict[str, Any]:
         """Obstacles in the layout's part; many of them, as of a map, in a part that layouts of equal ones share."""
-        if len(shapes.center) < SHARED:
+        if len(shapes.center) < SHARED_FROM:
             return shapes.packed(packing, middle)
         own = Packing()
         text = own.sealed(shapes.packed(own, 0.5 * (shapes.center.min(axis=0) + shapes.center.max(axis=0))))

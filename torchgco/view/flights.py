@@ -13,7 +13,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
-from torchgco.view.packing import LARGEST, Packing, number
+from torchgco.view.packing import LARGEST_HALF, Packing, number
 from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
@@ -117,7 +117,7 @@ def worst_row(problem: Problem, violation: np.ndarray, worst: np.ndarray) -> Row
 
 def whole(X: np.ndarray) -> np.ndarray:
     """The knots (K, n) of states (N+1, n) before the first that isn't finite, or is too far to be drawn."""
-    good = np.isfinite(X).all(axis=1) & (np.abs(np.nan_to_num(X)) < LARGEST).all(axis=1)
+    good = np.isfinite(X).all(axis=1) & (np.abs(np.nan_to_num(X)) < LARGEST_HALF).all(axis=1)
     return X if good.all() else X[: int(good.argmin())]
 
 

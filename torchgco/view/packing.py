@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-LARGEST = 6e4  # the largest magnitude that is kept; half precision ends at 65,504
+LARGEST_HALF = 6e4  # the largest magnitude that is kept; half precision ends at 65,504
 KEY = "$"
-WHOLE = 4  # bytes of a whole number
+WHOLE_BYTES = 4  # bytes of a whole number
 
 
 class Packing:
@@ -34,7 +34,7 @@ class Packing:
                 so far, so that rounding doesn't add up: with steps of 0.3 m a path is right to 0.1 mm anywhere.
         """
         values = np.asarray(values, dtype=float)
-        halves = differences(values) if steps else values.clip(-LARGEST, LARGEST).astype("<f2")
+        halves = differences(values) if steps else values.clip(-LARGEST_HALF, LARGEST_HALF).astype("<f2")
         raw = np.frombuffer(np.ascontiguousarray(halves).tobytes(), dtype=np.uint8).reshape(-1, 2)
         place = self.size
         self.planes.append(raw.T.tobytes())
@@ -44,7 +44,7 @@ class Packing:
     def put_whole(self, values: np.ndarray) -> dict[str, Any]:
         """Keep whole numbers (K,) from 0 up to below 2^32, as the differences between one and the next, modulo 2^32."""
         steps = np.diff(np.asarray(values, dtype=np.uint32), prepend=np.uint32(0))
-        raw = np.frombuffer(steps.astype("<u4").tobytes(), dtype=np.uint8).reshape(-1, WHOLE)
+        raw = np.frombuffer(steps.astype("<u4").tobytes(), dtype=np.uint8).reshape(-1, WHOLE_BYTES)
         place = self.size
         self.planes.append(raw.T.tobytes())
         self.size += raw.size
@@ -60,8 +60,8 @@ class Packing:
 def differences(values: np.ndarray) -> np.ndarray:
     """Half-precision steps (K, ...) along the first axis, whose sums follow the values (K, ...)."""
     found, reached = np.empty(values.shape, dtype="<f2"), np.zeros(values.shape[1:])
-    for k, value in enumerate(values.clip(-LARGEST, LARGEST)):
-        found[k] = (value - reached).clip(-LARGEST, LARGEST)
+    for k, value in enumerate(values.clip(-LARGEST_HALF, LARGEST_HALF)):
+        found[k] = (value - reached).clip(-LARGEST_HALF, LARGEST_HALF)
         reached = reached + found[k].astype(float)
     return found
 

@@ -10,7 +10,7 @@ from torchgco.solution import Comparison, Fate, SearchRecord, Solution
 from torchgco.view.document import Line, SearchPart
 from torchgco.view.flights import whole
 
-STEPS = ("tracked", "relaxed", "refined")
+SEARCH_STEPS = ("tracked", "relaxed", "refined")
 
 
 def search_of(solution: Solution, problem: Problem, b: int) -> SearchPart | None:
@@ -64,7 +64,7 @@ def _candidates(one: Comparison, problem: Problem, i: int) -> list[Line]:
         if fate == Fate.ABSENT:
             continue
         path, cost = int(one.path[i, c]), float(one.cost[i, c])
-        steps = {step: whole(_array(getattr(one, step)[i, c]))[:, problem.position] for step in STEPS}
+        steps = {step: whole(_array(getattr(one, step)[i, c]))[:, problem.position] for step in SEARCH_STEPS}
         reached = [step for step, points in steps.items() if len(points) > 1]
         told = f"candidate {c + 1} along path {path + 1}: {fate.name.lower()}"
         told += f", cost {cost:.6g}" if np.isfinite(cost) else ""

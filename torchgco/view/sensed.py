@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.missions.sensing.grid import OCCUPIED
-from torchgco.missions.unknown.safety import SeenLog
+from torchgco.exploration.sensing.grid import OCCUPIED
+from torchgco.missions.log import SeenLog
 from torchgco.view.packing import Packing
 
 STRAIGHT = 1e-9  # m: corners of a path that turn it less are left out

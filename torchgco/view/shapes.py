@@ -27,7 +27,7 @@ from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.view.cells import merged
 from torchgco.view.packing import Packing
 
-STRAIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no turn
+NOT_TURNED = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no turn
 
 
 @dataclass(frozen=True)

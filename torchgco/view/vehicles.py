@@ -13,10 +13,10 @@ import numpy as np
 
 from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
 from torchgco.dynamics.names import states_of
+from torchgco.obstacles.attitude import QUATERNION
 
-QUATERNION = ["qw", "qx", "qy", "qz"]
 HEADING = "heading"
-STILL = 1e-9  # m: a way that is shorter has no direction
+NO_WAY = 1e-9  # m: a way that is shorter has no direction
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def look_of(dynamics: Dynamics) -> Look:
         if isinstance(dynamics, kind):
             return look
     names = [one.name for one in states_of(dynamics)]
-    if QUATERNION[0] in names and names[(k := names.index(QUATERNION[0])) : k + 4] == QUATERNION:
+    if QUATERNION[0] in names and tuple(names[(k := names.index(QUATERNION[0])) : k + 4]) == QUATERNION:
         return Look("dart", quaternion=slice(k, k + 4))
     if HEADING in names:
         return Look("dart", heading=names.index(HEADING))
@@ -72,7 +72,7 @@ def _pointing(p: np.ndarray) -> np.ndarray:
     """Quaternions (K, 4) of bodies without roll that point along a way p (K, d); x, where it leads nowhere."""
     steps = np.diff(p, axis=0, append=p[-1:])
     steps = np.concatenate((steps, np.zeros((len(p), 3 - p.shape[1]))), axis=1)
-    moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > STILL)
+    moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > NO_WAY)
     if len(moving) == 0:
         return np.tile([1.0, 0.0, 0.0, 0.0], (len(p), 1))
     last = np.searchsorted(moving, np.arange(len(p)), side="right") - 1

@@ -18,7 +18,7 @@ from tests.maps.files.samples import POINTS, ROOM
 from torchgco import InputError
 from torchgco.maps import OccupancyGrid, PointCloud, read
 from torchgco.maps.files.bags import mcap, ros1, sqlite
-from torchgco.maps.files.bags.container import GRID, Message
+from torchgco.maps.files.bags.container import GRIDS, Message
 from torchgco.maps.files.bags.messages import decoded
 from torchgco.maps.files.source import Source
 
@@ -169,11 +169,11 @@ def grid_message(ros1: bool = False, **changed: Any) -> Message:
     cells = given["cells"]
     if ros1:
         data = struct.pack("<III", 1, 2, 3) + struct.pack("<I", 3) + b"map" + struct.pack("<IIfII", *info)
-        return Message(GRID, data + struct.pack("<7d", *place) + struct.pack("<I", len(cells)) + cells, "ros1")
+        return Message(GRIDS, data + struct.pack("<7d", *place) + struct.pack("<I", len(cells)) + cells, "ros1")
     order = given.get("order", "<")
     data = struct.pack(f"{order}iII", 1, 2, 4) + b"map\0" + struct.pack(f"{order}iIfII", *info)
     data += bytes(-len(data) % 8) + struct.pack(f"{order}7d", *place) + struct.pack(f"{order}I", len(cells)) + cells
-    return Message(GRID, bytes([0, order == "<", 0, 0]) + data, "cdr")
+    return Message(GRIDS, bytes([0, order == "<", 0, 0]) + data, "cdr")
 
 
 @pytest.mark.parametrize("message", [grid_message(), grid_message(True), grid_message(order=">")])

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, InstantiationException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchgco.base.errors import InputError
@@ -23,7 +23,7 @@ from torchgco.experiments.config.checks import as_input_error, check, hydra_word
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.config.stored import check_stored
-from torchgco.experiments.results.identity import plain
+from torchgco.experiments.results.identity import settings_of
 from torchgco.kernels import use_native
 from torchgco.missions import Mission
 from torchgco.missions.plant import Plant, flown
@@ -42,9 +42,9 @@ register()
 
 @dataclass(frozen=True)
 class Setup:
-    """A composed configuration and the objects made from it, for studies and notebooks."""
+    """A composed configuration, resolved, in plain containers, and the objects made from it."""
 
-    config: DictConfig
+    configuration: dict[str, Any]
     vehicle: Vehicle
     scenario: Scenario
     solver: Any
@@ -60,7 +60,7 @@ class Setup:
         Raises:
             InputError: count below 1, more than there are, or more than fit into memory.
         """
-        count = count if count is not None else self.config.study.layouts
+        count = count if count is not None else self.configuration["study"]["layouts"]
         count = count if count is not None else self.scenario.available or DEFAULT_LAYOUTS
         check_value(count, Count, "study.layouts")
         self._refuse_beyond_memory(self.scenario.draw(range(1), self.seed), count)
@@ -101,22 +101,29 @@ def compose(overrides: Sequence[str] = ()) -> Setup:
     return build(compose_config(overrides))
 
 
-def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> DictConfig:
-    """The configuration alone; `searchpath` names further folders of configs."""
+def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> dict[str, Any]:
+    """The configuration alone, as `plain` has it; `searchpath` names further folders of configs."""
     extra = [f"hydra.searchpath=[{','.join(searchpath)}]"] if searchpath else []
     words = hydra_words(overrides)
     running = GlobalHydra.instance().hydra  # a study composes its baselines while Hydra's own main runs
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(config_dir()), **ENTRY):
-            return hydra.compose("config", [*words, *extra])
+            return plain(hydra.compose("config", [*words, *extra]))
     except (HydraException, OmegaConfBaseException) as error:
         raise as_input_error(error) from None
     finally:
         GlobalHydra.instance().hydra = running
 
 
-def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[str | None], DictConfig]:
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration as plain dicts, lists and numbers, resolved: no part of the library knows OmegaConf."""
+    held = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(held, dict)
+    return {str(key): value for key, value in held.items()}
+
+
+def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[str | None], dict[str, Any]]:
     """A function that composes the configuration of some overrides with another solver, with None as it is.
 
     `sources` are Hydra's own `config_sources` of the command.
@@ -125,7 +132,7 @@ def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[st
     folders = [source.path for source in sources if source.schema == "file"]
     others = tuple(f"file://{path}" for path in folders if str(config_dir()) not in path)
 
-    def recompose(solver: str | None) -> DictConfig:
+    def recompose(solver: str | None) -> dict[str, Any]:
         try:
             return _composed(tuple(overrides) if solver is None else (*given, f"solver={solver}"), others)
         except InputError as error:
@@ -137,7 +144,7 @@ def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[st
 
 
 @cache
-def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictConfig:
+def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> dict[str, Any]:
     return compose_config(overrides, searchpath)  # needed several times by the folder's name
 
 
@@ -146,31 +153,32 @@ def forget_composed() -> None:
     _composed.cache_clear()
 
 
-def build(config: DictConfig) -> Setup:
-    """Instantiate model, scenario, solver and device of a configuration.
+def build(configuration: dict[str, Any]) -> Setup:
+    """Instantiate model, scenario, solver and device of a configuration, as `plain` has it.
 
     Raises:
         InputError: a value that a part refuses, or parts that don't fit each other.
     """
-    check(plain(config))
-    if OmegaConf.is_missing(config.scenario, "path"):
-        of_map = str(config.scenario.get("_target_")).endswith("MapFile")
+    check(configuration)
+    scenario, model = configuration["scenario"], configuration["model"]
+    if scenario.get("path") == MISSING:
+        of_map = str(scenario.get("_target_")).endswith("MapFile")
         wanted = "the map: add scenario.path=FILE" if of_map else "the layout file: add scenario.path=FILE.npz"
         raise InputError("scenario.path", wanted, "none")
-    device, dtype = _device(config.device)
+    device, dtype = _device(configuration["device"])
     setup = Setup(
-        config=config,
-        vehicle=_vehicle(config),
-        scenario=_instantiate(config.scenario, "scenario"),
-        solver=solver_of(config),
-        solver_name=config.solver.name,
-        seed=config.seed,
+        configuration=configuration,
+        vehicle=_vehicle(configuration),
+        scenario=_instantiate(scenario, "scenario"),
+        solver=solver_of(configuration),
+        solver_name=configuration["solver"]["name"],
+        seed=configuration["seed"],
         device=device,
         dtype=dtype,
     )
     setup = replace(setup, mission=_mission(setup))
-    if config.model.dimension != setup.vehicle.dimension:
-        raise InputError("model.dimension", f"{setup.vehicle.dimension}, as its dynamics say", config.model.dimension)
+    if model["dimension"] != setup.vehicle.dimension:
+        raise InputError("model.dimension", f"{setup.vehicle.dimension}, as its dynamics say", model["dimension"])
     d, n = setup.scenario.dimension, setup.scenario.states
     another = n != setup.vehicle.dynamics.n and (d, n) in BUILT_IN.values()
     if d != setup.vehicle.dimension or another:
@@ -182,13 +190,13 @@ def build(config: DictConfig) -> Setup:
     return setup
 
 
-def _vehicle(config: DictConfig) -> Vehicle:
+def _vehicle(configuration: Mapping[str, Any]) -> Vehicle:
     """The model; mistakes in its airframe have the names that a command has for it."""
     try:
-        return _instantiate(config.model.vehicle, "model.vehicle")
+        return _instantiate(configuration["model"]["vehicle"], "model.vehicle")
     except InputError as error:
         part, _, name = error.field.partition(".")
-        if part != "airframe" or config.get("vehicle") is None:
+        if part != "airframe" or configuration.get("vehicle") is None:
             raise
         raise InputError(f"vehicle.{name}", error.expected, error.got) from None
 
@@ -203,19 +211,19 @@ def _mission(setup: Setup) -> Mission | None:
     Raises:
         InputError: a value that a part refuses, a model other than the quadrotor, or a device other than the CPU.
     """
-    node = setup.config.get("mission")
+    node, plant = setup.configuration.get("mission"), setup.configuration.get("plant")
     if node is None:
-        if setup.config.get("plant") is not None:
+        if plant is not None:
             raise InputError("plant", "a mission: experiment=mission or mission=default", "a plant alone")
         return None
-    if setup.config.get("plant") is None:
+    if plant is None:
         raise InputError("plant", "the vehicle that flies the mission: plant=rotors", "none")
     if setup.device.type != "cpu" or setup.dtype != torch.float64:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
     if setup.scenario.dimension != 3 or isinstance(setup.scenario, GateForest | Race):
         raise InputError("scenario", FLOWN, setup.scenario.name)
-    made, plant = _instantiate(node, "mission"), _instantiate(setup.config.plant, "plant")
-    mission = _closed_loop(made, plant, setup.solver, setup.vehicle)
+    made = _instantiate(node, "mission")
+    mission = _closed_loop(made, _instantiate(plant, "plant"), setup.solver, setup.vehicle)
     mission.check(setup.vehicle.dynamics)
     return mission
 
@@ -236,9 +244,9 @@ def _closed_loop(made: Any, plant: Any, solver: Any, vehicle: Vehicle) -> Missio
         raise as_input_error(error, field) from None
 
 
-def solver_of(config: DictConfig) -> Any:
+def solver_of(configuration: Mapping[str, Any]) -> Any:
     """The solver alone."""
-    return _instantiate(config.solver, "solver", leave_out="name")
+    return _instantiate(settings_of(configuration), "solver")
 
 
 def solver_from(settings: Mapping[str, Any], trust: bool = False) -> Any:
@@ -271,16 +279,11 @@ def _stored(tree: Any, group: str, field: str, trust: bool) -> Any:
     return _instantiate(tree, field)
 
 
-def _instantiate(node: Any, field: str, leave_out: str | None = None) -> Any:
-    if not isinstance(node, dict | DictConfig):
+def _instantiate(node: Any, field: str) -> Any:
+    if not isinstance(node, dict):
         raise InputError(field, "a group of keys", repr(node))
     try:
-        node = OmegaConf.create(node) if isinstance(node, dict) else node
-        # Containers become lists here: no part of the library knows OmegaConf.
-        plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
-        assert isinstance(plain, dict)
-        parts = {key: value for key, value in plain.items() if key != leave_out}
-        return hydra.utils.instantiate(parts, _convert_="all", **ANY_CLASS)
+        return hydra.utils.instantiate(node, _convert_="all", **ANY_CLASS)
     except RecursionError:
         raise InputError(field, "less deeply nested keys", "more than Python can follow") from None
     except (InstantiationException, OmegaConfBaseException, TypeError) as error:  # Hydra 1.4 wraps no TypeError
@@ -300,7 +303,7 @@ class _Device:
         check_options(self, "device")
 
 
-def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
+def _device(node: Mapping[str, Any]) -> tuple[torch.device, torch.dtype]:
     """The device and dtype; also sets the threads and kernels of this process."""
     given = _Device(**{field.name: node[field.name] for field in fields(_Device)})
     if given.name == "cuda" and not torch.cuda.is_available():

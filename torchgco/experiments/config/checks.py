@@ -17,11 +17,11 @@ from torchgco.base.options import Seed, check_value
 from torchgco.experiments.config.groups import config_dir, options_of
 from torchgco.experiments.results.identity import CLOSED_LOOP
 
-NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
+NAME_PATTERN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
 MODEL = ("dimension", "vehicle")
-VEHICLE = "vehicle"  # the group of airframes that the model of a quadrotor brings along
+VEHICLE_GROUP = "vehicle"  # the group of airframes that the model of a quadrotor brings along
 NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
-PATHS = ("scenario.path", "hydra.run.dir", "hydra.sweep.dir")  # keys whose values are paths, of any letters
+PATH_KEYS = ("scenario.path", "hydra.run.dir", "hydra.sweep.dir")  # keys whose values are paths, of any letters
 
 
 def hydra_words(words: Iterable[str]) -> list[str]:
@@ -38,7 +38,7 @@ def _hydra_word(word: str) -> str:
     if re.fullmatch(r"~[\w.]+\.\d+", word):  # Hydra fails there, too
         raise InputError(word[1:], "a key: a row of a list can be changed by its index, but not deleted", word)
     key, equals, value = word.lstrip("+").partition("=")
-    if key in PATHS and equals:
+    if key in PATH_KEYS and equals:
         return f"{word.partition('=')[0]}={_hydra_path(key, value)}"
     group = key.split("@")[0]
     if equals and re.fullmatch(r"[\w/]+", group) and (options := options_of(group)):
@@ -94,7 +94,7 @@ def check(config: Mapping[str, Any]) -> None:
     groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
     own = [key for key in base if key not in ("defaults", "hydra")]
     needed = [*own, *(key for key, option in groups.items() if option is not None)]
-    _keys(config, "", needed, [*own, *groups, VEHICLE])
+    _keys(config, "", needed, [*own, *groups, VEHICLE_GROUP])
     device: Any = OmegaConf.load(conf / "device" / f"{groups['device']}.yaml")
     for name, known in (("study", base["study"]), ("device", device), ("model", MODEL)):
         _keys(config[name], name, list(known), list(known))
@@ -123,7 +123,7 @@ def _keys(node: Any, group: str, needed: Sequence[str], known: Sequence[str] = (
 
 
 def _name(value: Any, field: str) -> None:
-    if not isinstance(value, str) or not NAME.fullmatch(value):
+    if not isinstance(value, str) or not NAME_PATTERN.fullmatch(value):
         expected = "at most 64 letters, digits, '_', '-' and '.', which isn't the first"
         raise InputError(field, expected, repr(value))
 
@@ -189,10 +189,10 @@ def _unknown_key(error: BaseException, key: str) -> InputError:
     name, parent = key.rpartition(".")[2], found.parent_node if hasattr(found, "parent_node") else None
     if key in CLOSED_LOOP:
         return InputError(key, "experiment=mission, as its keys are given", "none")
-    if key.split(".")[0] == VEHICLE and not (isinstance(parent, DictConfig) and "mass" in parent):
+    if key.split(".")[0] == VEHICLE_GROUP and not (isinstance(parent, DictConfig) and "mass" in parent):
         return InputError(key, "model=quadrotor, whose airframe this is", "another model")
     if key.startswith("model.vehicle.dynamics.airframe."):
-        return InputError(key, f"{VEHICLE}.{name}, as airframes have a group of their own", name)
+        return InputError(key, f"{VEHICLE_GROUP}.{name}, as airframes have a group of their own", name)
     known = [str(other) for other in parent] if isinstance(parent, DictConfig) else []
     near = get_close_matches(name, known, n=1)
     return InputError(key, "a key that the configuration has" + "".join(f", such as {other}" for other in near), name)

@@ -23,7 +23,8 @@ from omegaconf import OmegaConf
 
 from torchgco.base.version import PACKAGE
 from torchgco.dynamics import Airframe
-from torchgco.missions import Disturbance, Mission, Planner, RotorPlant, Tracker
+from torchgco.exploration import SensorMission
+from torchgco.missions import Disturbance, Planner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
 from torchgco.scenarios import (
     Crossing,
@@ -44,7 +45,7 @@ from torchgco.scenarios import (
     Woods,
     Yard,
 )
-from torchgco.scenarios.quadrotor import STATES
+from torchgco.scenarios.quadrotor import PLANNING_STATES
 from torchgco.scenarios.vehicle import BUILT_IN
 from torchgco.search import Passes
 
@@ -54,8 +55,8 @@ FAMILIES: tuple[type[Any], ...] = (
 )  # fmt: skip
 ANYWHERE = {2: "unicycle", 3: "quadrotor"}  # the model for layouts that give positions alone
 BY_DIMENSION = "torchgco.by_dimension"
-ALIKE = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each
-WIDTH = 100  # of the help page
+SHARED_FIELDS = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each
+HELP_WIDTH = 100  # of the help page
 _targets: dict[str, set[str]] = {}  # paths of the classes that registered options make, by group
 
 
@@ -127,10 +128,10 @@ def register() -> None:
         trees = _tree(make(2)), _tree(make(3))
         _store("solver", name, {"name": name} | _joined(*trees), *trees)
     _store("vehicle", "paper", _fields_of(Airframe))
-    _store("plant", "rotors", _fields_of(RotorPlant, *ALIKE))
-    planner = {"_partial_": True} | _fields_of(Planner, "solver", *ALIKE)  # its solver is the one under study
-    parts = {"planner": planner, "tracker": _fields_of(Tracker, *ALIKE), "disturbance": _fields_of(Disturbance)}
-    _store("mission", "default", {"_partial_": True} | _fields_of(Mission, "plant", *parts) | parts)
+    _store("plant", "rotors", _fields_of(RotorPlant, *SHARED_FIELDS))
+    planner = {"_partial_": True} | _fields_of(Planner, "solver", *SHARED_FIELDS)  # its solver is the one under study
+    parts = {"planner": planner, "tracker": _fields_of(Tracker, *SHARED_FIELDS), "disturbance": _fields_of(Disturbance)}
+    _store("mission", "default", {"_partial_": True} | _fields_of(SensorMission, "plant", *parts) | parts)
 
 
 def classes_of(group: str) -> frozenset[type]:
@@ -208,7 +209,7 @@ def _literal(value: Any) -> str:
 
 def _sizes(made: Any) -> dict[str, Any]:
     """Lengths of a family that are the vehicle's, where a command has chosen one."""
-    return {"vehicle_radius": f"${{torchgco.radius:{made.vehicle_radius}}}"} if made.states == STATES else {}
+    return {"vehicle_radius": f"${{torchgco.radius:{made.vehicle_radius}}}"} if made.states == PLANNING_STATES else {}
 
 
 def _radius(usual: float, _root_: Any) -> float:
@@ -225,5 +226,5 @@ def _help(_root_: Any) -> str:
     for group in [*sorted(name for name in loader.list_groups("") if name != "hydra"), "hydra/launcher"]:
         names = sorted(loader.get_group_options(group))
         shown = ", ".join(f"{name}*" if name == chosen.get(group) else name for name in names)
-        lines += textwrap.wrap(f"{group:<16}{shown}", WIDTH, initial_indent="  ", subsequent_indent=" " * 18)
+        lines += textwrap.wrap(f"{group:<16}{shown}", HELP_WIDTH, initial_indent="  ", subsequent_indent=" " * 18)
     return "\n".join(lines)

@@ -9,7 +9,7 @@ from typing import Any
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.groups import classes_of
 
-MADE = "_target_"
+TARGET = "_target_"
 PARTIAL = "_partial_"  # of missions: their planner and plant are put in later
 
 
@@ -26,8 +26,8 @@ def check_stored(tree: Any, group: str, field: str) -> None:
     Raises:
         InputError: the node makes anything else.
     """
-    if not isinstance(tree, Mapping) or MADE not in tree:
-        raise _refused(field, f"a node with a {MADE}", tree)
+    if not isinstance(tree, Mapping) or TARGET not in tree:
+        raise _refused(field, f"a node with a {TARGET}", tree)
     _check(tree, classes_of(group), group, field)
 
 
@@ -39,17 +39,17 @@ def _check(value: Any, known: frozenset[type], group: str, field: str) -> None:
             _check(item, known, group, f"{field}.{i}")
     if not isinstance(value, Mapping):
         return
-    if MADE not in value:
-        if not value or not all(isinstance(item, Mapping) and MADE in item for item in value.values()):
+    if TARGET not in value:
+        if not value or not all(isinstance(item, Mapping) and TARGET in item for item in value.values()):
             raise _refused(field, "a number, a text, a list, a class or classes by name", value)
         for name, item in value.items():
             _check(item, known, group, f"{field}.{name}")
         return
-    if not _is_known(value[MADE], known):
-        raise _refused(f"{field}.{MADE}", f"a class that torchgco's own options of {group} make", value[MADE])
+    if not _is_known(value[TARGET], known):
+        raise _refused(f"{field}.{TARGET}", f"a class that torchgco's own options of {group} make", value[TARGET])
     for key, item in value.items():
-        if key.startswith("_") and key != MADE and not (key == PARTIAL and group == "mission"):
-            raise _refused(field, f"fields of {value[MADE]}", key)
+        if key.startswith("_") and key != TARGET and not (key == PARTIAL and group == "mission"):
+            raise _refused(field, f"fields of {value[TARGET]}", key)
         _check(item, known, group, f"{field}.{key}")
 
 

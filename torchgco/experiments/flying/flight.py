@@ -93,7 +93,7 @@ def plan_of(setup: Setup) -> Plan:
     Raises:
         InputError: as Plan.
     """
-    plan = Plan(**{field.name: setup.config.study[field.name] for field in fields(Plan)})
+    plan = Plan(**{field.name: setup.configuration["study"][field.name] for field in fields(Plan)})
     if plan.workers is not None:
         return plan
     # On a GPU the batches of several processes would share one device.

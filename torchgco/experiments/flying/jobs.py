@@ -29,7 +29,7 @@ from torchgco.experiments.config.launching import jobs_at_once
 from torchgco.experiments.ending import Refused
 from torchgco.experiments.results.files import write
 
-CUT = ("study.jobs", "study.job")  # keys in which the jobs of one study differ
+CUT_BY = ("study.jobs", "study.job")  # keys in which the jobs of one study differ
 EXTRAS = {"ray": "ray"}  # extra of the package by launcher; the others are in "cluster"
 
 
@@ -134,6 +134,6 @@ def _finish(config: DictConfig, report: Report) -> None:
     """Write tables, summary and figures of a study whose shares are flown."""
     from torchgco.experiments.flying.study import run_study  # here, as jobs and workers import this module
 
-    words = [word for word in report.overrides if not word.lstrip("+~").startswith(tuple(f"{key}=" for key in CUT))]
+    words = [word for word in report.overrides if not word.lstrip("+~").startswith(tuple(f"{key}=" for key in CUT_BY))]
     recompose = recomposer(words, config.hydra.runtime.config_sources)
     run_study(recompose(None), Path(report.folder), recompose, command=sys.argv[1:], collect=True)

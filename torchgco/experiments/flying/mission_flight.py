@@ -13,15 +13,15 @@ import torch
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.progress import Bar
+from torchgco.exploration.safety import safe_arrays
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.safe import safe_arrays
 from torchgco.missions.tables import clearances, ending, mission_row, packed
 from torchgco.scenarios import Layouts
 
-FEW = 4  # missions in a study, up to which plans are kept and each mission gets figures
-LOST = (Outcome.COLLISION, Outcome.DIVERGED)
+PLANS_KEPT = 4  # missions in a study, up to which plans are kept and each mission gets figures
+FAILED = (Outcome.COLLISION, Outcome.DIVERGED)
 # Columns of a study that a mission leaves empty: they belong to a single trajectory.
 SINGLE = ("cost", "dynamics_residual", "clearance_full", "bound_violation", "kkt_residual")
 
@@ -65,7 +65,7 @@ class MissionFlight:
         return {
             "scenario": self.layouts.name, "layout": int(self.layouts.ids[b]), "seed": setup.seed,
             "model": setup.vehicle.name, "solver": self.name, "status": outcome.name,
-            "feasible": outcome not in LOST, "reached": outcome == Outcome.REACHED, "sound": False,
+            "feasible": outcome not in FAILED, "reached": outcome == Outcome.REACHED, "sound": False,
             **dict.fromkeys(SINGLE, np.nan),
             "batch_size": self.layouts.count, "threads": torch.get_num_threads(), "device": setup.device.type,
             "dtype": str(setup.dtype).removeprefix("torch."), "kernels": "", "version": VERSION,

@@ -13,7 +13,7 @@ from torchgco.base.notices import watched
 from torchgco.experiments.config.launching import side_by_side
 
 # Parts of a trial count too: a mission is one, and takes seconds.
-LAYOUT = "{l_bar}{bar}| {n:.0f}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+BAR_FORMAT = "{l_bar}{bar}| {n:.0f}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 PERIOD = 30.0  # s between two lines of a job
 
 
@@ -75,6 +75,11 @@ class Lines(NoBar):
 def lines_alone() -> bool:
     """Whether a bar would be out of place: nobody watches, or other jobs write to the same terminal."""
     return side_by_side() or not watched()
+
+
+def page_bar(total: int, slow: int, unit: str, of: str | None = None) -> tqdm:
+    """A bar over the parts of a page, shown where there are `slow` or more and somebody watches."""
+    return tqdm(total=total, desc=of, unit=unit, leave=False, disable=total < slow or not watched())
 
 
 def draw(drawings: Mapping[str, Callable[[], object]]) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
@@ -20,38 +19,36 @@ from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
-from torchgco.experiments.flying.mission_flight import FEW, MissionFlight
-from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines, lines_alone
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionFlight
+from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
 from torchgco.experiments.flying.workers import Shared, run_all
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.durations import states_of, times_at
+from torchgco.experiments.results.folder import DONE, JUDGED, StudyFolder
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,
     difference,
     digest,
     layout_digests,
-    plain,
     settings_of,
 )
 from torchgco.experiments.results.lock import held
 from torchgco.experiments.results.provenance import recorded
-from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
-from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.results.success import sound, with_success
 from torchgco.kernels import native
 from torchgco.missions import Mission
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.
-Recompose = Callable[[str], DictConfig]
+Recompose = Callable[[str], dict[str, Any]]
 
 
 def run_study(
-    config: DictConfig,
+    configuration: dict[str, Any],
     folder: Path,
     recompose: Recompose,
     accepted: Callable[[], None] = lambda: None,
@@ -75,60 +72,60 @@ def run_study(
             one, damaged files, worker processes that die again and again, no layout that could be flown at all, missing
             trials where `collect` is set.
     """
-    study = _study(config, recompose)
-    records = Records(folder, study.manifest, study.plan.repair)
+    study = _study(configuration, recompose)
+    store = StudyFolder(folder, study.manifest, study.plan.repair)
     with held(folder, study.plan.job, study.plan.jobs):
-        records.claim()
+        store.claim()
         accepted()
         with recorded(folder, study.setup, study.plan, command) as ending:
             if study.plan.job is not None:
-                _fly_share(study, records, show)
+                _fly_share(study, store, show)
                 ending.append("share flown")
                 return False
-            _fly_and_report(study, records, show, collect)
+            _fly_and_report(study, store, show, collect)
             return True
 
 
-def _fly_share(study: _Study, records: Records, show: Callable[[str], None]) -> None:
+def _fly_share(study: _Study, store: StudyFolder, show: Callable[[str], None]) -> None:
     """Fly the share of a job, and leave the tables to the process that finishes the study."""
     name = f"Job {study.plan.job} of {study.plan.jobs}"
-    if records.finished(study.layouts):
-        show(f"{name}: already done in {records.folder}")
+    if store.finished(study.layouts):
+        show(f"{name}: already done in {store.path}")
         return
-    missing = {solver: study.plan.share(records.missing(solver), study.layouts.count) for solver in study.solvers}
-    _fly(study, records, missing, name)
-    if (records.folder / DONE).is_file():  # another process flew the rest, and this share, meanwhile
-        records.drop_shards()
-    show(f"{name}: {sum(map(len, missing.values()))} trials flown in {records.folder}")
+    missing = {solver: study.plan.share(store.missing(solver), study.layouts.count) for solver in study.solvers}
+    _fly(study, store, missing, name)
+    if (store.path / DONE).is_file():  # another process flew the rest, and this share, meanwhile
+        store.drop_shards()
+    show(f"{name}: {sum(map(len, missing.values()))} trials flown in {store.path}")
 
 
-def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None], collect: bool) -> None:
-    folder = records.folder
-    if records.finished(study.layouts):
+def _fly_and_report(study: _Study, store: StudyFolder, show: Callable[[str], None], collect: bool) -> None:
+    folder = store.path
+    if store.finished(study.layouts):
         show(f"Already done in {folder}: nothing was flown again.\n")
-        _update_success(study, records, show)
+        _update_success(study, store, show)
     else:
-        missing = {name: records.missing(name) for name in study.solvers}
+        missing = {name: store.missing(name) for name in study.solvers}
         count, left = study.layouts.count * len(study.solvers), sum(map(len, missing.values()))
         if collect and left:
             told = f"{left} of {count} trials missing in {folder} (the same command flies them)"
             raise InputError("study.jobs", "a share from every job", told)
         if left < count and not collect:
             show(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
-        _fly(study, records, missing, study.setup.solver_name)
-        flown = [records.flown(name) for name in study.solvers]
+        _fly(study, store, missing, study.setup.solver_name)
+        flown = [store.flown(name) for name in study.solvers]
         rows = pd.concat([rows for rows, _ in flown], ignore_index=True)
-        _finish(study, records, rows, np.stack([U for _, U in flown]))
+        _finish(study, store, rows, np.stack([U for _, U in flown]))
     show(_report(study, folder))
-    records.close()
+    store.close()
+    trials = store.table()
     if study.plan.explain:
-        show(explained(study.setup, study.layouts, read_trials(folder / TRIALS)))
-    elif study.setup.mission is None and (told := advised(study.setup, study.layouts, read_trials(folder / TRIALS))):
+        show(explained(study.setup, study.layouts, trials))
+    elif study.setup.mission is None and (told := advised(study.setup, study.layouts, trials)):
         show(told)
     show(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
         show(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
-    trials = pd.read_parquet(folder / TRIALS)
     if (trials["status"] == Status.INVALID_START.name).all():
         raise InputError("scenario", where_to_start(study.setup, study.layouts), "none")
 
@@ -149,12 +146,12 @@ class _Study:
         return len(self.solvers) if self.setup.mission is None else 1
 
 
-def _finish(study: _Study, records: Records, rows: pd.DataFrame, flown: np.ndarray) -> None:
+def _finish(study: _Study, store: StudyFolder, rows: pd.DataFrame, flown: np.ndarray) -> None:
     """Write the files of a study from its rows and what was flown, (solver, L, ...)."""
     held: np.ndarray | pd.DataFrame = flown
     if study.setup.mission is not None:
-        held = mission_table(records.folder, study.setup, study.layouts, list(study.solvers), flown)
-    records.finish(with_success(rows, study.layouts, study.rivals), held, study.layouts)
+        held = mission_table(store.path, study.setup, study.layouts, list(study.solvers), flown)
+    store.finish(with_success(rows, study.layouts, study.rivals), held, study.layouts)
 
 
 def _report(study: _Study, folder: Path) -> str:
@@ -165,8 +162,8 @@ def _report(study: _Study, folder: Path) -> str:
     return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure)
 
 
-def _study(config: DictConfig, recompose: Recompose) -> _Study:
-    setup = build(config)
+def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
+    setup = build(configuration)
     layouts = setup.layouts()
     task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
     plan = plan_of(setup)
@@ -176,12 +173,11 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
             raise InputError("study.explain", "false in missions: single solves can be explained", True)
         if plan.figure is not None:
             raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
-    configs = _rivals(config, recompose)
-    solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
-    configuration = {"version": VERSION, **plain(config)}
+    rivals = _rivals(configuration, recompose)
+    solvers = {name: setup.solver if held is configuration else solver_of(held) for name, held in rivals.items()}
     manifest = Manifest(
-        configuration=configuration,
-        solvers={name: settings_of(held) for name, held in configs.items()},
+        configuration={"version": VERSION, **configuration},
+        solvers={name: settings_of(held) for name, held in rivals.items()},
         layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
     )
     return _Study(setup, plan, layouts, solvers, manifest)
@@ -194,13 +190,13 @@ def check_mission(mission: Mission, task: Task) -> None:
         raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
 
 
-def _rivals(config: DictConfig, recompose: Recompose) -> dict[str, DictConfig]:
+def _rivals(configuration: dict[str, Any], recompose: Recompose) -> dict[str, dict[str, Any]]:
     """The configurations of the solvers by name, the one under study first; a baseline that equals it is left out."""
-    own = config.solver.name
-    found = {own: config}
-    for name in config.study.baselines or ():
+    own = configuration["solver"]["name"]
+    found = {own: configuration}
+    for name in configuration["study"]["baselines"] or ():
         other = recompose(name)
-        here, there = settings_of(config), settings_of(other)
+        here, there = settings_of(configuration), settings_of(other)
         if name == own and digest(here) != digest(there):
             expected = f"another name, as the baseline {own} has other settings: solver.name={own}_changed"
             raise InputError("solver.name", expected, f"{own} ({difference(there, here)})")
@@ -208,7 +204,7 @@ def _rivals(config: DictConfig, recompose: Recompose) -> dict[str, DictConfig]:
     return found
 
 
-def _fly(study: _Study, records: Records, missing: Mapping[str, Sequence[int]], name: str) -> None:
+def _fly(study: _Study, store: StudyFolder, missing: Mapping[str, Sequence[int]], name: str) -> None:
     """Fly the missing layouts of every solver, and keep them as shards."""
     batches = [(name, ids) for name, left in missing.items() for ids in _cut(left, study.plan.shard_size)]
     if not batches:
@@ -216,11 +212,11 @@ def _fly(study: _Study, records: Records, missing: Mapping[str, Sequence[int]], 
     with _bar(study, sum(map(len, missing.values())), name) as bar:
         workers = min(study.plan.workers or 1, len(batches))
         if workers > 1:
-            _fly_side_by_side(study, records, batches, workers, bar)
+            _fly_side_by_side(study, store, batches, workers, bar)
         else:  # in this process, with a bar that moves inside a batch
             for name, ids in batches:
                 bar.set_description(name)
-                records.keep(name, _flight(study, name, ids, bar).fly())
+                store.keep(name, _flight(study, name, ids, bar).fly())
 
 
 def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
@@ -229,7 +225,7 @@ def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
     count = layouts * len(study.solvers)
     if lines_alone():
         return Lines(name, count, count - left)
-    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=LAYOUT)
+    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=BAR_FORMAT)
 
 
 def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
@@ -248,11 +244,11 @@ def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | 
     if study.setup.mission is None:
         most = None if study.layouts.stages is None else int(np.max(study.layouts.stages))
         return Flight(study.setup, layouts, name, solver, bar, most)
-    return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= FEW)
+    return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
 
 
 def _fly_side_by_side(
-    study: _Study, records: Records, batches: Sequence[tuple[str, list[int]]], workers: int, bar: tqdm | Lines
+    study: _Study, store: StudyFolder, batches: Sequence[tuple[str, list[int]]], workers: int, bar: tqdm | Lines
 ) -> None:
     """Fly the batches by several processes; this one writes the shards."""
 
@@ -273,18 +269,18 @@ def _fly_side_by_side(
         workers,
         prepare=prepare,
         options=(torch.get_num_threads(), native()),
-        keep=lambda flown: records.keep(*flown),
+        keep=lambda flown: store.keep(*flown),
         watch=watch,
         say=lambda line: bar.write(line, sys.stderr),
     )
 
 
-def _update_success(study: _Study, records: Records, show: Callable[[str], None]) -> None:
+def _update_success(study: _Study, store: StudyFolder, show: Callable[[str], None]) -> None:
     """Judge the rows of a finished study again where the best costs of its layouts have changed since."""
-    trials = pd.read_parquet(records.folder / TRIALS)
+    trials = store.table()
     new = with_success(trials.assign(sound=sound(trials)), study.layouts, study.rivals)
     if not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object)):
-        records.replace(new, study.layouts)
+        store.replace(new, study.layouts)
         show("The best costs of the layouts have changed: best_cost and success were computed again.\n")
 
 

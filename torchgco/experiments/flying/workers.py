@@ -20,7 +20,7 @@ from torchgco.experiments.flying.progress import NoBar
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 CONTEXT = multiprocessing.get_context("spawn")
-POLL = 1.0  # seconds until progress is shown, and an interrupt noticed that Python dropped
+WORKERS_POLL = 1.0  # seconds until progress is shown, and an interrupt noticed that Python dropped
 NEW_POOLS = 3  # replacements of broken pools before giving up
 
 
@@ -42,7 +42,7 @@ def run_all(
     Args:
         prepare, options: `prepare(*options)` runs first in every process.
         say: receives a line for each broken pool.
-        watch: called every POLL seconds with the sum of what `Shared` bars counted in all jobs: trials.
+        watch: called every WORKERS_POLL seconds with the sum of what `Shared` bars counted in all jobs: trials.
 
     Raises:
         InputError: the last pool broke, too.
@@ -82,7 +82,7 @@ def _run_pool(
             with _interrupts_held(noted):
                 futures = {pool.submit(_work, work, job, number): number for number, job in left.items()}
             while futures:
-                done, _ = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED)
+                done, _ = wait(futures, timeout=WORKERS_POLL, return_when=FIRST_COMPLETED)
                 noted.raise_late()
                 for future in done:
                     number = futures.pop(future)  # and with it the memory of the result

@@ -14,13 +14,13 @@ from typing import Any, Literal
 import numpy as np
 
 from torchgco.base.errors import InputError
-from torchgco.problem.sampled import TIME
+from torchgco.obstacles.attitude import QUATERNION
+from torchgco.problem.sampled import TIME_COLUMN
 
 Storage = Literal["mcap", "sqlite3"]
 FRAME, BODY = "map", "base_link"
-QUATERNION = "qw", "qx", "qy", "qz"
-RATES = tuple(f"w{axis} [rad/s]" for axis in "xyz")
-HEADING = "heading [rad]"
+SPINS = tuple(f"w{axis} [rad/s]" for axis in "xyz")
+HEADING_COLUMN = "heading [rad]"
 NANO = 10**9
 
 
@@ -67,13 +67,13 @@ class _Messages:
 
     def __init__(self, types: Mapping[str, Any], columns: Mapping[str, np.ndarray], position: Sequence[str]) -> None:
         self.types = types
-        t = np.asarray(columns[TIME], float)
+        t = np.asarray(columns[TIME_COLUMN], float)
         self.nanoseconds = [round(value * NANO) for value in t.tolist()]
         self.p = _stacked(columns, position)
         self.q = _attitudes(columns, len(t))
         self.v = _or_slope(columns, [f"v{axis} [m/s]" for axis in "xyz"], self.p, t)
         self.a = _or_slope(columns, [f"a{axis} [m/s^2]" for axis in "xyz"], self.v, t)
-        self.w = _stacked(columns, RATES) if RATES[0] in columns else _turning(columns, t)  # in the body's axes
+        self.w = _stacked(columns, SPINS) if SPINS[0] in columns else _turning(columns, t)  # in the body's axes
         self.w_world = _turned(self.q, self.w)
         self.turning = _slope(self.w_world, t)
 
@@ -151,8 +151,8 @@ def _attitudes(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
     if QUATERNION[0] in columns:
         q = np.stack([np.asarray(columns[name], float) for name in QUATERNION], axis=1)
         q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    elif HEADING in columns:
-        half = 0.5 * np.asarray(columns[HEADING], float)
+    elif HEADING_COLUMN in columns:
+        half = 0.5 * np.asarray(columns[HEADING_COLUMN], float)
         q[:, 0], q[:, 3] = np.cos(half), np.sin(half)
     return q
 
@@ -160,8 +160,8 @@ def _attitudes(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
 def _turning(columns: Mapping[str, np.ndarray], t: np.ndarray) -> np.ndarray:
     """Rates (T, 3), rad/s, of a vehicle that turns by its heading."""
     rates = np.zeros((len(t), 3))
-    if HEADING in columns:
-        rates[:, 2] = _slope(np.asarray(columns[HEADING], float), t)
+    if HEADING_COLUMN in columns:
+        rates[:, 2] = _slope(np.asarray(columns[HEADING_COLUMN], float), t)
     return rates
 
 

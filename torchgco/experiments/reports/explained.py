@@ -12,7 +12,7 @@ from torchgco.base.status import Status
 from torchgco.experiments.config.build import Setup
 from torchgco.explaining.advice import Facts, advice
 from torchgco.explaining.barred import map_facts
-from torchgco.explaining.explain import WIDTH, explanation
+from torchgco.explaining.explain import LINE_WIDTH, explanation
 from torchgco.scenarios import Layouts
 
 EXPLAINED = 8  # layouts at most
@@ -42,7 +42,7 @@ def advised(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
     lines = [f"\n{setup.solver_name} did not reach {len(short)} of {len(own)} goals{more}. What to try:"]
     for sentence, places in found.items():
         layouts_told = f"layout{'s' if len(places) > 1 else ''} {', '.join(places)}: "
-        lines.append(textwrap.fill(layouts_told + sentence, WIDTH, initial_indent="  ", subsequent_indent="    "))
+        lines.append(textwrap.fill(layouts_told + sentence, LINE_WIDTH, initial_indent="  ", subsequent_indent="    "))
     return "\n".join([*lines, "study.explain=true tells what was tried."])
 
 

@@ -17,18 +17,18 @@ from torchgco.dynamics import QuadrotorPlant
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.bags import Storage, write_bag
-from torchgco.experiments.reports.finished import TRUST, Study
+from torchgco.experiments.reports.finished import Study
 from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import damaged, write
+from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.experiments.results.limits import read_table
-from torchgco.experiments.results.records import SOLUTIONS
-from torchgco.problem.sampled import TIME, sampled
+from torchgco.problem.sampled import TIME_COLUMN, sampled
 from torchgco.problem.times import times
 
 FOLDER = "export"
-QUATERNION, VELOCITY = slice(6, 10), slice(3, 6)  # of the plant's states
+ATTITUDE_STATES, VELOCITY = slice(6, 10), slice(3, 6)  # of the plant's states
 Table = tuple[str, int, pd.DataFrame]  # solver, layout, columns
 
 
@@ -134,8 +134,8 @@ def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:
         u = u[np.clip(np.searchsorted(t[:, 0], at + 1e-9, side="right") - 1, 0, len(u) - 1)]  # they hold
     rates = np.gradient(x[:, VELOCITY], t[:, 0], axis=0) if len(t) > 1 else np.zeros((1, 3))
     x, rates = _between(at, t[:, 0], x), _between(at, t[:, 0], rates)
-    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
-    columns: dict[str, Any] = {TIME: at}
+    x[:, ATTITUDE_STATES] /= np.linalg.norm(x[:, ATTITUDE_STATES], axis=1, keepdims=True)
+    columns: dict[str, Any] = {TIME_COLUMN: at}
     columns |= {one.label: x[:, i] for i, one in enumerate(states_of(plant))}
     columns |= {f"a{axis} [m/s^2]": rates[:, i] for i, axis in enumerate("xyz")}
     columns["thrust [N]"] = x[:, 13:].sum(1)
@@ -161,7 +161,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--solver", metavar="NAME", nargs="+", default=[], help="default: all of the study")
     kinds = list(get_args(Storage))
     parser.add_argument("--bag", metavar="KIND", choices=kinds, help=f"bags of ROS 2 instead: {' or '.join(kinds)}")
-    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,8 @@ import pandas as pd
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import mission_from, solver_from, vehicle_of
-from torchgco.experiments.results.files import damaged
-from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
-from torchgco.experiments.results.records import (
+from torchgco.experiments.results.files import damaged, readable
+from torchgco.experiments.results.folder import (
     DONE,
     LAYOUTS,
     MANIFEST,
@@ -23,8 +22,10 @@ from torchgco.experiments.results.records import (
     SOLUTIONS,
     TRIALS,
     read_manifest,
+    read_trials,
 )
-from torchgco.experiments.results.runs import read_trials
+from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
 from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
@@ -32,8 +33,7 @@ from torchgco.view.document import Document
 from torchgco.view.flights import constraint_name
 from torchgco.view.vehicles import Look
 
-BATCH = 64  # layouts whose trajectories are measured at once
-TRUST = "--trust", "admit any size in a run's files, and any class, such as a model of yours: its code runs"
+MEASURED_AT_ONCE = 64  # layouts whose trajectories are measured at once
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Study:
         vehicle = vehicle_of(manifest.configuration, trust)
         layouts, trials = read_layouts(folder / LAYOUTS, trust), read_trials(folder / TRIALS, trust)
         if not trust:
-            check_stages(folder, vehicle, layouts, BATCH)
+            check_stages(folder, vehicle, layouts, MEASURED_AT_ONCE)
         return cls(folder, manifest, vehicle, layouts, trials, trust)
 
     def flown(self, name: str, part: str) -> dict[str, np.ndarray]:
@@ -76,7 +76,7 @@ class Study:
         Raises:
             InputError: the file is damaged, takes more than it may, or has other solvers or layouts.
         """
-        held = self._held(name, read_npz)
+        held = readable(self.folder / name, partial(read_npz, trust=self.trust))
         solvers, ids = list(self.manifest.solvers), self.layouts.ids
         named = {"solver", "layout", part} <= held.keys() and held["solver"].tolist() == solvers
         if not named or not np.array_equal(held["layout"], ids):
@@ -89,16 +89,7 @@ class Study:
     @property
     def log(self) -> pd.DataFrame:
         """The control steps of its missions; InputError where the file is damaged, or takes more than it may."""
-        return self._held(MISSION, read_log)
-
-    def _held(self, name: str, reader: Callable[[Path, bool], Any]) -> Any:
-        try:
-            return reader(self.folder / name, self.trust)
-        except InputError:
-            raise
-        except Exception as error:  # damaged bytes make readers raise nearly anything
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise damaged(self.folder / name, f"is damaged ({reason})") from None
+        return readable(self.folder / MISSION, partial(read_log, trust=self.trust))
 
     @property
     def missions(self) -> bool:
@@ -115,7 +106,7 @@ class Study:
 
     def batches(self) -> Iterator[tuple[np.ndarray, Problem]]:
         """Problems of some layouts at a time, and their places."""
-        for places in self.layouts.together(BATCH):
+        for places in self.layouts.together(MEASURED_AT_ONCE):
             yield places, self.vehicle.task(self.layouts.take(places)).problem
 
     @property

@@ -12,13 +12,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from torchgco.experiments.config.build import Setup
-from torchgco.experiments.flying.mission_flight import FEW
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT
 from torchgco.experiments.flying.progress import draw as draw_all
 from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
+from torchgco.experiments.results.folder import LAYOUTS, MISSION, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
-from torchgco.experiments.results.records import LAYOUTS, MISSION, TRIALS
-from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.missions.contact import Contact
 from torchgco.missions.planning_problem import airframe_of
@@ -32,7 +31,7 @@ from torchgco.scenarios import Layouts
 
 SNAPSHOTS = 4  # instants of a mission in one figure
 # Where few missions fly: planned positions (solver, L, K, N+1, 3), and a row per time step of the plant.
-PLANS, TIME_STEPS = "plans.npz", "time_steps.parquet"
+PLANS_FILE, TIME_STEPS = "plans.npz", "time_steps.parquet"
 
 
 def mission_table(
@@ -47,7 +46,7 @@ def mission_table(
     period, contact = float(problem.dynamics.dt), Contact.among(problem)
     frames, plans, fine = [], [], []
     for name, rows in zip(solvers, logs, strict=True):
-        arrays = unpacked(rows, setup.mission.substeps(period) or 1, setup.mission.sensor != "full")
+        arrays = unpacked(rows, setup.mission.substeps(period) or 1, not setup.mission.sees_all)
         frame = mission_frame(arrays, layouts.ids.tolist(), period, clearances(arrays, period, contact))
         frame.insert(0, "solver", name)
         frames.append(frame)
@@ -59,7 +58,7 @@ def mission_table(
         steps = pd.concat(fine, ignore_index=True)
         write(folder / TIME_STEPS, lambda file: steps.to_parquet(file, index=False))
         held = {"plan": np.stack(plans), "solver": np.array(solvers), "layout": layouts.ids}
-        write(folder / PLANS, lambda file: np.savez_compressed(file, **held))
+        write(folder / PLANS_FILE, lambda file: np.savez_compressed(file, **held))
     return pd.concat(frames, ignore_index=True)
 
 
@@ -71,7 +70,7 @@ def write_mission_report(folder: Path, setup: Setup, figures: bool = True) -> st
     if figures:
         draw_all(_drawings(folder, trials, setup))
     text = format_report(parts, "table")
-    return mission_lines(trials) if trials["layout"].nunique() <= FEW else text
+    return mission_lines(trials) if trials["layout"].nunique() <= PLANS_KEPT else text
 
 
 def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Callable[[], object]]:
@@ -123,9 +122,9 @@ class _Flown:
     @classmethod
     def read(cls, folder: Path) -> _Flown | None:
         """None where a study has many missions."""
-        if not all((folder / name).is_file() for name in (PLANS, TIME_STEPS)):
+        if not all((folder / name).is_file() for name in (PLANS_FILE, TIME_STEPS)):
             return None
-        with np.load(folder / PLANS, allow_pickle=False) as held:
+        with np.load(folder / PLANS_FILE, allow_pickle=False) as held:
             plans = dict(zip(held["solver"].tolist(), held["plan"], strict=True))
         return cls(pd.read_parquet(folder / MISSION), pd.read_parquet(folder / TIME_STEPS), plans)
 

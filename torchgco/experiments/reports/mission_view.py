@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from tqdm import tqdm
 
 from torchgco.base.errors import InputError
 from torchgco.base.memory import limited
-from torchgco.base.notices import watched
+from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.reports.finished import Study, document_of
-from torchgco.experiments.reports.mission_report import PLANS
-from torchgco.experiments.results.limits import LARGEST
+from torchgco.experiments.reports.mission_report import PLANS_FILE
+from torchgco.experiments.results.limits import LARGEST_FILE
+from torchgco.exploration.replay import replayed
 from torchgco.judging.contact import contacts
 from torchgco.missions import Mission
-from torchgco.missions.replay import replayed
 from torchgco.missions.tables import STATES
 from torchgco.native.compiler import NativeError
 from torchgco.problem.problem import Problem
@@ -30,8 +29,8 @@ from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
 QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # the plant
-SLOW = 100  # control periods from which on a bar shows how far a map is
-DRAWN = 13  # of its states: those that place it and turn it come before the rotors'
+SLOW_MAP = 100  # control periods from which on a bar shows how far a map is
+DRAWN_STATES = 13  # of its states: those that place it and turn it come before the rotors'
 
 
 def missions(study: Study, found: Mapping[int, SearchPart]) -> Document:
@@ -72,9 +71,9 @@ class _Log:
     @classmethod
     def read(cls, study: Study) -> _Log:
         steps = dict(iter(study.log.groupby(["solver", "mission"], sort=False)))
-        if not (study.folder / PLANS).is_file():
+        if not (study.folder / PLANS_FILE).is_file():
             return cls(steps, study.rows, {}, {})  # type: ignore[arg-type]
-        held, numbers = study.flown(PLANS, "plan"), study.layouts.ids.tolist()
+        held, numbers = study.flown(PLANS_FILE, "plan"), study.layouts.ids.tolist()
         kept = {(name, i): plan for name, plans in held.items() for i, plan in zip(numbers, plans, strict=True)}
         if study.manifest.configuration["mission"].get("sensor", "full") == "full":
             return cls(steps, study.rows, kept, {})  # type: ignore[arg-type]
@@ -98,7 +97,7 @@ class _Log:
             return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:
-            with limited(math.inf if study.trust else LARGEST), _bar(len(x)) as bar:
+            with limited(math.inf if study.trust else LARGEST_FILE), page_bar(len(x), SLOW_MAP, "period", "map") as bar:
                 replay = replayed(loop, problem, x, study.seed, number, bar.update)
         except (NativeError, MemoryError) as error:  # a map of any size can be asked for
             notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]
@@ -107,13 +106,8 @@ class _Log:
         return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(replay.seen, replay.sought, safe))
 
 
-def _bar(periods: int) -> tqdm:
-    hidden = periods < SLOW or not watched()
-    return tqdm(total=periods, desc="map", unit="period", leave=False, disable=hidden)
-
-
 def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:
-    X = whole(steps[[f"x{i}" for i in range(DRAWN)]].to_numpy(dtype=float))
+    X = whole(steps[[f"x{i}" for i in range(DRAWN_STATES)]].to_numpy(dtype=float))
     path, clear = X[:, :3], steps["clearance"].to_numpy(dtype=float)
     bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
     place = next((i for i, one in enumerate(problem.constraints) if one in problem.obstacles), -1)

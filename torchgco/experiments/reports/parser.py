@@ -7,9 +7,16 @@ from typing import NoReturn
 
 from torchgco.base.errors import InputError
 
+TRUST = "admit any size in a run's files, and any class, such as a model of yours: its code runs"
+
 
 class RunParser(argparse.ArgumentParser):
-    """Without the usage before an error: one line for every mistake."""
+    """Takes `--trust`, and shows no usage before an error: one line for every mistake."""
+
+    def __init__(self, prog: str, description: str, takes: str = "RUN") -> None:
+        super().__init__(prog=prog, description=description)
+        self.takes = takes
+        self.add_argument("--trust", action="store_true", help=TRUST)
 
     def error(self, message: str) -> NoReturn:
-        raise InputError("command line", "RUN and the options of --help", message)
+        raise InputError("command line", f"{self.takes} and the options of --help", message)

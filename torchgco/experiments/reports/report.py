@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 import pandas as pd
@@ -20,16 +19,15 @@ from matplotlib.figure import Figure
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.flying.progress import draw
-from torchgco.experiments.reports.finished import TRUST
+from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.kinds import MISSION, Part, format_report, parts_of, write_tables
+from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TRIALS, read_trials
+from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
-from torchgco.experiments.results.records import LAYOUTS, MANIFEST, SOLUTIONS, TRIALS
-from torchgco.experiments.results.runs import is_merged, read_trials
-from torchgco.experiments.statistics.mission_statistics import summarise_missions
-from torchgco.experiments.statistics.statistics import TASK, plain, summarise, task_columns
-from torchgco.experiments.statistics.tables import FORMATS, format_frame
+from torchgco.experiments.results.runs import is_merged
+from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
+from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
@@ -106,9 +104,8 @@ def drawings(part: Part) -> Drawings:
 
     What would be empty isn't drawn: a distribution or shares of single trials.
     """
-    mission = part.kind == MISSION
-    named, again = ("outcomes", summarise_missions) if mission else ("rates", summarise)
-    trials, summary, held = part.trials, part.summary, {}
+    mission, again = part.kind is MISSIONS, part.kind.summarise
+    named, trials, summary, held = "outcomes" if mission else "rates", part.trials, part.summary, {}
     swept = task_columns(trials)[len(TASK) :]
     for name in swept:
         others = [other for other in swept if other != name]
@@ -143,20 +140,12 @@ def _distributions(trials: pd.DataFrame, prefix: str) -> Drawings:
     return held
 
 
-class _Parser(argparse.ArgumentParser):
-    """Without the usage before an error: one line for every mistake."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError("command line", "DIR and the options of --help", message)
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="torchgco-report", description="One report on many studies.")
+    parser = RunParser("torchgco-report", "One report on many studies.", "DIR")
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
-    parser.add_argument("--format", choices=FORMATS, default="table", help="of the tables on stdout; default: table")
+    parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
-    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 

@@ -60,9 +60,9 @@ def _solved(study: Study, numbers: Sequence[int], name: str, solver: Any) -> tup
     if not study.missions:
         return task.problem, solver.solve(task.problem, task.U0, seed=study.seed, ids=ids)
     mission = study.mission(name)
-    if mission.sensor != "full":
+    if not mission.sees_all:
         expected = "missions that know all obstacles; with a sensor the page shows the path sought on the map"
-        raise InputError("--search", expected, f"mission.sensor={mission.sensor}")
+        raise InputError("--search", expected, "missions with a sensor")
     planner = replace(mission.planner, solver=solver)
     return replace(mission, planner=planner).first_plans(task.problem, study.seed, ids)
 

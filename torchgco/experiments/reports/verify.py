@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import io
 import os
-import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,22 +20,22 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import vehicle_of
-from torchgco.experiments.flying.mission_flight import LOST
+from torchgco.experiments.flying.mission_flight import FAILED
 from torchgco.experiments.results.durations import durations, times_at
-from torchgco.experiments.results.files import checksum, damaged
-from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
-from torchgco.experiments.results.kinds import joined, parts_of
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
-from torchgco.experiments.results.records import (
+from torchgco.experiments.results.files import damaged, readable
+from torchgco.experiments.results.folder import (
     DONE,
     LAYOUTS,
     MANIFEST,
     MISSION,
     SOLUTIONS,
     TRIALS,
-    read_checksums,
+    StudyFolder,
     read_manifest,
 )
+from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
+from torchgco.experiments.results.kinds import joined, parts_of
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.judging.judge import frame_columns, gates_passed, judge
@@ -48,9 +46,9 @@ from torchgco.scenarios import Layouts, Vehicle
 
 TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries round differently
 BATCH = 256  # layouts judged at once
-ROW = ["solver", "layout"]
+TRIAL = ["solver", "layout"]
 IDENTITY = ("model", "seed", "version", "device", "dtype", "layout_digest", "settings_digest")
-KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row of summary.csv or paired.csv
+ROW_KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row of summary.csv or paired.csv
 DIFFERENT = 10  # differing values that are printed per table
 # Of missions: columns that the log, which has the states at control steps alone, can't confirm; and those that are
 # compared with the outcome only.
@@ -122,12 +120,12 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
     manifest = read_manifest(folder / MANIFEST, whole=True)
     missions = manifest.configuration.get("mission") is not None
-    layouts = _read(folder / LAYOUTS, partial(read_layouts, trust=trust))
-    held = _read(folder / TRIALS, partial(read_table, trust=trust))
-    rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=ROW)
-    if not set(ROW) <= set(held.columns) or not held.set_index(ROW).index.sort_values().equals(rows.sort_values()):
+    layouts = readable(folder / LAYOUTS, partial(read_layouts, trust=trust))
+    held = readable(folder / TRIALS, partial(read_table, trust=trust))
+    rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=TRIAL)
+    if not set(TRIAL) <= set(held.columns) or not held.set_index(TRIAL).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
-    held = held.set_index(ROW)
+    held = held.set_index(TRIAL)
     vehicle = vehicle_of(manifest.configuration, trust)
     if not trust:
         check_stages(folder, vehicle, layouts, BATCH)
@@ -141,7 +139,7 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     computed = computed.join(_identity(manifest, vehicle, layouts, held.index))
     differences = _differences(held, computed)
     if differences.empty:  # nothing that can be computed differs: has any other column been changed?
-        _check_checksums(folder)
+        StudyFolder(folder, manifest).verify()
     others = tuple(str(name) for name in held.columns if name not in computed.columns)
     trials = Table(TRIALS, len(held), tuple(computed.columns), others, differences)
     # Of rows that differ, the tables that count them would differ, too.
@@ -157,37 +155,15 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
         if not path.is_file():
             absent += [path.name] if len(table) else []
             continue
-        held, computed = _read(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
+        held, computed = readable(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
         if list(held.columns) != list(computed.columns) or len(held) != len(computed):
             shapes = (f"{len(some)} rows, {len(some.columns)} columns" for some in (held, computed))
             differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
         else:
-            keys = pd.MultiIndex.from_frame(computed[KEYS.intersection(computed.columns)])
+            keys = pd.MultiIndex.from_frame(computed[ROW_KEYS.intersection(computed.columns)])
             differences = _differences(held.set_axis(keys), computed.set_axis(keys))
         found.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
     return found, tuple(absent)
-
-
-def _read(path: Path, reader: Any) -> Any:
-    if not path.is_file():
-        raise damaged(path, "is missing")
-    try:
-        found = reader(path)  # first, as it refuses sizes
-        if path.suffix == ".npz":
-            with zipfile.ZipFile(path) as members:
-                if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
-                    raise ValueError("a checksum differs")
-        return found
-    except Exception as error:  # damaged bytes make readers raise nearly anything
-        if isinstance(error, InputError) and "--trust" in error.expected:
-            raise
-        raise damaged(path, f"is damaged ({(str(error).splitlines() or [type(error).__name__])[0]})") from None
-
-
-def _check_checksums(folder: Path) -> None:
-    for name, sums in read_checksums(folder / DONE).items():
-        if not (folder / name).is_file() or checksum(folder / name) not in sums:
-            raise damaged(folder / name, "isn't as the study wrote it")
 
 
 def _identity(manifest: Manifest, vehicle: Vehicle, layouts: Layouts, index: pd.MultiIndex) -> pd.DataFrame:
@@ -204,7 +180,7 @@ def _trajectories(
     trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
 ) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
-    arrays = _read(folder / SOLUTIONS, partial(read_npz, trust=trust))
+    arrays = readable(folder / SOLUTIONS, partial(read_npz, trust=trust))
     names, place = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
     parts = []
     for name in manifest.solvers:
@@ -220,7 +196,7 @@ def _trajectories(
             more = durations(times) | gates_passed(task.problem, verdict)
             parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
-    return rows.set_index(ROW)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
+    return rows.set_index(TRIAL)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
 
 
 def _missions(
@@ -231,7 +207,7 @@ def _missions(
     The log has the plant's state at the start of every control step, and a flight is judged at all time steps: the
     outcome itself, and what belongs to the end of a flight, can't be confirmed.
     """
-    log = _read(folder / MISSION, partial(read_log, trust=trust))
+    log = readable(folder / MISSION, partial(read_log, trust=trust))
     log["shifted"] = log["source"] == "shifted"
     problem = vehicle.task(layouts).problem
     contact, period = Contact.among(problem), float(problem.dynamics.dt)
@@ -243,12 +219,12 @@ def _missions(
         rows.append(
             {
                 "solver": solver, "layout": layout, "status": outcome,
-                "feasible": outcome not in {lost.name for lost in LOST}, "reached": outcome == Outcome.REACHED.name,
+                "feasible": outcome not in {lost.name for lost in FAILED}, "reached": outcome == Outcome.REACHED.name,
                 "clearance_knots": nearest[solver][layout],
                 **step_columns({str(name): column.to_numpy() for name, column in steps.items()}, period),
             }
         )  # fmt: skip
-    return pd.DataFrame(rows).set_index(ROW)
+    return pd.DataFrame(rows).set_index(TRIAL)
 
 
 def _nearest(log: pd.DataFrame, layouts: Layouts, contact: Contact, period: float) -> dict[int, float]:

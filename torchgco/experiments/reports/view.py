@@ -9,26 +9,25 @@ from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from torchgco.base.errors import InputError
-from torchgco.base.notices import watched
 from torchgco.experiments.ending import ended, say
-from torchgco.experiments.reports.finished import TRUST, Study, document_of
+from torchgco.experiments.flying.progress import page_bar
+from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.records import SOLUTIONS
+from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.judging.judge import OTHERS_WITHIN
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page
 from torchgco.view.vehicles import look_of
 
-NAME = "view.html"
-SLOW = 256  # layouts from which on a bar shows how far the page is
+PAGE_NAME = "view.html"
+SLOW_PAGE = 256  # layouts from which on a bar shows how far the page is
 
 
 def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) -> str:
@@ -52,8 +51,7 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
     controls, held_times = study.flown(SOLUTIONS, "U"), study.times
     document, rows, order = None, study.rows, list[np.ndarray]()
-    hidden = study.layouts.count < SLOW or not watched()
-    bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=hidden)
+    bar = page_bar(study.layouts.count, SLOW_PAGE, "layout")
     for places, problem in study.batches():
         look = look_of(problem.dynamics)
         document = document or document_of(study, problem, look)
@@ -100,16 +98,15 @@ def told(row: Mapping[str, Any]) -> Rows:
 def _parser() -> argparse.ArgumentParser:
     parser = RunParser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
-    parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {NAME} in RUN")
+    parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {PAGE_NAME} in RUN")
     words = "solve the layouts of these numbers again, and show the search"
     parser.add_argument("--search", metavar="N", type=int, nargs="+", default=[], help=words)
-    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 
 def write_view(folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False) -> Path:
     """Write the page of a finished study; returns where it lies. Raises InputError as `study_page` does."""
-    path = folder / NAME if output is None else output
+    path = folder / PAGE_NAME if output is None else output
     if path.is_dir():
         raise InputError("--output", "a file", f"{path}, which is a folder")
     text = study_page(folder, searched, trust)

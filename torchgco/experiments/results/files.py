@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
+import zipfile
 from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, first_line
 from torchgco.base.files import write_whole
 
+Read = TypeVar("Read")
 NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)  # of file systems without hard links
 
 
@@ -73,6 +75,30 @@ def checksum(path: Path) -> str:
         for block in iter(lambda: file.read(1 << 20), b""):
             total.update(block)
     return total.hexdigest()
+
+
+def readable(path: Path, reader: Callable[[Path], Read], sized: bool = True) -> Read:
+    """What `reader` makes of a file of a study, whose bytes anything may have happened to.
+
+    Args:
+        sized: whether to pass on that the file takes more memory than it may, which a command can admit.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    if not path.exists():
+        raise damaged(path, "is missing")
+    try:
+        found = reader(path)  # first, as it refuses sizes
+        if path.suffix == ".npz":
+            with zipfile.ZipFile(path) as members:
+                if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
+                    raise ValueError("a checksum differs")
+        return found
+    except Exception as error:  # damaged bytes make readers raise nearly anything
+        if sized and isinstance(error, InputError) and "--trust" in error.expected:
+            raise
+        raise damaged(path, f"is damaged ({first_line(error)})") from None
 
 
 def damaged(path: Path, reason: str) -> InputError:

@@ -14,7 +14,6 @@ from hashlib import sha256
 from typing import Any, Self
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
 
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
@@ -31,19 +30,12 @@ CLOSED_LOOP = ("mission", "plant")  # nodes of missions
 GROUPS = ("scenario", "model", "device", *CLOSED_LOOP)
 DIGITS = 16  # hexadecimal, of a digest: 64 bits
 EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same float
-LONGEST = 40  # letters of a value in a message
+MESSAGE_LETTERS = 40  # letters of a value in a message
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration as plain dicts, lists and numbers, resolved."""
-    held = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(held, dict)
-    return {str(key): value for key, value in held.items()}
-
-
-def settings_of(config: DictConfig) -> dict[str, Any]:
-    """The settings of a configuration's solver, resolved, without its name."""
-    return {key: value for key, value in plain(config)["solver"].items() if key != "name"}
+def settings_of(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a configuration's solver, without its name."""
+    return {key: value for key, value in configuration["solver"].items() if key != "name"}
 
 
 def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> dict[str, Any]:
@@ -249,4 +241,4 @@ def _short(value: Any) -> str:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     text = str(value)
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return text if len(text) <= MESSAGE_LETTERS else f"{text[:MESSAGE_LETTERS]}..."

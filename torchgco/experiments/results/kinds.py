@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -17,7 +18,19 @@ from torchgco.experiments.statistics.statistics import TASK, are_missions, summa
 from torchgco.experiments.statistics.tables import csv_text, format_frame, format_table, printed
 
 KIND = "kind"  # first column of summary.csv and paired.csv
-TRAJECTORY, MISSION = "trajectory", "mission"
+
+
+class Kind(NamedTuple):
+    """A kind of trials: its name, its statistics, and the texts and tables made of these and of comparisons."""
+
+    name: str
+    summarise: Callable[[pd.DataFrame], pd.DataFrame]
+    text: Callable[[pd.DataFrame, pd.DataFrame], str]
+    printed: Callable[[pd.DataFrame, pd.DataFrame], list[pd.DataFrame]]
+
+
+TRAJECTORIES = Kind("trajectory", summarise, format_table, printed)
+MISSIONS = Kind("mission", summarise_missions, format_missions, printed_missions)
 
 
 @dataclass(frozen=True)
@@ -25,11 +38,11 @@ class Part:
     """The trials of one kind with their statistics.
 
     Args:
-        summary: see `summarise`, and of missions `summarise_missions`.
+        summary: see `Kind.summarise`.
         paired: see `compare`; of missions by `reached` alone.
     """
 
-    kind: str
+    kind: Kind
     trials: pd.DataFrame
     summary: pd.DataFrame
     paired: pd.DataFrame
@@ -43,11 +56,11 @@ def parts_of(trials: pd.DataFrame) -> list[Part]:
     """
     missions = are_missions(trials)
     if trials.empty or not missions.any():
-        return [Part(TRAJECTORY, trials, summarise(trials), compare(trials))]
+        return [Part(TRAJECTORIES, trials, summarise(trials), compare(trials))]
     flown, single = _own(trials[missions]), _own(trials[~missions])
     pairs = compare(flown)
-    found = [Part(MISSION, flown, summarise_missions(flown), pairs[pairs["outcome"] == "reached"])]
-    return [Part(TRAJECTORY, single, summarise(single), compare(single)), *found] if len(single) else found
+    found = [Part(MISSIONS, flown, summarise_missions(flown), pairs[pairs["outcome"] == "reached"])]
+    return [Part(TRAJECTORIES, single, summarise(single), compare(single)), *found] if len(single) else found
 
 
 def _own(rows: pd.DataFrame) -> pd.DataFrame:
@@ -58,7 +71,7 @@ def _own(rows: pd.DataFrame) -> pd.DataFrame:
 
 def joined(parts: Sequence[Part]) -> dict[str, pd.DataFrame]:
     """The tables "summary" and "paired" of all parts, with the kind in the first column."""
-    return {name: _stacked([(part.kind, getattr(part, name)) for part in parts]) for name in ("summary", "paired")}
+    return {name: _stacked([(part.kind.name, getattr(part, name)) for part in parts]) for name in ("summary", "paired")}
 
 
 def write_tables(folder: Path, parts: Sequence[Part]) -> None:
@@ -89,18 +102,11 @@ def format_report(parts: Sequence[Part], form: str) -> str:
         table: as `format_table` and `format_missions`.
     """
     if form == "table":
-        return "\n\n".join(_text(part) for part in parts)
+        return "\n\n".join(part.kind.text(part.summary, part.paired) for part in parts)
     if form in ("csv", "json"):
         tables = joined(parts)
         if form == "csv":
             return format_frame(tables["summary"], form)
         return json.dumps({name: json.loads(format_frame(table, form)) for name, table in tables.items()}, indent=1)
-    return "\n\n".join(format_frame(table, form) for part in parts for table in _printed(part))
-
-
-def _text(part: Part) -> str:
-    return (format_missions if part.kind == MISSION else format_table)(part.summary, part.paired)
-
-
-def _printed(part: Part) -> list[pd.DataFrame]:
-    return (printed_missions if part.kind == MISSION else printed)(part.summary, part.paired)
+    tables = [table for part in parts for table in part.kind.printed(part.summary, part.paired)]
+    return "\n\n".join(format_frame(table, form) for table in tables)

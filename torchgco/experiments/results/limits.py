@@ -23,13 +23,13 @@ from torchgco.base.memory import limited
 from torchgco.missions.tables import STATES
 from torchgco.scenarios import Layouts, Vehicle
 
-LARGEST = 2**30  # bytes of one file when it is read; the files of 10,000 layouts and ten solvers take a third
-LOG = (
+LARGEST_FILE = 2**30  # bytes of one file when it is read; the files of 10,000 layouts and ten solvers take a third
+LOG_COLUMNS = (
     "mission", "step", "cost", "violation", "clearance", "planner_seconds", "tracker_seconds", "tracking_violation",
     "guided",
 )  # fmt: skip
-NUMBER = 8  # bytes of a number in a table
-MORE = "that a run's file may take (--trust admits more)"
+NUMBER_BYTES = 8  # bytes of a number in a table
+FILE_LIMIT = "that a run's file may take (--trust admits more)"
 
 
 def read_npz(path: Path, trust: bool = False) -> dict[str, np.ndarray]:
@@ -40,7 +40,7 @@ def read_npz(path: Path, trust: bool = False) -> dict[str, np.ndarray]:
         Exception: nearly any, where the file is damaged.
     """
     with open(regular(path), "rb") as file:
-        if not trust and (size := npz_size(file)) > LARGEST:
+        if not trust and (size := npz_size(file)) > LARGEST_FILE:
             refuse(path, f"arrays of {size / 1e9:.3g} GB")
         with np.load(file, allow_pickle=False) as held:
             return {name: held[name] for name in held.files}
@@ -54,8 +54,8 @@ def read_layouts(path: Path, trust: bool = False) -> Layouts:
     if trust:
         return Layouts.load(path)
     try:
-        with limited(LARGEST):
-            return Layouts.load(path, room=LARGEST, limit=MORE)
+        with limited(LARGEST_FILE):
+            return Layouts.load(path, room=LARGEST_FILE, limit=FILE_LIMIT)
     except MemoryError:  # distances take a multiple of a map's cells, and any multiple of its points
         refuse(path, "a map that takes more")
 
@@ -71,8 +71,8 @@ def read_table(path: Path, trust: bool = False, **options: Any) -> pd.DataFrame:
     if trust:
         return _table(path, options)
     try:
-        with _counted(), limited(LARGEST):
-            if (size := _size(path)) > LARGEST:
+        with _counted(), limited(LARGEST_FILE):
+            if (size := _size(path)) > LARGEST_FILE:
                 refuse(path, f"a table of {size / 1e9:.3g} GB")
             return _table(path, options)
     except MemoryError:  # a page that is longer than its headers say, or a text in many rows
@@ -87,7 +87,7 @@ def read_log(path: Path, trust: bool = False) -> pd.DataFrame:
         Exception: nearly any, where the file is damaged or no such log.
     """
     log = read_table(path, trust)
-    for name in ("solver", "source", *LOG, *(f"x{i}" for i in range(STATES))):
+    for name in ("solver", "source", *LOG_COLUMNS, *(f"x{i}" for i in range(STATES))):
         if name not in log.columns:
             raise ValueError(f"no column {name}")
     for name, column in log.items():
@@ -105,13 +105,13 @@ def check_stages(folder: Path, vehicle: Vehicle, layouts: Layouts, most: int) ->
         InputError: they do.
     """
     count, stages = min(most, layouts.count), vehicle.stages if layouts.stages is None else int(np.max(layouts.stages))
-    size = count * stages * (vehicle.dynamics.n + vehicle.dynamics.m) * NUMBER
-    if size > LARGEST:
+    size = count * stages * (vehicle.dynamics.n + vehicle.dynamics.m) * NUMBER_BYTES
+    if size > LARGEST_FILE:
         refuse(folder, f"{count} trajectories of {stages} stages, {size / 1e9:.3g} GB")
 
 
 def refuse(path: Path, got: str) -> NoReturn:
-    raise InputError("RUN", f"at most the {LARGEST / 1e9:.3g} GB {MORE}", f"{path} with {got}")
+    raise InputError("RUN", f"at most the {LARGEST_FILE / 1e9:.3g} GB {FILE_LIMIT}", f"{path} with {got}")
 
 
 @contextmanager
@@ -143,14 +143,14 @@ def _size(path: Path) -> int:
     with pyarrow.parquet.ParquetFile(path) as file:
         about = file.metadata
         groups = [about.row_group(i) for i in range(about.num_row_groups)]
-        size = max(about.num_rows * about.num_columns * NUMBER, sum(group.total_byte_size for group in groups))
-        if size > LARGEST:
+        size = max(about.num_rows * about.num_columns * NUMBER_BYTES, sum(group.total_byte_size for group in groups))
+        if size > LARGEST_FILE:
             return size
         texts = [i for i in range(about.num_columns) if about.schema.column(i).physical_type == "BYTE_ARRAY"]
         for i in texts:
             # At worst one text is the whole column, and every row repeats it.
             chunks = [group.column(i) for group in groups]
-            if sum(chunk.total_uncompressed_size * chunk.num_values for chunk in chunks) > LARGEST:
+            if sum(chunk.total_uncompressed_size * chunk.num_values for chunk in chunks) > LARGEST_FILE:
                 size += _longest(path, about.schema.column(i).path) * about.num_rows
     return size
 

@@ -28,11 +28,11 @@ INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "suc
 RUN, VARIANT, LAYOUT = "_run", "_variant", "_layout"
 OWN = [RUN, VARIANT]
 # Columns of text that become categories: comparing and copying text would take most of a large report's time.
-TEXT = (*TASK, "solver", "status", "device", "dtype", "kernels", "version", "best_from", *DIGESTS)
+CODED = (*TASK, "solver", "status", "device", "dtype", "kernels", "version", "best_from", *DIGESTS)
 
 
 def merge(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> pd.DataFrame:
-    """All trials found in and below `folders`, as one table with the columns of a study, those of TEXT as categories.
+    """All trials found in and below `folders`, as one table with the columns of a study, those of CODED as categories.
 
     - Keys of scenario and vehicle in which runs of one (scenario, model) differ become columns, named as on the
       command line: `scenario.num_obstacles`. Runs that flew other layouts without such a key get their folder in a
@@ -77,7 +77,7 @@ def _tagged(runs: Sequence[Run]) -> tuple[pd.DataFrame, list[str]]:
         for i, (run, more) in enumerate(zip(runs, swept, strict=True))
     ]
     rows = pd.concat(tables, ignore_index=True)
-    rows = rows.assign(**{name: pd.Categorical.from_codes(*pd.factorize(rows[name])) for name in TEXT if name in rows})
+    rows = rows.assign(**{name: pd.Categorical.from_codes(*pd.factorize(rows[name])) for name in CODED if name in rows})
     settings = {digest(held): held for run in runs for held in run.solvers.values()}
     numbers: dict[str, int] = {}
     code = np.zeros(len(rows), dtype=int)

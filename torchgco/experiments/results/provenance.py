@@ -1,4 +1,4 @@
-"""Records of how a study was run: run.json in its folder, and run-JOB-of-JOBS.json of every job that flew a share.
+"""StudyFolder of how a study was run: run.json in its folder, and run-JOB-of-JOBS.json of every job that flew a share.
 
 Each is written by who holds the study, or that very share (`lock.held`): nobody else reads and changes it meanwhile.
 
@@ -46,7 +46,7 @@ from torchgco.native.compiler import find_compiler
 
 RECORD = "run.json"
 PACKAGES = ("torch", "numpy", "scipy", "casadi", "hydra-core", "pandas", "pyarrow")
-PATIENCE = 10.0  # s, for git
+GIT_PATIENCE = 10.0  # s, for git
 
 
 @contextmanager
@@ -119,7 +119,7 @@ def _source() -> dict[str, Any]:
 
 def _git(root: Path, *words: str) -> str:
     line = ["git", "--no-optional-locks", *words]
-    return subprocess.run(line, cwd=root, capture_output=True, text=True, check=True, timeout=PATIENCE).stdout
+    return subprocess.run(line, cwd=root, capture_output=True, text=True, check=True, timeout=GIT_PATIENCE).stdout
 
 
 def _version(name: str) -> str | None:

@@ -11,20 +11,21 @@ from typing import Any
 import pandas as pd
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.results.files import checksum, damaged
-from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.limits import read_layouts, read_table
-from torchgco.experiments.results.records import (
+from torchgco.experiments.results.files import damaged
+from torchgco.experiments.results.folder import (
     COLUMNS,
     DONE,
     MANIFEST,
     TRIALS,
-    Records,
-    read_checksums,
+    StudyFolder,
     read_manifest,
+    read_trials,
+    table_of,
 )
+from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.limits import read_layouts
 from torchgco.experiments.results.success import with_success
-from torchgco.experiments.statistics.statistics import PAIR, check_trials
+from torchgco.experiments.statistics.statistics import PAIR
 from torchgco.scenarios import LayoutFile, Layouts
 
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
@@ -67,38 +68,9 @@ def find_runs(folders: Iterable[str | os.PathLike[str]], trust: bool = False) ->
     return runs
 
 
-def read_trials(path: str | os.PathLike[str], trust: bool = False) -> pd.DataFrame:
-    """The table in a `trials.parquet`.
-
-    Raises:
-        InputError: it can't be read, lacks columns of a study, isn't as the study left it, or without `trust` takes
-            more memory than a run's file may.
-    """
-    mark = Path(path).parent / DONE
-    sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
-    if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
-        raise damaged(Path(path), "isn't as the study wrote it")
-    trials = _read(path, trust)
-    missing = [name for name in COLUMNS if name not in trials.columns]
-    if missing:
-        raise InputError("trials", "the columns of a study", f"{path} without {', '.join(missing)}")
-    check_trials(trials, path)
-    return trials
-
-
 def is_merged(path: Path) -> bool:
     """Whether a table comes out of a merge rather than out of a study. Raises InputError if it can't be read."""
-    return MERGED in _read(path, trust=True, columns=[]).attrs
-
-
-def _read(path: str | os.PathLike[str], trust: bool, **options: Any) -> pd.DataFrame:
-    try:
-        return read_table(Path(path), trust, **options)
-    except InputError:
-        raise
-    except Exception as error:  # damaged bytes make the reader raise nearly anything
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
+    return MERGED in table_of(path, trust=True, columns=[]).attrs
 
 
 def _below(folders: list[Path]) -> Iterator[Path]:
@@ -121,8 +93,8 @@ def _run(folder: Path, given: bool, trust: bool) -> Run | None:
     manifest = read_manifest(folder / MANIFEST)
     if (folder / DONE).is_file():
         raise damaged(folder / TRIALS, "is missing")
-    records = Records(folder, manifest)
-    parts = [rows for name in manifest.solvers if len(rows := records.flown(name)[0])]
+    study = StudyFolder(folder, manifest)
+    parts = [rows for name in manifest.solvers if len(rows := study.flown(name)[0])]
     trials = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(COLUMNS))
     if parts:
         rivals = 1 if manifest.configuration.get("mission") is not None else len(parts)

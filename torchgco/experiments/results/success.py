@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from torchgco.experiments.results.records import COLUMNS
+from torchgco.experiments.results.folder import COLUMNS
 from torchgco.judging.judge import SUCCESS_VIOLATION, near_best
 from torchgco.scenarios import Layouts
 

@@ -16,9 +16,9 @@ from torchgco.experiments.statistics.statistics import TASK, are_missions
 
 # Prefixes of keys that define the problems and missions; `model` has keys for solvers, too.
 SWEPT = ("scenario.", "model.vehicle.", "mission.", "plant.")
-NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
+NAME_KEYS = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
 FILE = "scenario.path"
-RUN = "hydra.run.dir"
+RUN_FOLDER = "hydra.run.dir"
 LABEL_SETTINGS = 3  # settings named in a label
 
 
@@ -76,14 +76,14 @@ def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str
             cell |= {FILE: keys[FILE]} if keys else {}
         clusters = _clusters(runs, cells, tables)
     for cell, cluster in zip(cells, clusters, strict=True):
-        cell |= {RUN: cluster} if cluster else {}
+        cell |= {RUN_FOLDER: cluster} if cluster else {}
     return cells
 
 
 def _keys(run: Run) -> dict[str, Any]:
     parts = {name: run.configuration.get(name) for name in ("scenario", "model", *CLOSED_LOOP)}
     keys = flat({name: part for name, part in parts.items() if isinstance(part, Mapping)})
-    return {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAMES}
+    return {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAME_KEYS}
 
 
 def _clusters(

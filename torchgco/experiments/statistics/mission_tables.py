@@ -9,7 +9,7 @@ import pandas as pd
 from torchgco.experiments.statistics.mission_statistics import MISSIONS_AT_ONCE
 from torchgco.experiments.statistics.statistics import TASK
 from torchgco.experiments.statistics.tables import (
-    RATES,
+    RATES_TEXT,
     aligned,
     cells,
     headers,
@@ -21,7 +21,7 @@ from torchgco.experiments.statistics.tables import (
 from torchgco.missions.outcome import Outcome
 
 # Header, column of the summary, and how the numbers are written.
-EFFORT = (
+MISSION_EFFORT = (
     ("flight time", "flight_time", "{:.2f} s"), ("clearance", "clearance", "{:.3f} m"),
     ("energy", "energy", "{:.0f} J"),
     ("at once", MISSIONS_AT_ONCE, "{:.0f}"), ("planner", "planner_seconds_median", "{:.4f} s"),
@@ -72,7 +72,7 @@ def format_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if (rows["n"] > 0).any():
             blocks.append(paired_lines(rows, swept, costs=False))
-    return "\n\n".join([*blocks, RATES])
+    return "\n\n".join([*blocks, RATES_TEXT])
 
 
 def printed_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
@@ -81,7 +81,7 @@ def printed_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.Dat
     for _, row in summary.iterrows():
         rows.append([row["scenario"], row["model"], *cells(row, swept), row["solver"], row["n"]])
         rows[-1] += [*(rate(row, name.lower()) for name in Outcome.__members__), *_measured(row)]
-    heads = [*TASK, *headers(swept), "solver", "n", *Outcome.__members__, *(head for head, *_ in EFFORT)]
+    heads = [*TASK, *headers(swept), "solver", "n", *Outcome.__members__, *(head for head, *_ in MISSION_EFFORT)]
     return [pd.DataFrame(rows, columns=heads), *_printed_pairs(paired)]
 
 
@@ -98,13 +98,13 @@ def _outcomes(task: pd.DataFrame, swept: Sequence[str]) -> str:
 
 
 def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [[*headers(swept), "solver", *(head for head, *_ in EFFORT)]]
+    rows = [[*headers(swept), "solver", *(head for head, *_ in MISSION_EFFORT)]]
     rows += [[*cells(row, swept), row["solver"], *_measured(row)] for _, row in task.iterrows()]
     return aligned(rows, len(swept) + 1)
 
 
 def _measured(row: pd.Series) -> list[str]:
-    """The cells of EFFORT; of a batch no deadlines, which its divided times don't decide."""
-    unknown = {name for _, name, _ in EFFORT if pd.isna(row[name])}
+    """The cells of MISSION_EFFORT; of a batch no deadlines, which its divided times don't decide."""
+    unknown = {name for _, name, _ in MISSION_EFFORT if pd.isna(row[name])}
     unknown |= {"missed_deadlines"} if row[MISSIONS_AT_ONCE] > 1 else set()
-    return ["-" if name in unknown else form.format(row[name]) for _, name, form in EFFORT]
+    return ["-" if name in unknown else form.format(row[name]) for _, name, form in MISSION_EFFORT]

@@ -23,8 +23,8 @@ OUTCOMES = ("feasible", "reached", "success")
 TASK = ["scenario", "model"]
 PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
-COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
-NUMBERS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
+NEEDED_COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
+NUMBER_COLUMNS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
 TEXTS = ("string", "categorical", "bytes")  # kinds of columns without numbers, as pandas calls them
 INVALID = Status.INVALID_START.name
 STATUS = "status_"  # prefix of the columns that count statuses
@@ -174,14 +174,14 @@ def wilson(count: int, n: int) -> tuple[float, float]:
 
 def check_trials(trials: pd.DataFrame, source: object = "a table") -> None:
     """Raise InputError if a table, read from `source`, is empty, lacks a column or has text for numbers."""
-    missing = [name for name in COLUMNS if name not in trials.columns]
+    missing = [name for name in NEEDED_COLUMNS if name not in trials.columns]
     if missing:
         raise InputError("trials", "the columns of a study", f"{source} without {', '.join(missing)}")
     if trials.empty:
         raise InputError("trials", "at least one row", f"{source} with none")
     types = pd.api.types
     for names, is_right, convert, kind in (
-        (NUMBERS, types.is_numeric_dtype, numbers_of, "numbers"),
+        (NUMBER_COLUMNS, types.is_numeric_dtype, numbers_of, "numbers"),
         (OUTCOMES, types.is_bool_dtype, _truth, "true or false"),
     ):
         for name in trials.columns.intersection(list(names)):

@@ -10,11 +10,11 @@ import pandas as pd
 
 from torchgco.experiments.statistics.statistics import OUTCOMES, STATUS, TASK, task_columns
 
-FORMATS = ("table", "csv", "markdown", "latex", "json")
+OUTPUTS = ("table", "csv", "markdown", "latex", "json")
 # Where a spreadsheet finds a formula: where a cell begins, and where it would begin with another separator than the
 # comma, which is read where the comma is that of decimals. The wide signs count in some languages.
 FORMULA = re.compile(r"(^|[;\n\t])([^\S\n\t]*[=+\-@＝＋－＠])")
-RATES = "rates: attained of defined, share, [95 % Wilson interval]; -: undefined"
+RATES_TEXT = "rates: attained of defined, share, [95 % Wilson interval]; -: undefined"
 EFFORTS = "effort: median (90 % quantile); costs: where the goal was reached, everywhere, over the best known one"
 
 
@@ -35,11 +35,11 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if (rows["n"] > 0).any():
             blocks.append(paired_lines(rows, swept))
-    return "\n\n".join([*blocks, f"{RATES}\n{EFFORTS}"])
+    return "\n\n".join([*blocks, f"{RATES_TEXT}\n{EFFORTS}"])
 
 
 def format_frame(table: pd.DataFrame, form: str) -> str:
-    """One table in one of FORMATS, its cells as they are but for what the format itself would read."""
+    """One table in one of OUTPUTS, its cells as they are but for what the format itself would read."""
     if form == "csv":
         return csv_text(table).rstrip("\n")
     if form == "json":
@@ -121,7 +121,7 @@ def rate(row: pd.Series, name: str) -> str:
 
 
 # Header in the terminal, column of the summary, column in parentheses, and how the numbers are written.
-EFFORT = (
+EFFORT_COLUMNS = (
     ("n", "n", None, "d"),
     ("invalid", "invalid", None, "d"),
     ("viol. ok", "violation_ok", None, ".0%"),
@@ -134,7 +134,7 @@ EFFORT = (
     ("guided", "guided_median", "guided_p90", ".3g"),
     ("seconds", "seconds_median", "seconds_p90", ".2g"),
 )
-PRINTED = ("n", "cost ratio", "iter.", "seconds")  # of them, in a paper's table
+PAPER_COLUMNS = ("n", "cost ratio", "iter.", "seconds")  # of them, in a paper's table
 
 
 def _measured(row: pd.Series, median: str, p90: str | None, form: str) -> str:
@@ -143,8 +143,8 @@ def _measured(row: pd.Series, median: str, p90: str | None, form: str) -> str:
 
 
 def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [[*headers(swept), "solver", *(header for header, *_ in EFFORT)]]
-    columns_of = [(median, p90, form) for _, median, p90, form in EFFORT]
+    rows = [[*headers(swept), "solver", *(header for header, *_ in EFFORT_COLUMNS)]]
+    columns_of = [(median, p90, form) for _, median, p90, form in EFFORT_COLUMNS]
     for _, row in task.iterrows():
         rows.append([*cells(row, swept), row["solver"], *(_measured(row, *columns) for columns in columns_of)])
     return aligned(rows, len(swept) + 1)
@@ -195,7 +195,7 @@ def printed(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
 
 def _printed_summary(summary: pd.DataFrame) -> pd.DataFrame:
     swept = swept_of(summary)
-    columns = [(header, (median, p90, form)) for header, median, p90, form in EFFORT if header in PRINTED]
+    columns = [(header, (median, p90, form)) for header, median, p90, form in EFFORT_COLUMNS if header in PAPER_COLUMNS]
     rows = []
     for _, row in summary.iterrows():
         rates = [rate(row, name) for name in OUTCOMES]

@@ -14,8 +14,8 @@ from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Source, finite_p
 from torchgco.maps.grid import OccupancyGrid
 
 NPZ = "a map with occupied (X, Y[, Z]), origin (d,) and resolution"
-LIMIT = "that a map's file may take"
-TASK = ("start", "goal", "vehicle_radius", "goal_radius")
+MAP_LIMIT = "that a map's file may take"
+TASK_KEYS = ("start", "goal", "vehicle_radius", "goal_radius")
 NPY = "an npy file of numbers, without pickles"
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -23,7 +23,7 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 def read_npz(source: Source) -> OccupancyGrid:
     """The grid of the arrays `occupied`, `origin` and `resolution`; others are for `scenario=map`."""
     source.size(NPZ)
-    arrays = read_arrays(source.path, source.field, NPZ, ("occupied", "origin", "resolution"), MOST_BYTES, LIMIT)
+    arrays = read_arrays(source.path, source.field, NPZ, ("occupied", "origin", "resolution"), MOST_BYTES, MAP_LIMIT)
     occupied, origin = arrays["occupied"], arrays["origin"]
     if origin.shape != (occupied.ndim,):  # one grid per problem isn't for files
         source.refuse("origin (d,) for occupied (X, Y[, Z])", f"{origin.shape} for {occupied.shape}")
@@ -34,8 +34,8 @@ def read_task(path: Path) -> dict[str, np.ndarray]:
     """What an npz file says of the flight beside its map: start, goal (d,), vehicle_radius, goal_radius, m."""
     if path.suffix.lower() != ".npz":
         return {}
-    arrays = read_arrays(path, "scenario.path", NPZ, room=MOST_BYTES, limit=LIMIT)
-    return {name: arrays[name] for name in TASK if name in arrays}
+    arrays = read_arrays(path, "scenario.path", NPZ, room=MOST_BYTES, limit=MAP_LIMIT)
+    return {name: arrays[name] for name in TASK_KEYS if name in arrays}
 
 
 def read_npy(

@@ -12,14 +12,14 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from torchgco.base.errors import shown
-from torchgco.maps.files.source import FARTHEST, MOST_CELLS, Source, check_far, made
+from torchgco.maps.files.source import FARTHEST_AT, MOST_CELLS, Source, check_far, made
 from torchgco.maps.grid import OccupancyGrid
 
-WORLD = "a Gazebo world or model in SDF"
+WORLD_FILE = "a Gazebo world or model in SDF"
 MOST_XML = 2**24  # bytes
 MOST_SHAPES = 2**14
 MOST_WORK = 2**29  # cells that are looked at, all shapes together
-DEPTH = 16  # of models within models
+MODEL_DEPTH = 16  # of models within models
 EMPTY = {"model://sun", "model://ground_plane"}  # what many worlds include, and nothing stands in the way of
 
 
@@ -69,7 +69,7 @@ def read_world(source: Source, resolution: float | None) -> OccupancyGrid:
     assert resolution is not None
     shapes = list(_shapes(source, _root(source)))
     if not shapes:
-        source.refuse(f"{WORLD} with a box, cylinder or sphere in a static model", "none")
+        source.refuse(f"{WORLD_FILE} with a box, cylinder or sphere in a static model", "none")
     source.limit(len(shapes), MOST_SHAPES, "shapes")
     ends = np.array([(shape.frame.t - shape.reach, shape.frame.t + shape.reach) for shape in shapes])
     check_far(source, ends)
@@ -92,13 +92,13 @@ def read_world(source: Source, resolution: float | None) -> OccupancyGrid:
 
 
 def _root(source: Source) -> Element:
-    raw = source.bytes(WORLD, MOST_XML)
+    raw = source.bytes(WORLD_FILE, MOST_XML)
     if re.search(rb"<!(DOCTYPE|ENTITY)", raw, re.IGNORECASE):
-        source.refuse(f"{WORLD} without definitions of its own", "a DOCTYPE or ENTITY")
-    with source.library(WORLD):
+        source.refuse(f"{WORLD_FILE} without definitions of its own", "a DOCTYPE or ENTITY")
+    with source.library(WORLD_FILE):
         root = ElementTree.fromstring(raw)
     if root.tag not in ("sdf", "gazebo"):
-        source.refuse(WORLD, f"<{root.tag[:40]}>")
+        source.refuse(WORLD_FILE, f"<{root.tag[:40]}>")
     return root
 
 
@@ -113,8 +113,8 @@ def _shapes(source: Source, root: Element) -> Iterator[Shape]:
 
 
 def _of_models(source: Source, parent: Element, frame: Frame, static: bool, depth: int) -> Iterator[Shape]:
-    if depth > DEPTH:
-        source.refuse(f"models within models {DEPTH} deep at most", "more")
+    if depth > MODEL_DEPTH:
+        source.refuse(f"models within models {MODEL_DEPTH} deep at most", "more")
     for model in parent.findall("model"):
         at = frame.then(_pose(source, model))
         fixed = static or (model.findtext("static") or "").strip().lower() in ("1", "true")
@@ -175,6 +175,6 @@ def _numbers(source: Source, element: Element, name: str, count: int) -> list[fl
         found = [float(word) for word in text.split()]
     except ValueError:
         found = []
-    if len(found) != count or not all(abs(number) <= FARTHEST for number in found):
+    if len(found) != count or not all(abs(number) <= FARTHEST_AT for number in found):
         source.refuse(f"<{name}> of {count} numbers", shown(text[:60]))
     return found

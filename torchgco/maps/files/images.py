@@ -11,8 +11,8 @@ from torchgco.maps.files.source import Source, made
 from torchgco.maps.grid import OccupancyGrid
 
 MOST_PIXELS = 2**26  # 8192 x 8192
-IMAGE = "a png, pgm, ppm, bmp, jpg or tif image"
-KINDS = ("PNG", "PPM", "BMP", "JPEG", "TIFF")  # Pillow tries no other decoder
+IMAGE_FILE = "a png, pgm, ppm, bmp, jpg or tif image"
+DECODERS = ("PNG", "PPM", "BMP", "JPEG", "TIFF")  # Pillow tries no other decoder
 DARK = 0.5  # of a floor plan: darker pixels are occupied
 
 
@@ -45,8 +45,8 @@ def load(source: Source) -> tuple[np.ndarray, np.ndarray | None]:
     """
     from PIL import Image
 
-    source.size(IMAGE)
-    with source.library(IMAGE), open(source.path, "rb") as file, Image.open(file, formats=KINDS) as image:
+    source.size(IMAGE_FILE)
+    with source.library(IMAGE_FILE), open(source.path, "rb") as file, Image.open(file, formats=DECODERS) as image:
         source.limit(image.width * image.height, MOST_PIXELS, f"pixels ({image.width:,} x {image.height:,} here)")
         image.load()
         return _levels(source, image)
@@ -56,12 +56,12 @@ def _levels(source: Source, image: Any) -> tuple[np.ndarray, np.ndarray | None]:
     if image.mode.startswith("I"):  # 16 bits
         numbers = np.asarray(image)
         if numbers.size and (numbers.min() < 0 or numbers.max() > 65535):
-            source.refuse(f"{IMAGE} of 8 or 16 bits", f"a brightness of {numbers.max()}")
+            source.refuse(f"{IMAGE_FILE} of 8 or 16 bits", f"a brightness of {numbers.max()}")
         return numbers.astype(np.float32) / np.float32(65535.0), None
     if image.mode in ("1", "L") and "transparency" not in image.info:
         return np.asarray(image.convert("L")).astype(np.float32) / np.float32(255.0), None
     if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-        source.refuse(f"{IMAGE} of 8 or 16 bits", f"Pillow's mode {image.mode}")
+        source.refuse(f"{IMAGE_FILE} of 8 or 16 bits", f"Pillow's mode {image.mode}")
     opaque = image.mode in ("RGB", "P") and "transparency" not in image.info
     colours = np.asarray(image.convert("RGB" if opaque else "RGBA"))
     brightness = colours[..., :3].mean(-1, dtype=np.float32) / np.float32(255.0)

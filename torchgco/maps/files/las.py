@@ -6,8 +6,8 @@ import numpy as np
 
 from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Source, finite_points
 
-LAS = "a las or laz file of points"
-AT_ONCE = 2**20  # points: a header may promise more than there are
+LAS_FILE = "a las or laz file of points"
+RECORDS_AT_ONCE = 2**20  # points: a header may promise more than there are
 
 
 def read_las(source: Source) -> np.ndarray:
@@ -16,15 +16,15 @@ def read_las(source: Source) -> np.ndarray:
     Raises:
         InputError: another file, a damaged one, or one of too many points.
     """
-    source.limit(source.size(LAS), MOST_BYTES, "bytes")
+    source.limit(source.size(LAS_FILE), MOST_BYTES, "bytes")
     try:
         import laspy
     except ImportError:
         source.refuse("las with the extra maps: pip install 'torchgco[maps]'", "no laspy")
-    with source.library(LAS), laspy.open(source.path) as file:
+    with source.library(LAS_FILE), laspy.open(source.path) as file:
         source.limit(file.header.point_count, MOST_POINTS, "points")
-        parts = [np.stack([part.x, part.y, part.z], axis=-1) for part in file.chunk_iterator(AT_ONCE)]
+        parts = [np.stack([part.x, part.y, part.z], axis=-1) for part in file.chunk_iterator(RECORDS_AT_ONCE)]
     points = np.concatenate([np.empty((0, 3)), *parts])
     if len(points) != file.header.point_count:
-        source.refuse(f"{LAS} with {file.header.point_count:,} of them", f"{len(points):,}")
+        source.refuse(f"{LAS_FILE} with {file.header.point_count:,} of them", f"{len(points):,}")
     return finite_points(source, points)

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
-from torchgco.maps.files.rotated import UNKNOWN
-from torchgco.maps.files.source import FARTHEST, Source, made
+from torchgco.maps.files.rotated import UNKNOWN_CELL
+from torchgco.maps.files.source import FARTHEST_AT, Source, made
 from torchgco.maps.grid import OccupancyGrid, coordinates
 
 
 def checked_layer(value: Any, field: str) -> tuple[float, float]:
     """Two heights (low, high), m."""
     layer = coordinates(value, field)
-    if layer.shape != (2,) or not -FARTHEST <= layer[0] < layer[1] <= FARTHEST:
-        raise InputError(field, f"heights (low, high), low < high, within {FARTHEST:g} m", shown(value))
+    if layer.shape != (2,) or not -FARTHEST_AT <= layer[0] < layer[1] <= FARTHEST_AT:
+        raise InputError(field, f"heights (low, high), low < high, within {FARTHEST_AT:g} m", shown(value))
     return float(layer[0]), float(layer[1])
 
 
@@ -43,8 +43,8 @@ def flat(
         cells = found.occupied[..., held]
         if cells.dtype == np.bool_:
             return made(source, cells.any(-1), found.origin[:2], found.resolution)
-        worst = np.where(np.isnan(cells), UNKNOWN, cells.astype(np.float32)).max(-1)
-        worst[worst == UNKNOWN] = np.nan
+        worst = np.where(np.isnan(cells), UNKNOWN_CELL, cells.astype(np.float32)).max(-1)
+        worst[worst == UNKNOWN_CELL] = np.nan
         return made(source, worst, found.origin[:2], found.resolution)
     reach = radius or 0.0
     points = found[(found[:, 2] >= low - reach) & (found[:, 2] <= high + reach), :2]

@@ -20,7 +20,7 @@ MOST_YAML = 2**14  # bytes
 YAML = "a map_server yaml file with image, resolution, origin, negate, occupied_thresh and free_thresh"
 MODES = ("trinary", "scale", "raw")
 FULL = 2.0 * math.pi + 1e-3  # rad
-NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
+NUMBER_PATTERN = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 
 
 def beside(source: Source) -> Source | None:
@@ -160,7 +160,7 @@ def _mapping(source: Source) -> dict[str, Any]:
 def _number(source: Source, keys: dict[str, Any], name: str) -> float:
     """A finite number; `1e-2` is one, too, which YAML 1.1 reads as text."""
     value = keys[name]
-    if isinstance(value, str) and NUMBER.fullmatch(value):
+    if isinstance(value, str) and NUMBER_PATTERN.fullmatch(value):
         value = float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
         source.refuse(f"{name}, a finite number", shown(value))

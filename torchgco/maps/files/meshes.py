@@ -10,8 +10,8 @@ import numpy as np
 from torchgco.maps.files.source import MOST_CELLS, MOST_TEXT, Source, check_far, made
 from torchgco.maps.grid import OccupancyGrid
 
-MESH = "a mesh of triangles, stl, obj or ply"
-EDGE = 0.5  # of a cell: triangles are divided until no edge is longer
+MESH_FILE = "a mesh of triangles, stl, obj or ply"
+LONGEST_EDGE = 0.5  # of a cell: triangles are divided until no edge is longer
 MOST_PIECES = 2**25  # triangles after this
 
 
@@ -44,17 +44,17 @@ def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> O
 
 def _loaded(source: Source) -> tuple[np.ndarray, np.ndarray, bool]:
     """Vertices (V, 3), m, faces (F, 3), and whether the surface is closed."""
-    raw, kind = source.bytes(MESH, MOST_TEXT), source.path.suffix.lower()[1:]
+    raw, kind = source.bytes(MESH_FILE, MOST_TEXT), source.path.suffix.lower()[1:]
     try:
         import trimesh
     except ImportError:
         source.refuse("a mesh with the extra maps: pip install 'torchgco[maps]'", "no trimesh")
-    with source.library(MESH):  # no resolver: files that it names, such as materials, aren't read
+    with source.library(MESH_FILE):  # no resolver: files that it names, such as materials, aren't read
         mesh = trimesh.load_mesh(BytesIO(raw), file_type=kind, force="mesh", skip_materials=True)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         closed = bool(mesh.is_watertight)
     if not len(faces) or not np.isfinite(vertices).all():
-        source.refuse(MESH, f"{len(faces):,} faces" if not len(faces) else "vertices that aren't finite")
+        source.refuse(MESH_FILE, f"{len(faces):,} faces" if not len(faces) else "vertices that aren't finite")
     check_far(source, vertices)
     return vertices, faces, closed
 
@@ -65,7 +65,7 @@ def _pieces(source: Source, vertices: np.ndarray, faces: np.ndarray, resolution:
 
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(-1)
-    halvings = np.ceil(np.log2(np.maximum(longest / (EDGE * resolution), 1.0)))
+    halvings = np.ceil(np.log2(np.maximum(longest / (LONGEST_EDGE * resolution), 1.0)))
     source.limit(int((4.0**halvings).sum()), MOST_PIECES, "pieces of triangles: larger cells take fewer")
-    divided = subdivide_to_size(vertices, faces, EDGE * resolution, max_iter=math.ceil(halvings.max()) + 1)
+    divided = subdivide_to_size(vertices, faces, LONGEST_EDGE * resolution, max_iter=math.ceil(halvings.max()) + 1)
     return np.unique(np.floor(divided[0] / resolution).astype(np.int64), axis=0)

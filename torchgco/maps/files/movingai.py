@@ -10,8 +10,8 @@ from torchgco.maps.files.source import MOST_CELLS, MOST_TEXT, Source, made, whol
 from torchgco.maps.grid import OccupancyGrid
 
 MAP = "a MovingAI map: type, height, width and map, then a row of characters per line"
-FREE = b".GS"  # ground, and swamp, which can be passed
-OCCUPIED = b"@OTW"  # outside of the map, trees, and water, which can't
+FREE_LETTERS = b".GS"  # ground, and swamp, which can be passed
+OCCUPIED_LETTERS = b"@OTW"  # outside of the map, trees, and water, which can't
 
 
 def read_movingai(source: Source, resolution: float | None, origin: np.ndarray | None) -> OccupancyGrid:
@@ -38,9 +38,9 @@ def read_movingai(source: Source, resolution: float | None, origin: np.ndarray |
         got = f"{len(rows[bad])} characters in line {bad + 5}" if bad is not None else f"{len(lines) - 4} lines"
         source.refuse(f"{height} rows of {width} characters", got)
     cells = np.frombuffer(b"".join(rows), np.uint8).reshape(height, width)
-    occupied = np.isin(cells, list(OCCUPIED))
-    if (strange := ~(occupied | np.isin(cells, list(FREE)))).any():
+    occupied = np.isin(cells, list(OCCUPIED_LETTERS))
+    if (strange := ~(occupied | np.isin(cells, list(FREE_LETTERS)))).any():
         i, j = np.argwhere(strange)[0].tolist()
-        known = ", ".join(map(chr, FREE + OCCUPIED))
+        known = ", ".join(map(chr, FREE_LETTERS + OCCUPIED_LETTERS))
         source.refuse(f"characters {known}", f"{shown(bytes([cells[i, j]]))} in line {i + 5}, column {j + 1}")
     return made(source, turned(occupied), np.zeros(2) if origin is None else origin, resolution)

@@ -19,9 +19,9 @@ from torchgco.maps.grid import OccupancyGrid
 DEPTH = 16  # of OctoMap's trees: the root has a side of 2**16 cells, with the frame's origin in its middle
 MOST_NODES = 2**24
 FIRST_LINES = {".bt": "# Octomap OcTree binary file", ".ot": "# Octomap OcTree file"}
-MORE = {"OcTree": 0, "ColorOcTree": 3, "OcTreeStamped": 4}  # bytes of a node in an ot file after its log-odds
-LINES, LETTERS = 64, 4096
-FREE, OCCUPIED, INNER = 1, 2, 3  # a child in a bt file, two bits
+NODE_BYTES = {"OcTree": 0, "ColorOcTree": 3, "OcTreeStamped": 4}  # bytes of a node in an ot file after its log-odds
+OCTOMAP_LINES, OCTOMAP_LETTERS = 64, 4096
+FREE_CHILD, OCCUPIED_CHILD, INNER = 1, 2, 3  # a child in a bt file, two bits
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def read_octomap(source: Source, box: Box) -> OccupancyGrid:
     source.limit(size, MOST_NODES, "nodes of a tree")
     cursor = Cursor(source, raw, expected, at)
     binary = source.path.suffix.lower() == ".bt"
-    leaves, nodes = _binary_tree(cursor, size) if binary else _tree(cursor, MORE[kind])
+    leaves, nodes = _binary_tree(cursor, size) if binary else _tree(cursor, NODE_BYTES[kind])
     if nodes != size:
         source.refuse(f"a tree of {size:,} nodes", f"{nodes:,}")
     if not len(leaves.sides):
@@ -79,8 +79,8 @@ def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float,
     """Kind of tree, number of nodes, side of a cell, and the byte after the header."""
     found: dict[str, str] = {}
     at = 0
-    for line in range(LINES):
-        end = raw.find(b"\n", at, at + LETTERS)
+    for line in range(OCTOMAP_LINES):
+        end = raw.find(b"\n", at, at + OCTOMAP_LETTERS)
         text = raw[at : max(end, at)].decode("utf-8", "replace").strip()
         if end < 0 or (line == 0 and not text.startswith(FIRST_LINES[source.path.suffix.lower()])):
             source.refuse(expected, f"{shown(raw[at : at + 40])} at byte {at:,}")
@@ -94,8 +94,8 @@ def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float,
             found[key] = value.strip()
     if set(found) != {"id", "size", "res"}:
         source.refuse(f"{expected}, then id, size, res and data", f"only {', '.join(found) or 'none of them'}")
-    if found["id"] not in MORE:
-        source.refuse(f"a tree of {', '.join(MORE)}", shown(found["id"]))
+    if found["id"] not in NODE_BYTES:
+        source.refuse(f"a tree of {', '.join(NODE_BYTES)}", shown(found["id"]))
     if not found["size"].isascii() or not found["size"].isdigit() or len(found["size"]) > 12:
         source.refuse("a whole number of nodes", shown(found["size"]))
     try:
@@ -139,10 +139,10 @@ def _children(inner: np.ndarray) -> tuple[Leaves, int]:
     """The leaves among the children of inner nodes (I, 5): lowest cell, level, word."""
     child = np.arange(8)
     kinds = inner[:, 4:] >> 2 * child & 3
-    node, which = np.nonzero((kinds == FREE) | (kinds == OCCUPIED))
+    node, which = np.nonzero((kinds == FREE_CHILD) | (kinds == OCCUPIED_CHILD))
     side = 1 << (inner[node, 3] - 1)
     corner = np.stack([which & 1, which >> 1 & 1, which >> 2], 1) * side[:, None]
-    values = (kinds[node, which] == OCCUPIED).astype(np.float32)
+    values = (kinds[node, which] == OCCUPIED_CHILD).astype(np.float32)
     return Leaves(inner[node, :3] + corner, side, values), len(node) + len(inner)
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
-from torchgco.maps.files.source import FARTHEST, Source, made
+from torchgco.maps.files.source import FARTHEST_AT, Source, made
 from torchgco.maps.grid import OccupancyGrid, coordinates
 
-EDGE = 1e-9  # of a cell: a box that ends this close to a cell doesn't touch it
+TOUCHES_WITHIN = 1e-9  # of a cell: a box that ends this close to a cell doesn't touch it
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Box:
 
     def cells(self, resolution: float, origin: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """The first cell (d,) that the box touches, of cells that begin at an origin, and the one after the last."""
-        first = np.floor((self.low - origin) / resolution + EDGE)
-        last = np.ceil((self.high - origin) / resolution - EDGE)
+        first = np.floor((self.low - origin) / resolution + TOUCHES_WITHIN)
+        last = np.ceil((self.high - origin) / resolution - TOUCHES_WITHIN)
         most = 2.0**40
         return np.clip(first, -most, most).astype(np.int64), np.clip(last, -most, most).astype(np.int64)
 
@@ -58,8 +58,8 @@ def checked_box(value: Any, field: str) -> Box:
         InputError: other numbers, or a corner that isn't below the other one.
     """
     box = coordinates(value, field)
-    if box.shape not in ((2, 2), (2, 3)) or not (np.abs(box) <= FARTHEST).all() or not (box[0] < box[1]).all():
-        expected = f"two corners (low, high), low < high, of 2 or 3 coordinates within {FARTHEST:g} m"
+    if box.shape not in ((2, 2), (2, 3)) or not (np.abs(box) <= FARTHEST_AT).all() or not (box[0] < box[1]).all():
+        expected = f"two corners (low, high), low < high, of 2 or 3 coordinates within {FARTHEST_AT:g} m"
         raise InputError(field, expected, shown(value))
     return Box(box[0], box[1])
 

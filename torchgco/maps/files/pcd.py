@@ -15,10 +15,10 @@ from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Cursor, Source, 
 from torchgco.maps.files.text import columns_of
 
 PCD = "a pcd file with fields x, y and z"
-LINES, LETTERS = 64, 4096  # of a header, and of one of its lines
+PCD_LINES, PCD_LETTERS = 64, 4096  # of a header, and of one of its lines
 FIELDS = 256  # of a point
-KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
-TYPES = {
+PCD_KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+PCD_TYPES = {
     ("F", 4): "<f4", ("F", 8): "<f8", ("U", 1): "u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8",
     ("I", 1): "i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
 }  # fmt: skip
@@ -71,14 +71,14 @@ def _header(source: Source, raw: bytes) -> Header:
     found: dict[str, list[str]] = {}
     at = lines = 0
     while "DATA" not in found:
-        end = raw.find(b"\n", at, at + LETTERS)
-        if end < 0 or lines >= LINES:
+        end = raw.find(b"\n", at, at + PCD_LETTERS)
+        if end < 0 or lines >= PCD_LINES:
             source.refuse(f"{PCD} with a header that ends with DATA", f"none in line {lines + 1}, byte {at:,}")
         words = raw[at:end].decode("utf-8", "replace").split()
         at, lines = end + 1, lines + 1
         if words and not words[0].startswith("#"):
-            if words[0] not in KEYS or words[0] in found:
-                source.refuse(f"{PCD}: a line of each of {', '.join(KEYS)}", f"{shown(words[0])} in line {lines}")
+            if words[0] not in PCD_KEYS or words[0] in found:
+                source.refuse(f"{PCD}: a line of each of {', '.join(PCD_KEYS)}", f"{shown(words[0])} in line {lines}")
             found[words[0]] = words[1:]
     if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT") if key not in found]:
         source.refuse(f"{PCD} with {' and '.join(missing)}", "a header without")
@@ -92,9 +92,9 @@ def _header(source: Source, raw: bytes) -> Header:
         source.refuse(f"at most {FIELDS} numbers per point", sum(counts))
     types = []
     for pair in zip(found["TYPE"], sizes, strict=True):
-        if pair not in TYPES:
+        if pair not in PCD_TYPES:
             source.refuse("TYPE F, U or I of 1, 2, 4 or 8 bytes", f"{shown(pair[0])} of {pair[1]}")
-        types.append(np.dtype(TYPES[pair]))
+        types.append(np.dtype(PCD_TYPES[pair]))
     sides = [whole(source, " ".join(found[key]), key) for key in ("WIDTH", "HEIGHT")]
     points = sides[0] * sides[1]
     if "POINTS" in found and whole(source, " ".join(found["POINTS"]), "POINTS") != points:

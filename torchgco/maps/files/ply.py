@@ -1,4 +1,7 @@
-"""ply: the vertices of a Stanford polygon file, as text or binary, or its mesh. Plyfile has a stronger licence."""
+"""ply: the vertices of a Stanford polygon file, as text or binary, or its mesh.
+
+Read by hand: plyfile has a stronger licence, and trimesh, which reads meshes, is an extra that clouds do without.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,9 @@ from torchgco.maps.files.text import columns_of
 from torchgco.maps.grid import OccupancyGrid
 
 PLY = "a ply file of points with x, y and z"
-LINES, LETTERS = 1024, 4096
+PLY_LINES, PLY_LETTERS = 1024, 4096
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-TYPES = {
+PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
@@ -89,8 +92,8 @@ def _header(source: Source, raw: bytes) -> tuple[str, list[Element], int, int]:
     """Order of bytes, tables, and the byte and line after the header."""
     order, elements, at, lines = None, [], 0, 0
     while True:
-        end = raw.find(b"\n", at, at + LETTERS)
-        if end < 0 or lines >= LINES:
+        end = raw.find(b"\n", at, at + PLY_LETTERS)
+        if end < 0 or lines >= PLY_LINES:
             source.refuse(f"{PLY} with a header that ends with end_header", f"none in line {lines + 1}, byte {at:,}")
         words = raw[at:end].decode("utf-8", "replace").split()
         at, lines = end + 1, lines + 1
@@ -106,11 +109,11 @@ def _header(source: Source, raw: bytes) -> tuple[str, list[Element], int, int]:
             case ["element", name, count]:
                 elements.append(Element(name, whole(source, count, f"a count in line {lines}")))
                 source.limit(elements[-1].count, MOST_POINTS, f"rows of {shown(name)}")
-            case ["property", "list", first, second, _] if elements and first in TYPES and second in TYPES:
+            case ["property", "list", first, second, _] if elements and first in PLY_TYPES and second in PLY_TYPES:
                 elements[-1].lists = True
-            case ["property", type, name] if elements and type in TYPES and name not in elements[-1].names:
+            case ["property", type, name] if elements and type in PLY_TYPES and name not in elements[-1].names:
                 elements[-1].names.append(name)
-                elements[-1].types.append(TYPES[type])
+                elements[-1].types.append(PLY_TYPES[type])
             case ["end_header"] if order is not None:
                 return order, elements, at, lines
             case _:

@@ -23,7 +23,7 @@ from torchgco.maps.files.octomap import read_octomap
 from torchgco.maps.files.part import Box, checked_box, part
 from torchgco.maps.files.pcd import read_pcd
 from torchgco.maps.files.ply import read_ply
-from torchgco.maps.files.source import FARTHEST, LEAST, Source
+from torchgco.maps.files.source import FARTHEST_AT, LEAST_CELL, Source
 from torchgco.maps.files.text import read_xyz
 from torchgco.maps.grid import OccupancyGrid, coordinates, number
 from torchgco.maps.points import PointCloud
@@ -159,11 +159,11 @@ def read(
         if value is not None and name not in format.options:
             raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
     for name, value in (("resolution", resolution), ("radius", radius), ("height", height)):
-        _check_length(value, f"{field}.{name}", least=0.0 if name == "radius" else LEAST)
+        _check_length(value, f"{field}.{name}", least=0.0 if name == "radius" else LEAST_CELL)
     if origin is not None:
         given["origin"] = origin = coordinates(origin, f"{field}.origin")
-        if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST).all():
-            raise InputError(f"{field}.origin", f"2 or 3 coordinates within {FARTHEST:g} m", shown(origin.tolist()))
+        if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST_AT).all():
+            raise InputError(f"{field}.origin", f"2 or 3 coordinates within {FARTHEST_AT:g} m", shown(origin.tolist()))
     if solid is not None and not isinstance(solid, bool):
         raise InputError(f"{field}.solid", "True, False or None", shown(solid))
     given["layer"] = layer = None if layer is None else checked_layer(layer, f"{field}.layer")
@@ -195,5 +195,5 @@ def _find(path: Any, field: str) -> tuple[Source, Format]:
 
 
 def _check_length(value: Any, field: str, least: float) -> None:
-    if value is not None and not least <= number(value, field) <= FARTHEST:
-        raise InputError(field, f"a length from {least:g} to {FARTHEST:g} m", shown(value))
+    if value is not None and not least <= number(value, field) <= FARTHEST_AT:
+        raise InputError(field, f"a length from {least:g} to {FARTHEST_AT:g} m", shown(value))

@@ -9,8 +9,8 @@ import numpy as np
 from torchgco.maps.files.source import MOST_CELLS, Source
 from torchgco.maps.grid import OCCUPIED_FROM
 
-UNKNOWN = np.nextafter(np.float32(OCCUPIED_FROM), np.float32(0.0))  # worse than free, better than occupied
-EXACT = 1e-9  # rad: closer to a quarter turn is one
+UNKNOWN_CELL = np.nextafter(np.float32(OCCUPIED_FROM), np.float32(0.0))  # worse than free, better than occupied
+QUARTER_TURN = 1e-9  # rad: closer to a quarter turn is one
 SLAB = 2**20  # cells turned at once
 
 
@@ -26,7 +26,7 @@ def rotated(
         Bool or float32 (X', Y') with NaN where unknown, and the lowest corner (2,) of the first.
     """
     quarters = round(yaw / (math.pi / 2))
-    exact = abs(yaw - quarters * math.pi / 2) < EXACT
+    exact = abs(yaw - quarters * math.pi / 2) < QUARTER_TURN
     turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * np.array(cells.shape) @ turn.T
     low, high = corners.min(0), corners.max(0)
@@ -35,12 +35,12 @@ def rotated(
     X, Y = (int(side) for side in np.ceil(high - low))
     source.limit(X * Y, MOST_CELLS, f"cells ({X:,} x {Y:,} after turning by the origin's yaw)")
     padded = np.pad(cells.astype(np.float32), 3, constant_values=np.float32("nan"))
-    padded[np.isnan(padded)] = UNKNOWN
+    padded[np.isnan(padded)] = UNKNOWN_CELL
     result = np.empty((X, Y), np.float32)
     for first in range(0, X, max(SLAB // Y, 1)):
         last = min(first + max(SLAB // Y, 1), X)
         result[first:last] = _worst(padded, turn, low + np.array([first, 0]), (last - first, Y))
-    result[result == UNKNOWN] = np.nan
+    result[result == UNKNOWN_CELL] = np.nan
     return result, origin + resolution * low
 
 

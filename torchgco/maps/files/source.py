@@ -21,9 +21,9 @@ MOST_BYTES = 2**30  # of a file that is read whole
 MOST_TEXT = 2**28  # bytes of points written as text
 MOST_CELLS = 2**27  # of a grid: 512 x 512 x 512
 MOST_POINTS = 2**25
-FARTHEST = 1e7  # m, of any coordinate: what lies farther has another unit
-LETTERS = 150  # of a path in an error
-LEAST = 1e-6  # m, of a cell
+FARTHEST_AT = 1e7  # m, of any coordinate: what lies farther has another unit
+PATH_ROOM = 150  # of a path in an error
+LEAST_CELL = 1e-6  # m, of a cell
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Source:
     def refuse(self, expected: str, got: object) -> NoReturn:
         """Raise InputError, which names the file before what came."""
         path = str(self.path)
-        path = path if len(path) <= LETTERS else f"...{path[-LETTERS:]}"  # so that an error has room for the rest
+        path = path if len(path) <= PATH_ROOM else f"...{path[-PATH_ROOM:]}"  # so that an error has room for the rest
         raise InputError(self.field, expected, f"{path}: {got}")
 
     def size(self, expected: str) -> int:
@@ -181,9 +181,9 @@ def finite_points(source: Source, points: np.ndarray | list[np.ndarray]) -> np.n
 
 
 def check_far(source: Source, coordinates: np.ndarray) -> None:
-    """InputError where finite coordinates are beyond `FARTHEST`."""
-    if (farthest := float(np.abs(coordinates).max(initial=0.0))) > FARTHEST:
-        source.refuse(f"coordinates within {FARTHEST:g} m", f"{farthest:g}")
+    """InputError where finite coordinates are beyond `FARTHEST_AT`."""
+    if (farthest := float(np.abs(coordinates).max(initial=0.0))) > FARTHEST_AT:
+        source.refuse(f"coordinates within {FARTHEST_AT:g} m", f"{farthest:g}")
 
 
 def whole(source: Source, text: str, what: str, least: int = 0) -> int:
@@ -194,13 +194,13 @@ def whole(source: Source, text: str, what: str, least: int = 0) -> int:
 
 
 def made(source: Source, occupied: np.ndarray, origin: Any, resolution: Any) -> OccupancyGrid:
-    """The grid; what it refuses, and lengths beyond `FARTHEST` or under `LEAST`, become errors that name the file."""
+    """The grid; what it refuses, and lengths that are too large or too small, become errors that name the file."""
     source.limit(occupied.size, MOST_CELLS, "cells")
     try:
         grid = OccupancyGrid(occupied, origin, resolution)
     except InputError as error:
         source.refuse(f"{error.field}: {error.expected}", error.got)
-    if not grid.resolution >= LEAST:
-        source.refuse(f"cells of at least {LEAST:g} m", f"{grid.resolution:g} m")
+    if not grid.resolution >= LEAST_CELL:
+        source.refuse(f"cells of at least {LEAST_CELL:g} m", f"{grid.resolution:g} m")
     check_far(source, np.stack([grid.origin, grid.upper]))
     return grid

@@ -145,7 +145,7 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
 
     kept = _needed(stages, ca.vertcat(*outputs))
     if not kept:
-        return emit.emit(name, ca.Function(name, [*inputs], [*outputs]), emit.SHARED)
+        return emit.emit(name, ca.Function(name, [*inputs], [*outputs]), emit.SHARED_AT)
     if (kept_bytes := sum(stages[i].source.kept_bytes for i in kept if stages[i].ahead is None)) > MOST_KEPT:
         raise InputError("networks", f"derivatives of at most {MOST_KEPT} bytes in native kernels", kept_bytes)
     given = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
@@ -154,13 +154,13 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
     for i in kept:
         stage = stages[i]
         helpers.append(stage.source.code)
-        helpers.append(emit.emit(f"{name}_{i}", ca.Function(name, symbols, [stage.inputs]), emit.SHARED))
+        helpers.append(emit.emit(f"{name}_{i}", ca.Function(name, symbols, [stage.inputs]), emit.SHARED_AT))
         declared.append(f"    V a{i}[{stage.inputs.numel()}], b{i}[{stage.outputs.numel()}];")
         if stage.source.d and stage.ahead is None:
             declared.append(f"    tgco_net_{stage.source.key}_kept kept{i}[1];")
         lines += [f"    {name}_{i}({passed}, a{i});", f"    {_called(i, stage)};"]
         symbols, passed = [*symbols, stage.outputs], f"{passed}, b{i}"
-    helpers.append(emit.emit(f"{name}_end", ca.Function(name, symbols, [*outputs]), emit.SHARED))
+    helpers.append(emit.emit(f"{name}_end", ca.Function(name, symbols, [*outputs]), emit.SHARED_AT))
     lines.append(f"    {name}_end({passed}, {', '.join(f'out{i}' for i in range(len(outputs)))});")
     written = ", ".join(f"V *restrict out{i}" for i in range(len(outputs)))
     head = f"__attribute__((noinline)) static void {name}({given}, {written}) {{"
@@ -169,7 +169,7 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
 
 def _called(i: int, stage: Stage) -> str:
     """The call of stage i, from a to b."""
-    net, key, w = stage.source.net, stage.source.key, f"in{emit.SHARED}"
+    net, key, w = stage.source.net, stage.source.key, f"in{emit.SHARED_AT}"
     if stage.ahead is not None:
         return f"tgco_net_{key}_back({w}, kept{stage.ahead}, a{i}, b{i}, b{i} + {net.k})"
     if stage.source.d:

@@ -13,7 +13,7 @@ from torchgco.native.codegen.stages import StagesSource
 from torchgco.tracing.nets import Call
 
 # Operations whose derivatives are finite wherever their arguments are.
-SMOOTH = (
+SMOOTH_OPERATIONS = (
     "INPUT", "CONST", "PARAMETER", "ASSIGN", "ADD", "SUB", "MUL", "NEG", "TWICE", "SQ", "SIN", "COS", "ATAN", "TANH",
     "ERF", "FABS", "FMIN", "FMAX", "SIGN", "FLOOR", "CEIL", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "IF_ELSE_ZERO",
     "REMAINDER",
@@ -160,7 +160,7 @@ def _has_hidden_pole(function: Any, poles: Container[int] = ()) -> bool:
     """
     import casadi as ca
 
-    smooth = {getattr(ca, f"OP_{name}") for name in SMOOTH}
+    smooth = {getattr(ca, f"OP_{name}") for name in SMOOTH_OPERATIONS}
     written: dict[int, int] = {}  # by which instruction each place of the work vector was written last
     needs: list[list[int]] = []
     outputs = []

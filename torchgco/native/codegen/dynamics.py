@@ -20,7 +20,7 @@ from torchgco.native.codegen import calls, emit, layers
 from torchgco.tracing import Traced, arrays, dtypes, nets, operations, own_tensors
 from torchgco.tracing.nets import Call
 
-STEP, JACOBIAN = "tgco_step", "tgco_jacobian"
+STEP_FUNCTION, JACOBIAN = "tgco_step", "tgco_jacobian"
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def step_parts(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> dict
     places = np.where(fixed, -1, np.cumsum(np.logical_not(fixed)) - 1)
     code = [
         calls.emit_staged(name, inputs, [ca.densify(result)], stages)
-        for name, result, stages in ((STEP, step, calls.values(found)), (JACOBIAN, changing, tangents.stages))
+        for name, result, stages in ((STEP_FUNCTION, step, calls.values(found)), (JACOBIAN, changing, tangents.stages))
     ]
     return {
         "code": "\n".join(code),
@@ -165,7 +165,7 @@ def elements(column: Any) -> np.ndarray:
 def makers(*more: str) -> Sequence[str]:
     """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
     modules = (operations, arrays, dtypes, nets, emit, layers, calls)
-    files = (*(module.__file__ for module in modules), str(layers.LOOPS), __file__, *more)
+    files = (*(module.__file__ for module in modules), str(layers.NET_SOURCE), __file__, *more)
     try:
         casadi = version("casadi")
     except PackageNotFoundError:

@@ -28,7 +28,7 @@ _OF_ONE = (
 _OF_TWO = ("pow", "fmod", "atan2", "hypot", "copysign")
 
 
-SHARED = 3  # of the functions of a model, a cost, a constraint: the input with the numbers that all problems share
+SHARED_AT = 3  # of the functions of a model, a cost, a constraint: the input with the numbers that all problems share
 
 
 def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
@@ -57,7 +57,7 @@ def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
     return f"static inline void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"
 
 
-def input_type(i: int, shared: int | None = SHARED) -> str:
+def input_type(i: int, shared: int | None = SHARED_AT) -> str:
     """The type of input i, a pointer's up to the name."""
     return "const double *restrict" if i == shared else "const V *restrict"
 

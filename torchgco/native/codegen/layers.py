@@ -21,7 +21,7 @@ from typing import Any
 from torchgco.native.codegen import emit
 from torchgco.tracing.nets import Linear, Net, Neurons
 
-LOOPS = Path(__file__).parents[1] / "c" / "net.h"
+NET_SOURCE = Path(__file__).parents[1] / "c" / "net.h"
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class NetSource:
     def code(self) -> str:
         """The functions, once in a file however often this text stands there."""
         guard = f"TGCO_NET_{self.key}"
-        loops = ["#ifndef TGCO_NETS", "#define TGCO_NETS", LOOPS.read_text(), "#endif"]
+        loops = ["#ifndef TGCO_NETS", "#define TGCO_NETS", NET_SOURCE.read_text(), "#endif"]
         own = [f"#ifndef {guard}", f"#define {guard}", self._text.replace("KEY", self.key), "#endif"]
         return "\n".join([*loops, *own])
 

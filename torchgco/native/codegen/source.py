@@ -21,7 +21,7 @@ from torchgco.native.structures import CONSTANTS, COST_ARRAYS, ENUMERATIONS, STR
 
 C = Path(__file__).parents[1] / "c"
 LANES = lanes()
-KEPT = 64  # libraries, the most recent ones
+LIBRARIES_KEPT = 64  # libraries, the most recent ones
 HEADS = "problem.h", "model.h"
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
 LOOPS = """
@@ -65,15 +65,15 @@ class Library:
     shared: tuple[str, ...]
 
 
-BOXES = "box.h", "boxes.c", "field.c", "body.c"  # left out of problems without a position
-ROWS = ("problem.c", "rows.c", "penalty.c", *BOXES)
+OBSTACLE_SOURCES = "box.h", "boxes.c", "field.c", "body.c"  # left out of problems without a position
+ROWS = ("problem.c", "rows.c", "penalty.c", *OBSTACLE_SOURCES)
 PHASES = "_rows", "_step", "_memory", "_fixed", "_search", "", "_kkt"
-PASSES = "model.c", "passes.h", "cholesky.h", "passes.c"
+PASS_SOURCES = "model.c", "passes.h", "cholesky.h", "passes.c"
 RICCATI = "curvature.c", "interior.h", "cholesky.h", "riccati.c"
-SOLVER = Library(PASSES, (), (*ROWS, "passes.h", "knot.c", "ilqr.c", "trajectories.c", "outer.c"))
+SOLVER_LIBRARY = Library(PASS_SOURCES, (), (*ROWS, "passes.h", "knot.c", "ilqr.c", "trajectories.c", "outer.c"))
 SAMPLER = Library(("model.c",), (), (*ROWS, "normal.c", "mppi.c"))
-# The model's unit is that of SOLVER: it is compiled once for both.
-INTERIOR = Library(PASSES, RICCATI, (*ROWS, "interior.h", *(f"interior{phase}.c" for phase in PHASES)))
+# The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
+INTERIOR = Library(PASS_SOURCES, RICCATI, (*ROWS, "interior.h", *(f"interior{phase}.c" for phase in PHASES)))
 SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
 
 
@@ -91,12 +91,12 @@ class Form:
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
     lifted: frozenset[int] = frozenset()  # those of which the places of a body's balls are traced
 
-    def units(self, library: Library = SOLVER, real: str = "double", lanes: int = LANES) -> tuple[Unit, ...]:
+    def units(self, library: Library = SOLVER_LIBRARY, real: str = "double", lanes: int = LANES) -> tuple[Unit, ...]:
         """The units of a library, for numbers of type `real`."""
         key = (*self._key, library, real, lanes)
         if key not in _units:
             _units[key] = self._written(library, {"REAL": real, "LANES": lanes})
-            if len(_units) > KEPT:
+            if len(_units) > LIBRARIES_KEPT:
                 del _units[next(iter(_units))]
         return _units[key]
 
@@ -120,7 +120,7 @@ class Form:
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
             units.append(Unit(self._text(vectors | sizes, generated, *library.curvature), own=True))
-        shared = [name for name in library.shared if at is not None or name not in BOXES]
+        shared = [name for name in library.shared if at is not None or name not in OBSTACLE_SOURCES]
         return (*units, Unit(self._text(vectors | read, [], *shared)))
 
     def _text(self, sizes: dict[str, Any], generated: list[str], *files: str) -> str:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 BLOCK_TRIES = 10  # exchanges of whole blocks without progress before rows are exchanged one at a time
 EXCHANGES = 200  # at most
-SLACK = 1e-12  # share of a row's scale: exchange tolerance, and regularisation of dependent rows
+EXCHANGE_SLACK = 1e-12  # share of a row's scale: exchange tolerance, and regularisation of dependent rows
 
 
 def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | None:
@@ -29,14 +29,14 @@ def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | N
     if b.numel() == 0:
         return torch.zeros_like(b)
     scale = S.diagonal().clamp(min=torch.finfo(S.dtype).tiny)
-    S = S + torch.diag(SLACK * scale)
+    S = S + torch.diag(EXCHANGE_SLACK * scale)
     working = start | free
     fewest, tries = b.numel() + 1, BLOCK_TRIES
     for _ in range(EXCHANGES):
         lam = _on(S, b, working)
         slack = b - S @ lam
         # Both measured as multipliers, so that one tolerance serves rows of any unit.
-        wrong = torch.where(working, (lam < 0) & ~free, slack / scale > SLACK * (1.0 + lam.abs().max()))
+        wrong = torch.where(working, (lam < 0) & ~free, slack / scale > EXCHANGE_SLACK * (1.0 + lam.abs().max()))
         count = int(wrong.sum())
         if count == 0:
             return torch.where(free, lam, lam.clamp(min=0.0))
@@ -65,7 +65,7 @@ def projected(V: Tensor, b: Tensor, free: Tensor) -> Tensor | None:
     except RuntimeError:
         return None
     distance = 1.0 - float(E[-1] @ pushes)
-    if not distance > SLACK:
+    if not distance > EXCHANGE_SLACK:
         return None  # the rows contradict each other
     lam = b.new_tensor(pushes[: b.numel()]) / distance
     lam[free] -= b.new_tensor(pushes[b.numel() :]) / distance

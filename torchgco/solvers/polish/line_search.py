@@ -11,10 +11,10 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.problem.problem import Problem
 from torchgco.solvers.polish.condensed import Condensed
 
-SMALLEST = 1e-3  # step length at which the line search gives up
+SMALLEST_STEP = 1e-3  # step length at which the line search gives up
 CORRECTIONS = 2  # of a refused step, at each step length
 DEPENDENT = 1e-9  # share of the largest singular value below which active rows count as dependent
-NOISE = 1e-12  # rounding of a merit, as a share of it
+MERIT_NOISE = 1e-12  # rounding of a merit, as a share of it
 
 
 def merit(problem: Problem, X: Tensor, U: Tensor, weight: float) -> float:
@@ -34,9 +34,9 @@ def descend(model: Condensed, step: Tensor, lam: Tensor, weight: float) -> tuple
     """
     problem, U, alpha = model.problem, model.U, 1.0
     before = merit(problem, model.X, U, weight)
-    most = before + NOISE * (1.0 + abs(before))
+    most = before + MERIT_NOISE * (1.0 + abs(before))
     correction: Callable[[Tensor, Tensor, float], Tensor] | None = None
-    while alpha >= SMALLEST:
+    while alpha >= SMALLEST_STEP:
         trial = U + alpha * step.view_as(U)
         for tries in range(1 + CORRECTIONS):
             states = open_loop(problem.dynamics, problem.x0, trial)

@@ -26,14 +26,14 @@ from torchgco.solution import Solution
 from torchgco.solvers.ending import final_status, optimality
 from torchgco.solvers.polish.active_set import multipliers, projected
 from torchgco.solvers.polish.condensed import Condensed
-from torchgco.solvers.polish.line_search import NOISE, descend
+from torchgco.solvers.polish.line_search import MERIT_NOISE, descend
 
 STIFFNESS = 1e4  # curvature added across the active rows, times the Hessian's mean diagonal; no solution changes
 # Shares of the mean of `_mean_along`, added to the diagonal until the model is convex.
 SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)
-NEAR = 1e-2  # rows with c above minus this share of their slope's length are in the program from the start
+NEAR_ROWS = 1e-2  # rows with c above minus this share of their slope's length are in the program from the start
 PIVOT = 1e-3  # the smallest pivot that is convex enough, as a share of the mean of `_mean_along`
-ACTIVE = 1e-3  # as NEAR: rows that count as active in the KKT residual
+ACTIVE = 1e-3  # as NEAR_ROWS: rows that count as active in the KKT residual
 PROGRAM_ROUNDS = 10  # rounds of adding the rows that a step would violate to a program
 
 
@@ -246,7 +246,7 @@ def _program(point: _Point, L: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor
     """
     model, lam = point.model, point.lam
     size = model.slopes.norm(dim=-1)
-    member = (model.equality | (lam > 0) | (model.c > -NEAR * size)) & (size > 0)
+    member = (model.equality | (lam > 0) | (model.c > -NEAR_ROWS * size)) & (size > 0)
     g = torch.linalg.solve_triangular(L, gradient.unsqueeze(-1), upper=False).squeeze(-1)
     for _ in range(PROGRAM_ROUNDS):
         rows = member.nonzero().flatten()
@@ -262,7 +262,7 @@ def _program(point: _Point, L: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor
         if pushes is None:
             return None
         step = -torch.linalg.solve_triangular(L.mT, (g + V @ pushes).unsqueeze(-1), upper=True).squeeze(-1)
-        broken = (model.c + model.change(step) > NOISE * size) & ~member & (size > 0)
+        broken = (model.c + model.change(step) > MERIT_NOISE * size) & ~member & (size > 0)
         if not bool(broken.any()):
             return step, torch.zeros_like(lam).index_put((rows,), pushes)
         member = member | broken

@@ -12,7 +12,7 @@ from torchgco.maps.files.source import MOST_POINTS, Source
 MOST_RECORDS = 2**23  # of a file
 MOST_INSIDE = 2**20  # records in chunks, which may be far larger than the file: some seconds
 MOST_MESSAGE = 16 * MOST_POINTS  # bytes of a message, or of a chunk of them: a cloud of four floats per point
-CLOUD, GRID = "sensor_msgs/PointCloud2", "nav_msgs/OccupancyGrid"
+CLOUDS, GRIDS = "sensor_msgs/PointCloud2", "nav_msgs/OccupancyGrid"
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ def choose(source: Source, topics: dict[str, str], wanted: str | None) -> str:
     Raises:
         InputError: no or several topics have maps, or the one that is wanted has none.
     """
-    maps = sorted(topic for topic, type in topics.items() if plain(type) in (CLOUD, GRID))
+    maps = sorted(topic for topic, type in topics.items() if plain(type) in (CLOUDS, GRIDS))
     said = ", ".join(maps[:8]) + (", ..." if len(maps) > 8 else "")
     if not maps:
         others = ", ".join(sorted({plain(type) for type in topics.values()})[:8])
-        source.refuse(f"a bag with messages of {CLOUD} or {GRID}", others or "no messages")
+        source.refuse(f"a bag with messages of {CLOUDS} or {GRIDS}", others or "no messages")
     if wanted is None and len(maps) == 1:
         return maps[0]
     if wanted not in maps:

@@ -9,7 +9,7 @@ from torchgco.maps.files.source import Cursor, Source
 
 MCAP = "an mcap file"
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, END = 3, 4, 5, 6, 7, 15  # kinds of records
+SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, MCAP_INDEX, END = 3, 4, 5, 6, 7, 15  # kinds of records
 MOST_SCHEMA = 2**24  # bytes
 MOST_UNPACKED = 2**32  # bytes of all chunks of a file without an index
 
@@ -93,14 +93,14 @@ def _walk(cursor: Cursor, contents: Contents, chunk: int | None = None) -> None:
         if kind in (SCHEMA, CHANNEL):
             cursor.source.limit(length, MOST_SCHEMA, "bytes of a schema")
             _name(Cursor(cursor.source, cursor.take(length, "a schema"), MCAP, 0, first), kind, contents)
-        elif kind == MESSAGE and length >= 22:
+        elif kind == MCAP_MESSAGE and length >= 22:
             id, _, time, _ = (cursor.number(letter, "a message") for letter in "HIQQ")
             place = Place(time, cursor.at, length - 22, chunk)
             if id not in contents.last or contents.last[id].time <= time:
                 contents.last[id] = place
-        elif kind == CHUNK and chunk is None:
+        elif kind == MCAP_CHUNK and chunk is None:
             latest = contents.chunks[first] = {}
-        elif kind == INDEX and chunk is None and length >= 22:
+        elif kind == MCAP_INDEX and chunk is None and length >= 22:
             id = cursor.number("H", "an index")
             cursor.at = first + length - 16
             latest[id] = max(latest.get(id, 0), cursor.number("Q", "a time"))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import shown
-from torchgco.maps.files.bags.container import CLOUD, GRID, Message, plain
+from torchgco.maps.files.bags.container import CLOUDS, GRIDS, Message, plain
 from torchgco.maps.files.rotated import rotated
 from torchgco.maps.files.source import MOST_CELLS, MOST_POINTS, Cursor, Source, check_far, finite_points, made
 from torchgco.maps.grid import OccupancyGrid
@@ -67,9 +67,9 @@ def decoded(source: Source, message: Message) -> OccupancyGrid | np.ndarray:
     """
     if message.encoding not in ("cdr", "ros1"):
         source.refuse("messages as cdr or ros1", shown(message.encoding[:40]))
-    readers: dict[str, Callable[[Source, Fields, bool], OccupancyGrid | np.ndarray]] = {CLOUD: _cloud, GRID: _grid}
+    readers: dict[str, Callable[[Source, Fields, bool], OccupancyGrid | np.ndarray]] = {CLOUDS: _cloud, GRIDS: _grid}
     if (kind := plain(message.type)) not in readers:
-        source.refuse(f"messages of {CLOUD} or {GRID}", shown(kind[:40]))
+        source.refuse(f"messages of {CLOUDS} or {GRIDS}", shown(kind[:40]))
     return readers[kind](source, Fields(source, message), message.encoding == "ros1")
 
 

@@ -9,8 +9,8 @@ from torchgco.base.errors import shown
 from torchgco.maps.files.bags.container import MOST_INSIDE, MOST_RECORDS, Message, choose, unpack
 from torchgco.maps.files.source import Cursor, Source
 
-BAG = "a bag of ROS 1, version 2.0"
-FIRST = b"#ROSBAG V2.0\n"
+BAG_FILE = "a bag of ROS 1, version 2.0"
+BAG_BEGINS = b"#ROSBAG V2.0\n"
 MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7  # kinds of records
 MOST_HEADER = 2**16  # bytes
 MOST_CONNECTION = 2**24  # bytes, mostly the definition of its messages
@@ -34,19 +34,19 @@ def last_message(source: Source, topic: str | None) -> Message:
     Raises:
         InputError: no such bag, one without an index, damage, no such topic.
     """
-    with source.opened(BAG) as (data, size):
-        cursor = Cursor(source, data, BAG)
-        if bytes(cursor.take(min(size, len(FIRST)), "its first line")) != FIRST:
-            source.refuse(f"{BAG}, which begins with {FIRST.decode().strip()}", "another beginning")
+    with source.opened(BAG_FILE) as (data, size):
+        cursor = Cursor(source, data, BAG_FILE)
+        if bytes(cursor.take(min(size, len(BAG_BEGINS)), "its first line")) != BAG_BEGINS:
+            source.refuse(f"{BAG_FILE}, which begins with {BAG_BEGINS.decode().strip()}", "another beginning")
         connections, chunks = _walk(cursor)
         if not connections:
-            source.refuse(f"{BAG} with an index (`rosbag reindex` makes one)", "none")
+            source.refuse(f"{BAG_FILE} with an index (`rosbag reindex` makes one)", "none")
         name = choose(source, dict(connections.values()), topic)
         ids = {id for id, (other, _) in connections.items() if other == name}
         latest = [max((time for id, time in chunk.latest.items() if id in ids), default=None) for chunk in chunks]
         times = [time for time in latest if time is not None]
         if not times:
-            source.refuse(f"{BAG} with messages of {name}", "none")
+            source.refuse(f"{BAG_FILE} with messages of {name}", "none")
         chunk = chunks[latest.index(max(times))]
         cursor.at = chunk.at
         packed = cursor.take(chunk.packed, "a chunk")

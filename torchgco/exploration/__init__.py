@@ -1,0 +1,6 @@
+"""Missions in space that the vehicle has not seen: sensors, its map, paths on it, plans that stop where it is free."""
+
+from torchgco.exploration.explorer import Explorer as Explorer
+from torchgco.exploration.mission import SensorMission as SensorMission
+from torchgco.exploration.sensing.sensors import Depth as Depth
+from torchgco.exploration.sensing.sensors import Lidar as Lidar

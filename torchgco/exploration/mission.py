@@ -1,0 +1,65 @@
+"""Missions that learn of obstacles by a sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.dynamics.base import Dynamics
+from torchgco.exploration.explorer import Explorer, SensorName, Unknown
+from torchgco.exploration.pilot import Exploration
+from torchgco.exploration.sensing.sensors import Depth, Lidar
+from torchgco.missions.mission import Mission
+from torchgco.missions.pilot import Pilot
+from torchgco.native.compiler import find_compiler
+from torchgco.problem.problem import Problem
+
+
+@dataclass(frozen=True)
+class SensorMission(Mission):
+    """A closed loop that may know of the obstacles what a sensor sees on the way; see `Mission` for its other options.
+
+    Args:
+        sensor: what the vehicle knows of the obstacles: "full", all of them from the start, or what a "lidar" or a
+            "depth" camera sees on the way.
+        unknown: what plans make of space that hasn't been seen, with a lidar or a depth camera: "occupied" stay out of
+            it and so can always stop in time, "free" plan as if nothing were there.
+        lidar, depth, explorer: options of the sensors, and of flights with them.
+
+    Raises:
+        InputError: as `Mission`, and a latency with a sensor.
+    """
+
+    sensor: SensorName = "full"
+    unknown: Unknown = "occupied"
+    lidar: Lidar = field(default_factory=Lidar)
+    depth: Depth = field(default_factory=Depth)
+    explorer: Explorer = field(default_factory=Explorer)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.sees_all and self.latency:
+            raise InputError("mission.latency", "0 with a sensor", self.latency)
+
+    @property
+    def sees_all(self) -> bool:
+        """See `Mission`."""
+        return self.sensor == "full"
+
+    def check(self, dynamics: Dynamics) -> None:
+        """See `Mission`."""
+        super().check(dynamics)
+        if not self.sees_all and find_compiler() is None:
+            wanted = "full on a machine without a C compiler: sensors and their maps are computed in C (TORCHGCO_CC)"
+            raise InputError("mission.sensor", wanted, self.sensor)
+
+    def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
+        """Who plans for vehicles at plants x (B, 17): the planner, or with a sensor the explorer."""
+        return super().begin(problem, x, seed, ids) if self.sees_all else self.exploration(problem, seed, ids)
+
+    def exploration(self, problem: Problem, seed: int, ids: Tensor) -> Exploration:
+        """The pilot that explores with the sensor."""
+        sensor = self.lidar if self.sensor == "lidar" else self.depth
+        return Exploration(self.explorer, self.planner, sensor, self.unknown, problem, seed, ids)
