@@ -8,7 +8,7 @@ from torch import Tensor
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.softness import gives_of
 from torchgco.eager.step import Factors, factor, solve
-from torchgco.lagrangian.kkt import LEAST_PIVOT, CLOSING_ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
+from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, KktSolve, RightSides
 
 
 def kkt(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
-from torchgco.lagrangian.kkt import LEAST_PIVOT, CLOSING_ROUNDS, SLIGHT, STIFF, KktSolve, RightSides
+from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, KktSolve, RightSides
 from torchgco.native.codegen.source import INTERIOR, LANES
 from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
