@@ -121,6 +121,19 @@ def test_a_closed_mesh_is_solid(ending: str, tmp_path: Path) -> None:
     assert isinstance(part, OccupancyGrid) and part.shape == (4, 3, 15) and np.allclose(part.origin, [2.5, -1.5, -0.2])
 
 
+def test_seams_of_textures_and_normals_open_no_mesh(tmp_path: Path) -> None:
+    """Modellers write corners once per face, with a normal and a place on the texture of each."""
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box(extents=[2, 1, 1])
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"vn {x} {y} {z}" for x, y, z in box.face_normals]
+    lines += [f"vt {i / 36} 0.5" for i in range(36)]
+    for i, corners in enumerate(box.faces):
+        lines.append("f " + " ".join(f"{v + 1}/{3 * i + j + 1}/{i + 1}" for j, v in enumerate(corners)))
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    grid = read(tmp_path / "a.obj", resolution=0.1)
+    assert isinstance(grid, OccupancyGrid) and grid.is_occupied.all()
+
+
 def test_an_open_mesh_is_a_surface(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     vertices = [[0, 0, 0], [4, 0, 0], [4, 3, 2], [0, 3, 2]]
