@@ -62,7 +62,7 @@ def load(source: Source, upright: bool = False) -> tuple[np.ndarray, np.ndarray 
 def _check_levels(source: Source, image: Any) -> None:
     """Pillow gives numbers of 32 bits as they are, of which 65535 needn't be white, and doesn't turn white at 0."""
     if image.mode == "I":
-        source.refuse(f"{IMAGE} of 8 or 16 bits", "32 bits")
+        source.refuse(f"{IMAGE} of 8 or 16 bits, unsigned", "another kind of numbers")
     if image.tag_v2.get(PHOTOMETRIC) == 0:
         source.refuse(f"{IMAGE} whose black is 0", "16 bits with white at 0")
 
