@@ -38,6 +38,9 @@ COMPILER = [ -n "$$TORCHGCO_CC" ] || $(BIN)/python -c "$(FIND)" || { \
     echo "It can't be installed here: solves run in PyTorch, many times slower. Any of gcc, clang or zig will do."
 FIND := import sys; from torchgco.native.compiler import find_compiler; sys.exit(find_compiler() is None)
 
+# Tests start Python some hundred times, and each would compile the sources again, and every worker all tests.
+unexport PYTHONDONTWRITEBYTECODE
+
 SPEED := $(BIN)/python -m benchmarks.speed
 
 .PHONY: floors study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps maps-known maps-seen maps-long \

@@ -81,7 +81,7 @@ def draw(problem: Problem, solution: Solution, layouts: Layouts) -> dict[str, Fi
 
 def tables() -> str:
     """The passes of `gco` as Markdown; values that differ: in the plane / in space."""
-    plane, space = (presets.gco(dimension).table().reset_index() for dimension in (2, 3))
+    plane, space = (presets.gco(dimension).table().reset_index().iloc[:, :4] for dimension in (2, 3))
     lines = [space.columns.tolist(), ["---"] * len(space.columns)]
     for a, b in zip(plane.values.tolist(), space.values.tolist(), strict=True):
         lines.append([x if x == y or y == "" else f"{x} / {y}" if x else y for x, y in zip(a, b, strict=True)])

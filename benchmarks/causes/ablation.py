@@ -4,7 +4,7 @@ One at a time is doubled (None, or the other value, where that is all there is) 
 families are flown, until one family notices: until a layout has other controls. Where doubling changes nothing, it is
 halved, too. What changes nothing on all layouts, these families don't need. Rows fly all families; with --all, so does
 everything. Success counts against the best cost over all variants. Flights lie below outputs/ablation: a run that was
-stopped resumes. With --write the table goes into benchmarks/results/ablation.md.
+stopped resumes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from typing import Any
 import pandas as pd
 import torch
 
-from benchmarks.lib import RESULTS, ROOT
+from benchmarks.lib import ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, Family
-from benchmarks.lib.page import markdown, origin, put
+from benchmarks.lib.page import markdown
 from torchgco import compose, judge, presets
 from torchgco.base.errors import InputError
 from torchgco.judging.judge import near_best
@@ -230,7 +230,7 @@ def drawn() -> dict[Family, Task]:
 
 
 def main() -> int:
-    parser = parser_of(__doc__, "results/ablation.md")
+    parser = parser_of(__doc__)
     parser.add_argument("--folder", type=Path, default=ROOT / "outputs" / "ablation")
     parser.add_argument("--all", action="store_true", help="fly every family with every change")
     asked = parser.parse_args()
@@ -243,11 +243,7 @@ def main() -> int:
         if key[2] != "halved" or not noticed(doubled, done["", "default", ""]):
             done[key] = flights(key, tasks, asked.folder, asked.all)
             print(number, "of", len(values), *key, len(done[key]), file=sys.stderr, flush=True)
-    text = table(done, values)
-    print(text)
-    if asked.write:
-        how = f"{LAYOUTS} drawn layouts of each of {len(FAMILIES)} families, seed {SEED}"
-        put(RESULTS / "ablation.md", "ablation", f"{origin('Flown')}, {how}.\n\n{text}")
+    print(table(done, values))
     return 0
 
 

@@ -34,10 +34,10 @@ class Example:
 
 
 def table(trials: pd.DataFrame, causes: dict[str, str], missed: str) -> str:
-    """Markdown: one row per cause, with its count in every family; `missed` names the sum."""
+    """Markdown: one row per cause that was met, with its count in every family; `missed` names the sum."""
     families = list(dict.fromkeys(trials.family))
     counts = pd.crosstab(trials.cause, trials.family).reindex(index=list(causes), columns=families, fill_value=0)
-    rows = [[name, meaning, *counts.loc[name]] for name, meaning in causes.items()]
+    rows = [[name, meaning, *counts.loc[name]] for name, meaning in causes.items() if counts.loc[name].any()]
     flown = trials.groupby("family").cause
     sums = [f"{flown.get_group(f).notna().sum()} of {flown.get_group(f).size}" for f in families]
     return markdown(["cause", "what it means", *families], [*rows, [f"**{missed}**", "", *sums]])

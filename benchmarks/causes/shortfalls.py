@@ -24,7 +24,7 @@ from benchmarks.causes.picture import Example, picture, table
 from benchmarks.lib import RESULTS
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import WORLDS, Family
-from benchmarks.lib.page import markdown, origin, put
+from benchmarks.lib.page import filed, markdown, origin, put
 from torchgco import compose, judge, presets
 from torchgco.judging.judge import near_best
 from torchgco.plotting.bodies import Box, bodies
@@ -249,7 +249,7 @@ def _table(trials: pd.DataFrame) -> str:
 def write(page: Path, trials: pd.DataFrame, examples: dict[str, Example], seed: int) -> None:
     """Put table and list between the marks of the page, and the picture next to it."""
     head = f"{origin('`gco`')}, seed {seed}, the public layouts."
-    blocks = [head, _table(trials), listed(trials)]
+    blocks = [head, _table(trials), filed("shortfalls", listed(trials))]
     if examples:
         file = picture(examples, page.with_suffix(".png"), "cheapest candidate")
         blocks.append(f"![One layout for every cause]({file.name})")

@@ -3,7 +3,7 @@
 Changes one operator, number or condition at a time, in Python and in C, in a copy of the repository, and runs the tests
 that are meant to guard it. A sample, drawn by a seed, of the files of `AREAS`: some minutes per ten mutants on one
 core. A run that was stopped, even killed, goes on where it was. With --write the table goes into
-benchmarks/results/mutation.md; the reasons that stand there for survivors are kept.
+benchmarks/results/mutation.md; the reasons for survivors, in mutation-survivors.csv, are kept.
 """
 
 from __future__ import annotations
@@ -25,12 +25,14 @@ from pathlib import Path
 from tqdm import tqdm
 
 from benchmarks.endurance.mutants import Mutant, mutants_of, sampled
-from benchmarks.lib.page import put_between
+from benchmarks.lib.page import filed, put_between
+from benchmarks.lib.page import read as read_table
 from benchmarks.lib.provenance import provenance
 from torchgco.experiments.statistics.statistics import wilson
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "benchmarks" / "results" / "mutation.md"
+REASONS = PAGE.with_name("mutation-survivors.csv")
 RECORDS = ROOT / "outputs" / "mutation.jsonl"
 COPIED = ("torchgco", "tests", "benchmarks", "conf", "docs", "notebooks", "pyproject.toml", "README.md")
 KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
@@ -251,10 +253,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the tests that run and the copy go, too
     mutants = drawn(options.each, options.seed)
     ends = run(mutants, options.records, options.again)
-    origin, page = provenance("cpu"), PAGE.read_text()
-    lines = [*table(mutants, ends, page), "", *survivors(mutants, ends, page)]
+    origin, kept = provenance("cpu"), read_table(REASONS)
     head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}; seed {options.seed}."
-    text = "\n".join([head, "", *lines])
+    shares = "\n".join(table(mutants, ends, kept))
+    text = f"{head}\n\n{shares}\n\n{filed(REASONS.stem, chr(10).join(survivors(mutants, ends, kept)))}"
     print(text)
     if options.write:
         put_between(PAGE, "<!-- mutation -->", "<!-- end mutation -->", text)

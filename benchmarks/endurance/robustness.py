@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 
 from benchmarks.endurance import mutation
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import put_between
+from benchmarks.lib.page import filed, put_between
 from benchmarks.lib.provenance import provenance
 
 PAGE = RESULTS / "robustness.md"
@@ -106,7 +106,12 @@ def put_bombs(write: bool) -> bool:
     """Print the table of bombs, and with `write` put it into the page; whether all is as it should be."""
     lines, right = bomb_table()
     origin = provenance("cpu")
-    text = "\n".join([f"Run on {origin['date']} at commit {origin['commit']}.", "", *lines])
+    held = [[cell.strip() for cell in line.split("|")[4:6]] for line in lines[2:]]
+    seconds, memory = (max((row[place] for row in held), key=float) for place in (0, 1))
+    refused = sum("| in one line |" in line for line in lines)
+    said = f"{refused} of {len(held)} refused in one line, in at most {seconds} s and {memory} MB."
+    head = f"Run on {origin['date']} at commit {origin['commit']}."
+    text = f"{head}\n\n{filed('robustness-files', chr(10).join(lines), said)}"
     print(text)
     if write:
         put_between(PAGE, "<!-- bombs -->", "<!-- end bombs -->", text)
@@ -129,7 +134,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     origin = provenance("cpu")
     counts = f"{sum(cases.values()):,} cases, {sum(examples.values()):,} random examples"
     head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}: {counts}."
-    text = "\n".join([head, "", *case_table(cases), "", *example_table(examples)])
+    ends: Counter[str] = Counter()
+    for (_, outcome), count in examples.items():
+        ends[outcome] += count
+    said = f"Random examples: {', '.join(f'{count:,} {end}' for end, count in ends.most_common())}."
+    random = filed("robustness-random", "\n".join(example_table(examples)), said)
+    text = "\n\n".join([head, "\n".join(case_table(cases)), random])
     print(text)
     if options.write:
         put_between(PAGE, "<!-- robustness -->", "<!-- end robustness -->", text)

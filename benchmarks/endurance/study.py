@@ -30,12 +30,13 @@ from benchmarks.endurance.memory import Sampler, draw, group_of, summary
 from benchmarks.endurance.overhead import FLIGHT, PHASES, REPORT, REST
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.command import parser_of
-from benchmarks.lib.page import machine, markdown, origin, put
+from benchmarks.lib.page import cells_of, chosen, filed, machine, markdown, origin, put
 
 KILLS = 3
 TIMING = ["seconds", "batch_size", "threads"]  # columns that describe how a trial was flown
 SHARDS, LARGEST = 8, 512  # at least so many shards, of at most so many layouts
 LIMIT = 0.03  # the overhead of sharding, as a share of the direct calls
+PROCESS = "processor seconds in one process"
 POLL = 0.05  # s
 
 
@@ -209,8 +210,9 @@ def overhead_table(seconds: dict[str, dict[str, float]]) -> str:
     rows = [[phase, *(f"{held.get(phase, 0.0):.2f}" for held in seconds.values())] for phase in (*PHASES, REST)]
     rows.append(["all", *(f"{sum(held.values()):.2f}" for held in seconds.values())])
     report = seconds["study"].get(REPORT, 0.0) / sum(seconds["direct"].values())
+    table = markdown([PROCESS, "study", "direct calls"], rows)
     return (
-        f"{markdown(['processor seconds in one process', 'study', 'direct calls'], rows)}\n\n"
+        f"{filed('endurance', table, chosen(table, cells_of(table)[0], **{PROCESS: (*FLIGHT, 'all')}))}\n\n"
         "The study took more than the direct calls, solves, judging and report left out, by "
         f"{100 * share(seconds):.1f} % of these\n"
         f"(wanted: under {100 * LIMIT:.0f} %); the report took {100 * report:.1f} %."

@@ -24,7 +24,7 @@ import torch
 import torchgco
 from benchmarks.lib import RESULTS
 from benchmarks.lib.command import parser_of
-from benchmarks.lib.page import markdown, measured, put, share, shown
+from benchmarks.lib.page import chosen, filed, markdown, measured, put, share, shown
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.style import save
 from torchgco.scenarios import MapFile, Task
@@ -98,7 +98,7 @@ def main(words: Sequence[str] | None = None) -> int:
         print(markdown(MAP_HEAD, flown), flush=True)
         if asked.write:
             how = "each solved alone, processor time of one thread"
-            put(RESULTS / "floors.md", "maps", f"{measured(how)}\n\n{markdown(MAP_HEAD, flown)}\n\n{sources()}")
+            put(RESULTS / "floors.md", "maps", f"{measured(how)}\n\n{short(markdown(MAP_HEAD, flown))}\n\n{sources()}")
     if asked.picture is not None:
         draw(asked.picture, asked.seeds[1], solvers)
     return 0
@@ -163,6 +163,11 @@ def median(values: pd.Series, form: str) -> str:
     low = int(binom.ppf(0.025, n, 0.5))
     ends = held[max(0, low - 1)], held[min(n - 1, n - low)]
     return f"{np.median(held):{form}} [{ends[0]:{form}}, {ends[1]:{form}}]"
+
+
+def short(table: str) -> str:
+    """The table as a file, and these columns of it."""
+    return filed("floors-maps", table, chosen(table, ("map", "solver", "sound", "cost", "s")))
 
 
 def map_rows(folder: Path, owned: Owned, solvers: Sequence[str]) -> list[list[Any]]:

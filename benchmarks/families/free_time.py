@@ -21,7 +21,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.families.race import GATES, aimed, finer, flown, race
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import markdown, share
+from benchmarks.lib.page import chosen, filed, markdown, share
 from torchgco import (
     ControlBounds,
     FreeTime,
@@ -174,7 +174,9 @@ def carts(count: int, seed: int, N: int = 60) -> str:
                          f"{1e3 * spent:.1f}", theirs])  # fmt: skip
     head = ["fastest, m/s", "guess / least time", "within 1e-3", "not CONVERGED", "iterations (most)", "ms a problem",
             "IPOPT by hand: within 1e-3; iterations; ms"]  # fmt: skip
-    return markdown(head, rows)
+    whole = markdown(head, rows)
+    few = {"guess / least time": ("none", "drawn")}
+    return filed("free_time-carts", whole, chosen(whole, head, **few))
 
 
 def _within(violation: np.ndarray, found: np.ndarray, best: np.ndarray) -> int:

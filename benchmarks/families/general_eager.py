@@ -15,7 +15,7 @@ from benchmarks.families.general_problems import FAMILIES, SETS
 from benchmarks.families.general_problems_base import Family
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
-from benchmarks.lib.page import SET_UP, markdown, shown
+from benchmarks.lib.page import SET_UP, filed, markdown, shown
 from torchgco import InteriorPoint, Solution, solve
 from torchgco.kernels import use_native
 
@@ -60,7 +60,7 @@ def table(sets: Sequence[int], families: Sequence[str], seed: int, batch: int) -
         f"times in PyTorch are {ratios.min():.0f} to {ratios.max():.0f} times those in C, {ratios.median():.0f} in the "
         "median of families."
     )
-    return f"{markdown(HEAD, [cells(own) for own in rows])}\n\n{said}"
+    return filed("general-eager", markdown(HEAD, [cells(own) for own in rows]), said)
 
 
 def cells(own: pd.DataFrame) -> list[object]:

@@ -16,7 +16,7 @@ from benchmarks.families.general_problems_base import Family
 from benchmarks.families.general_starts import judged
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
-from benchmarks.lib.page import SET_UP, markdown, share, shown
+from benchmarks.lib.page import SET_UP, chosen, filed, markdown, share, shown
 from torchgco import certify, solve
 
 EXACT, USUAL = "gco_exact", "gco"
@@ -50,8 +50,8 @@ def table(sets: Sequence[int], families: Sequence[str], seed: int, rounds: int) 
     parts = [(SETS[number], rows[rows.set == number]) for number in sets]
     small = rows[rows.set != max(SETS)]
     parts += [(f"all but {SETS[max(SETS)]}", small)] * (len(sets) > 1 and max(SETS) in sets) + [("all", rows)]
-    text = markdown(HEAD, [[title, *cells(own)] for title, own in parts if len(own)])
-    return f"{text}\n\n{shortfalls(rows)}"
+    whole = markdown(HEAD, [[title, *cells(own)] for title, own in parts if len(own)])
+    return filed("general-exact", whole, chosen(whole, HEAD, set=("all",)), shortfalls(rows))
 
 
 def cells(own: pd.DataFrame) -> list[object]:

@@ -11,7 +11,7 @@ import pandas as pd
 from benchmarks.families.general_peers import LEFT_OUT, REFUSED, SOLVED
 from benchmarks.families.general_problems import SETS
 from benchmarks.families.general_problems_base import Family
-from benchmarks.lib.page import markdown, share, shown
+from benchmarks.lib.page import chosen, filed, markdown, share, shown
 
 TIGHT, LOOSE = 1e-6, 1e-3  # violations
 KEY = ["family", "instance"]
@@ -21,6 +21,7 @@ SET_HEAD = (
     "within 1 % of IPOPT's best start", "worse than IPOPT from rest", "better", "ms per problem, as a batch",
     "ms, one by one",
 )  # fmt: skip
+SHOWN = (*SET_HEAD[:2], "violation <= 1e-6", *SET_HEAD[6:9], "ms, one by one")  # in the page
 FAMILY_HEAD = (
     "family", "n, m, N", "solver", "<= 1e-6", "<= 1e-3", "within 1 %", "of (starts)", "worse", "better", "ms, batch",
     "ms, one", "IPOPT, rest", "ms", "FATROP", "ms", "statuses",
@@ -36,11 +37,13 @@ def text(flights: pd.DataFrame, peers: pd.DataFrame, families: Sequence[Family],
     references = references_of(peers)
     known = flights.merge(references[[*KEY, "best", "rest"]], on=KEY, how="left")
     every = [known, *peer_flights(references)]
+    sets, optima = set_table(every, families), known_table(known, references, families, seed)
+    mine = chosen(sets, SHOWN, solver=[*dict.fromkeys(flights.solver)])
     parts = [
-        ("Sets", set_table(every, families)),
-        ("Known optima", known_table(known, references, families, seed)),
+        ("Sets", filed("general-sets", sets, mine, chosen(sets, SHOWN, set=("all",), solver=(REST, BEST, FATROP)))),
+        ("Known optima", optima and filed("general-known", optima)),
         ("Statuses", honesty_table(known)),
-        ("Families", family_table(known, references, families, seed)),
+        ("Families", filed("general-families", family_table(known, references, families, seed))),
     ]
     return "\n\n".join(f"## {title}\n\n{table}" for title, table in parts if table)
 
@@ -90,8 +93,8 @@ def set_table(flights: Iterable[pd.DataFrame], families: Sequence[Family]) -> st
     numbers = {family.name: family.set for family in families}
     rows = pd.concat([table.assign(set=table.family.map(numbers)) for table in flights], ignore_index=True)
     cells = []
-    for title, chosen in [(name, rows[rows.set == k]) for k, name in SETS.items()] + [("all", rows)]:
-        cells += [[title, solver, *set_cells(own)] for solver, own in chosen.groupby("solver", sort=False)]
+    for title, part in [(name, rows[rows.set == k]) for k, name in SETS.items()] + [("all", rows)]:
+        cells += [[title, solver, *set_cells(own)] for solver, own in part.groupby("solver", sort=False)]
     return markdown(SET_HEAD, cells)
 
 

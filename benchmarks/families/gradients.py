@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ import torchgco
 from benchmarks.families.gradient_peers import Found, table
 from benchmarks.lib import DATA
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import markdown, share
+from benchmarks.lib.page import filed, markdown, share
 from torchgco import (
     ControlBounds,
     FunctionDynamics,
@@ -48,6 +49,8 @@ RELATIVE = (
     "goal radius",
 )  # moved by a share of themselves
 TIGHT = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8)
+
+ERRORS = ("problems", "by", "median error", "largest", "below 1e-6", "below 1e-4", "of")
 
 Numbers = Mapping[str, Tensor]
 
@@ -222,10 +225,21 @@ def text(count: int, seed: int) -> str:
             kinds.append([title, name, f"{one.median():.0e}", f"{one.max():.0e}", *below, len(one)])
     return "\n\n".join([
         markdown(["problems", "differentiable", "others"], shares),
-        markdown(["problems", "by", "median error", "largest", "below 1e-6", "below 1e-4", "of"], kinds),
+        filed("gradients", markdown(ERRORS, kinds), summary(kinds)),
         markdown(["problems", "solve, ms", "more, ms", "backward, ms", "backward / solve", "all / solve"], costs),
         table(differentiated, lq.numbers, 20, 4),
     ])  # fmt: skip
+
+
+def summary(kinds: Sequence[Sequence[Any]]) -> str:
+    """The worst of all numbers of a kind of problems, and how many derivatives are within 1e-4."""
+    rows = []
+    for title in dict.fromkeys(row[0] for row in kinds):
+        own = [row for row in kinds if row[0] == title]
+        median, largest = (max((row[place] for row in own), key=float) for place in (2, 3))
+        below, of = (sum(int(row[place]) for row in own) for place in (5, 6))
+        rows.append([title, len(own), median, largest, f"{below:,} of {of:,}"])
+    return markdown(["problems", "numbers", "largest median error", "largest error", "below 1e-4"], rows)
 
 
 main = Command(

@@ -25,7 +25,7 @@ import torchgco
 from benchmarks.lib import RESULTS
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY
-from benchmarks.lib.page import markdown, measured, put, share, shown
+from benchmarks.lib.page import chosen, filed, markdown, measured, put, share, shown
 from benchmarks.lib.rasters import rasterised
 from torchgco import Field, Problem, Roadmap
 from torchgco.maps import DistanceField
@@ -66,8 +66,13 @@ def main(words: Sequence[str] | None = None) -> int:
         print(markdown(HEAD, rows[-len(asked.cells) :]), flush=True)
     if asked.write:
         how = f"{asked.count} worlds of each kind, seed {asked.seed}, processor time of one thread"
-        put(RESULTS / "maps.md", "maps", f"{measured(how)}\n\n{markdown(HEAD, rows)}")
+        put(RESULTS / "maps.md", "maps", f"{measured(how)}\n\n{short(markdown(HEAD, rows))}")
     return 0
+
+
+def short(table: str) -> str:
+    """The table as a file, and these columns of it."""
+    return filed("maps-cells", table, chosen(table, (*HEAD[:2], HEAD[4], *HEAD[7:9])))
 
 
 def flown_worlds(name: str, sizes: Sequence[float], count: int, seed: int, touching: bool) -> Iterator[dict[str, Any]]:

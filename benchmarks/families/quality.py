@@ -2,7 +2,7 @@
 
 Every family and solver is a separate study below outputs/quality, so that a run that was stopped resumes where it
 was. The table is printed. With --write, and where all families flew, it is put into its page with date and commit: the
-table of `gco` alone into benchmarks/README.md, drawn layouts into results/drawn.md, several solvers into
+table of `gco` alone into benchmarks/README.md, drawn layouts and several solvers into
 results/ladder.md, unless --page names another page.
 """
 
@@ -19,7 +19,7 @@ import pandas as pd
 from benchmarks.lib import ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, FAMILIES, Family
-from benchmarks.lib.page import INTERVALS, interval, machine, markdown, origin, put, share, shown
+from benchmarks.lib.page import INTERVALS, crossed, filed, interval, machine, markdown, origin, put, share, shown
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.judging.judge import SUCCESS_VIOLATION
@@ -28,12 +28,14 @@ from torchgco.scenarios import Layouts
 PAGES = {
     "quality": "README.md",
     "ladder": "results/ladder.md",
-    "drawn": "results/drawn.md",
+    "drawn": "results/ladder.md",
 }  # below benchmarks/; a table is between the marks of its name
 HEAD = (
     "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "median iterations",
     "median seconds",
 )  # fmt: skip
+
+SHORT = ("Success", "Median seconds")  # of several solvers
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -41,6 +43,9 @@ def main(words: Sequence[str] | None = None) -> int:
     trials = pd.concat([fly(EVERY[name], asked) for name in asked.families], ignore_index=True)
     text = table(trials)
     print(text)
+    if len(asked.solvers) > 1:
+        parts = (crossed(text, "family", "solver", cell) for cell in ("success", "median seconds"))
+        text = filed("ladder", text, *(f"{title}:\n\n{part}" for title, part in zip(SHORT, parts, strict=True)))
     if set(asked.families) == set(FAMILIES) and asked.write:
         name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}, shared and busy."
         put(ROOT / "benchmarks" / PAGES[name], name, f"{head}\n\n{text}")

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.command import parser_of
-from benchmarks.lib.page import machine, markdown, origin, put
+from benchmarks.lib.page import cells_of, chosen, filed, machine, markdown, origin, put
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting.style import INK, SMALL, legend, panels, save, solver_colours, tidy
@@ -51,7 +51,7 @@ def main(words: Sequence[str] | None = None) -> int:
             f"{origin('Flown')}, n layouts per point, seed {asked.seed}; 95 % Wilson intervals in the figure; "
             f"{machine()}, shared."
         )
-        put(RESULTS / "transition.md", "transition", f"{head}\n\n![Rates](transition.png)\n\n{table(summary)}")
+        put(RESULTS / "transition.md", "transition", f"{head}\n\n![Rates](transition.png)\n\n{short(table(summary))}")
     return 0
 
 
@@ -120,6 +120,11 @@ def table(summary: pd.DataFrame) -> str:
         counts = (found.get(density, "-") for density in DENSITIES)
         rows.append([f"{speed(stages):.1f} m/s", f"`{solver}`", own["n"].iloc[0], *counts])
     return markdown(["speed", "solver", "n", *(f"{density:g}" for density in DENSITIES)], rows)
+
+
+def short(table: str) -> str:
+    """The table as a file, and the rows of `gco`."""
+    return filed("transition", table, chosen(table, cells_of(table)[0], solver=("`gco`",)))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import machine, markdown, origin, put
+from benchmarks.lib.page import chosen, filed, machine, markdown, origin, put
 from torchgco.experiments.statistics.statistics import wilson
 from torchgco.missions.outcome import Outcome
 
@@ -134,6 +134,13 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     return markdown(HEAD, lines)
 
 
+def short(name: str, table: str, misses: str) -> str:
+    """Both tables as files, and some columns of the first."""
+    few = chosen(table, (*HEAD[:5], "flight time", "clearance"))
+    missed = filed(f"{name}-misses", misses) if misses.startswith("|") else misses
+    return f"{filed(name, table, few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
+
+
 def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     """Markdown: a row per mission that missed its goal, and per mission at rest with a period without a safe plan."""
     lines = []
@@ -152,7 +159,7 @@ def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     return markdown(head, lines) if lines else none
 
 
-def times(log: pd.DataFrame) -> str:
+def times(log: pd.DataFrame, name: str = "unknown-times") -> str:
     """Markdown: milliseconds of the planner and of its parts, over the periods of all missions but their first."""
     later = log[log["step"] > 0]
     names = {
@@ -165,7 +172,9 @@ def times(log: pd.DataFrame) -> str:
     ]
     over = int((later["planner_seconds"] > PERIOD).sum())
     head = ("milliseconds", "median", "90 %", "99 %", "longest")
-    return f"{markdown(head, rows)}\n\n{over} of {len(later)} periods took longer than 50 ms."
+    whole = markdown(head, rows)
+    few = chosen(whole, head, milliseconds=(rows[-1][0],))
+    return filed(name, whole, few, f"{over} of {len(later)} periods took longer than 50 ms.")
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -180,7 +189,11 @@ def main(words: Sequence[str] | None = None) -> int:
     flown = [fly(name, count, asked.outputs) for name, count in counts.items()]
     trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*flown, strict=True))
     head = f"{origin('Flown')}, seed 0, 95 % Wilson intervals in percent; one thread, {machine()}, shared."
-    blocks = {"worlds": f"{head}\n\n{table(trials, log)}\n\n{misses(trials, log)}", "times": times(log)}
+    kind = "unknown-long" if asked.long else "unknown"
+    blocks = {
+        "worlds": f"{head}\n\n{short(kind, table(trials, log), misses(trials, log))}",
+        "times": times(log, f"{kind}-times"),
+    }
     for name, text in blocks.items():
         print(text)
         if asked.write:

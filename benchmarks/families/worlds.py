@@ -21,7 +21,7 @@ from benchmarks.families.worlds_peers import FILE, NAMES, rows_of
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import WORLDS
-from benchmarks.lib.page import machine, markdown, put, share, shown
+from benchmarks.lib.page import chosen, crossed, filed, machine, markdown, put, share, shown
 from torchgco.experiments.results.success import sound
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.scenarios import Layouts
@@ -31,6 +31,8 @@ HEAD = (
     "world", "solver", "n", "reached", "reached, of solved layouts", "success", "cost / best known, median",
     "seconds per problem, median",
 )  # fmt: skip
+
+OWN = ("world", "n", "reached, of solved layouts", "success", *HEAD[-2:])  # of `gco`
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -47,8 +49,15 @@ def main(words: Sequence[str] | None = None) -> int:
         head = f"{source(asked, 'world')}, two processes, {machine()}, shared."
         if not asked.fresh:
             head += _peers_source(rows_of(asked.peers))
-        put(RESULTS / "worlds.md", "drawn" if asked.fresh else "worlds", f"{head}\n\n{markdown(HEAD, rows)}")
+        name = "drawn" if asked.fresh else "worlds"
+        put(RESULTS / "worlds.md", name, f"{head}\n\n{short(f'worlds-{name}', markdown(HEAD, rows))}")
     return 0
+
+
+def short(name: str, table: str) -> str:
+    """The table as a file; in the page the rows of `gco`, and how many layouts each solver reaches."""
+    reached = crossed(table, "world", "solver", "reached")
+    return filed(name, table, *([] if "drawn" in name else [chosen(table, OWN, solver=("`gco`",))]), reached)
 
 
 def _parser() -> ArgumentParser:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, cost_ratios, named, timed, within, worst
-from benchmarks.lib.page import SET_UP
+from benchmarks.lib.page import SET_UP, chosen, filed
 from benchmarks.outside.golden_problems import GOLDEN, Golden
 from torchgco import Polish, Problem, certify, solve
 from torchgco.baselines import CasADiSolver
@@ -52,6 +52,10 @@ COMPARISON = Comparison(counted, [
     ("seconds per problem", lambda own, _: f"{own.seconds[0]:.3f}"),
     ("cost ratio: least, median, largest", ratios),
 ])  # fmt: skip
+SHOWN = (
+    "problem", "solver", "violation <= 1e-6", "cost", "largest KKT residual", "seconds per problem",
+    "cost ratio: least, median, largest",
+)  # fmt: skip
 
 
 def rows(task: Golden, starts: int, seed: int) -> list[list[Any]]:
@@ -72,7 +76,8 @@ def rows(task: Golden, starts: int, seed: int) -> list[list[Any]]:
 
 def table(problems: Sequence[str], starts: int, seed: int) -> str:
     """The results of both solvers, in Markdown."""
-    return COMPARISON.table([row for name in problems for row in rows(GOLDEN[name], starts, seed)])
+    whole = COMPARISON.table([row for name in problems for row in rows(GOLDEN[name], starts, seed)])
+    return filed("golden", whole, chosen(whole, SHOWN))
 
 
 main = Command(

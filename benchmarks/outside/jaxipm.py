@@ -19,7 +19,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib import comparison as lib
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import markdown
+from benchmarks.lib.page import chosen, filed, markdown
 from benchmarks.outside.jaxipm_ipopt import Ipopt
 from benchmarks.outside.jaxipm_problems import SCENARIOS, Scenario, spread
 from torchgco import InteriorPoint, Status
@@ -148,7 +148,10 @@ def tables(instances: int, ipopt: int, scenarios: Sequence[str]) -> str:
         flights = [*by_torchgco(scenario, places), *by_ipopt(scenario, places[spread(len(places), few)])]
         rows += [[column(each, flights[2]) for _, column in COLUMNS] for each in flights]
         rates.append(_beside(scenario.name, dict(zip((INTERIOR, DEFAULT, MX, SX), flights, strict=True))))
-    return "\n\n".join((markdown([name for name, _ in COLUMNS], rows), markdown(HEAD, rates)))
+    beside = markdown(HEAD, rates)
+    return filed(
+        "jaxipm", markdown([name for name, _ in COLUMNS], rows), filed("jaxipm-rates", beside, chosen(beside, SHOWN))
+    )
 
 
 HEAD = [
@@ -156,6 +159,7 @@ HEAD = [
     "jaxipm, NVIDIA L40S", "IPOPT MX, 64 processes, 2 x EPYC 9354", "IPOPT MX, one of these cores",
     "times jaxipm", "times IPOPT, 64 processes", "mean cost", "jaxipm's", "IPOPT's",
 ]  # fmt: skip
+SHOWN = [*HEAD[:6], *HEAD[7:9]]  # in the page
 
 
 def _beside(name: str, flights: dict[str, pd.DataFrame]) -> list[str]:

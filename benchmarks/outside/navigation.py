@@ -2,7 +2,7 @@
 
 Both solvers run in worker processes with one thread each, one worker, then two that share the starts. IPOPT has the
 published guess and options. All results are judged by `recount`, in NumPy. With --write the table goes into
-benchmarks/results/navigation.md.
+benchmarks/results/jaxipm.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib import comparison as lib
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import INTERVALS
+from benchmarks.lib.page import INTERVALS, chosen, filed
 from benchmarks.outside.navigation_problem import fan, line_guess, navigation, recount
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
@@ -55,6 +55,10 @@ COMPARISON = lib.Comparison(counted, [
     ("times IPOPT, one core", times("alone")),
     ("two cores", times("shared")),
 ])  # fmt: skip
+SHOWN = (
+    "fan", "solver", "violation <= 1e-4", "cost, share of IPOPT's: least, median, largest",
+    "problems per second, one core", "times IPOPT, one core",
+)  # fmt: skip
 
 
 def default(problem: Problem, ids: Tensor) -> Callable[[], Solution]:
@@ -137,12 +141,14 @@ def table(starts: int, sectors: Sequence[float]) -> str:
     for sector in sectors:
         flights = [fly(name, sector, starts) for name in SOLVERS]
         rows += COMPARISON.rows(flights, flights[-1])
-    return COMPARISON.table(rows)
+    whole = COMPARISON.table(rows)
+    return filed("navigation", whole, chosen(whole, SHOWN))
 
 
 main = Command(
-    __doc__, "navigation", table,
+    __doc__, "jaxipm", table,
     "{starts} starts per fan, processor time without set-up, one thread per process", "CasADi", INTERVALS,
+    mark="navigation",
     starts=(500, "starts per fan"), sectors=([90.0, 180.0], "widths of the fans, degrees"),  # as published
 )  # fmt: skip
 

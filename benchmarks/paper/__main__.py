@@ -63,12 +63,12 @@ def write_table(trials: Sequence[Solve], outputs: Path, page: Path) -> None:
 
 
 def fly(outputs: Path, page: Path, duration: float) -> dict[str, Callable[[], Figure]]:
-    """Fly the missions, write their table and the animations; what to draw of them."""
+    """Fly the missions, write their table, some rows into the page, and the animations; what to draw of them."""
     flown = flights.fly(duration=duration)
     rows = missions.table(flown)
     outputs.mkdir(parents=True, exist_ok=True)
     rows.to_csv(outputs / "missions.csv", index_label="quantity")
-    put_between(page, *MISSION_MARKS, f"{_head()}\n\n{missions.markdown(rows)}")
+    put_between(page, *MISSION_MARKS, f"{_head()}\n\n{missions.markdown(rows.loc[[*missions.SHOWN]])}")
     missions.animate(flown, outputs)
     return missions.figures(flown)
 

@@ -1,10 +1,13 @@
-"""Rows as Markdown tables, and the parts of benchmarks/README.md and results/speed.md that hold them."""
+"""Rows as Markdown tables, and the parts of benchmarks/README.md and results/speed.md that hold them.
+
+The page shows some quantities of a section (`SHOWN`); all rows are in results/speed.csv.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.lib.page import markdown, put
+from benchmarks.lib.page import crossed, markdown, put
 from benchmarks.speed.results import Row
 
 NOT_MEASURED = "Not measured yet: `make benchmark` does."
@@ -14,10 +17,9 @@ NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` 
 WORDS = {
     "targets": "Processor time per problem without set-up. Under a peer's name: how many times as fast the solver is,\n"
     "per problem and, after the comma, per layout reached, as a peer that stops short of the goal may be fast.",
-    "families": "Drawn layouts (seed 1000). The peers fly the first of the same layouts, before and after `gco`;\n"
-    "spread is the difference of the two times, wall the elapsed time. `fatrop_guided` and `acados_guided` start\n"
-    "from a trajectory along the roadmap's best path, whose search counts, all others from the vehicle at rest.\n"
-    "Ratios are peer / `gco`: of seconds per problem and per layout reached, and of costs (median where both arrive).",
+    "families": "Drawn layouts (seed 1000), of which the peers fly the first, before and after `gco`; the second\n"
+    "table has each peer's seconds per problem / those of `gco`. `fatrop_guided` and `acados_guided`\n"
+    "start along the roadmap's best path, whose search counts, all others from the vehicle at rest.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
     "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
     "finds its kernels, FATROP's program is built.",
@@ -35,29 +37,82 @@ WORDS = {
     "`torchgco.solve` without options.",
     "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles;\n"
     "the problems differ in their random draws.",
-    "mppi": "One round of white noise around hovering, 30 spheres, float32, B = 1; medians of alternating rounds.",
+    "mppi": "Milliseconds of one round of white noise around hovering, 30 spheres, float32, B = 1; medians.",
     "first_use": "A first solve in a new process: the model traced, differentiated, written out as C and compiled,\n"
     "and what the first solve takes more than the second, in processor seconds, the compiler's included.",
-    "share": "Processor time of one solve, in percent: a line per phase of the method, a column per function of the\n"
-    "native library that it calls. The problems are new to a process that has solved others.",
+    "share": "Processor time of one solve, in percent, by phase of the method. The problems are new to a process\n"
+    "that has solved others.",
     "cores": "Elapsed time per problem of forests of 30 spheres, in processes with one core and with two.",
     "batch": "Forests of 30 spheres, unless the row names other worlds. `2 outer` ends every problem after two outer\n"
     "iterations. Memory is the peak of a separate process above its memory before the problems were made.",
-    "scaling": "Whole solves of forests, 16 layouts in a batch, and the first four of them by the peers, from the\n"
-    "vehicle at rest: 30 spheres and 100 stages unless the row says otherwise. Stages divide the same 5 s, spheres\n"
-    "fill the same region; the far ones lie 12 m and more beside it.",
-    "growth": "`al_ilqr`, line search included. Quadrotor (n = 14), 100 stages, 30 spheres unless the row says\n"
-    "otherwise; more stages divide the same 5 s, more spheres fill the same region. The planar vehicle has n = 6.",
+    "scaling": "Seconds per problem: whole solves of forests, 16 layouts in a batch, and the first four of them by\n"
+    "the peers, from the vehicle at rest; 30 spheres and 100 stages unless the row says otherwise. Stages\n"
+    "divide the same 5 s, spheres fill the same region; the far ones lie 12 m and more beside it.",
+    "growth": "Milliseconds per problem and iteration, line search included. Quadrotor (n = 14), 100 stages, 30\n"
+    "spheres unless the row says otherwise; more stages divide the same 5 s. The planar vehicle has n = 6.",
 }
+
+# What the page shows of a section: quantities, the only solver (empty: all), and the form: a column per quantity
+# (empty), or one quantity with a row per case (case) or per solver (solver).
+SHOWN = {
+    "targets": [(("time", "FATROP", "acados", "pytorch-mppi"), "", "")],
+    "families": [
+        (("seconds per problem", "reached", "median cost"), "gco", ""),
+        (("seconds, ratio",), "", "case"),
+    ],
+    "loop": [(("median", "99 %", "solved"), "", "")],
+    "swing_up": [(("median", "99 %", "first period", "up"), "", "")],
+    "learned": [
+        (("first solve, nothing built", "first solve, solver's objects built"), "", ""),
+        (("an iteration",), "", "case"),
+        (("training step, median",), "", "case"),
+        (("first solve",), "", "case"),
+    ],
+    "mppi": [(("per round",), "", "case")],
+    "share": [(("sum",), "", "solver")],
+}
+LEFT_OUT = (
+    "latency",
+    "own_model",
+    "first_use",
+    "paper",
+    "cores",
+    "batch",
+    "scaling",
+    "growth",
+)  # of the page: the file alone has them
+
+
+def section_text(rows: list[Row]) -> str:
+    """What the page shows of the rows of one section."""
+    tables = []
+    for quantities, solver, form in SHOWN.get(rows[0]["section"], []):
+        held = [row for row in rows if row["quantity"] in quantities and solver in ("", row["solver"])]
+        tables += [form_of(held, form)] if held else []
+    return "\n\n".join(tables) or section_table(rows)
+
+
+def form_of(rows: list[Row], form: str) -> str:
+    """One table of these rows."""
+    if form == "":
+        return section_table(rows)
+    long = [[row["case"], f"`{row['solver']}`", _rounded(row["value"])] for row in rows]
+    table = markdown(["case", "solver", "value"], long)
+    table = crossed(table, form, "solver" if form == "case" else "case", "value")
+    return table.replace(f"| {form} |", f"| {_head(rows[0])} |", 1)
 
 
 def section_table(rows: list[Row]) -> str:
-    """A Markdown table: a row per case and solver, a column per quantity, in the order of measurement."""
+    """A Markdown table: a row per case and solver, a column per quantity, in the order of measurement.
+
+    The column of solvers is left out where there is one.
+    """
     lines = dict.fromkeys((row["case"], row["solver"]) for row in rows)
     heads = dict.fromkeys(_head(row) for row in rows)
     cells = {(row["case"], row["solver"], _head(row)): _rounded(row["value"]) for row in rows}
     values = ([case, f"`{solver}`", *(cells.get((case, solver, head), "") for head in heads)] for case, solver in lines)
-    return markdown(["case", "solver", *heads], values)
+    one = len({solver for _, solver in lines}) == 1
+    return markdown(["case", *["solver"] * (not one), *heads], ([v[0], *v[1 + one :]] for v in values))
 
 
 def _rounded(value: str) -> str:
@@ -76,7 +131,7 @@ def _head(row: Row) -> str:
 def targets_text(rows: list[Row]) -> str:
     """The compact table with its source."""
     own = [row for row in rows if row["section"] == "targets" and row["device"] == "cpu"]
-    return f"{_source(own[0])}\n{WORDS['targets']}\n\n{section_table(own)}" if own else NOT_MEASURED
+    return f"{_source(own[0])}\n{WORDS['targets']}\n\n{section_text(own)}" if own else NOT_MEASURED
 
 
 def speed_text(rows: list[Row]) -> str:
@@ -91,11 +146,11 @@ def _device_text(rows: list[Row]) -> str:
     """Tables of one device; a line on the source precedes a section where it differs from the section before."""
     blocks, before = [], ""
     present = {row["section"] for row in rows}
-    for section in [name for name in WORDS if name in present]:
+    for section in [name for name in WORDS if name in present and name not in LEFT_OUT]:
         own = [row for row in rows if row["section"] == section]
         source = _source(own[0])
         blocks += [source] if source != before else []
-        blocks.append(f"### `{section}`\n\n{WORDS[section]}\n\n{section_table(own)}")
+        blocks.append(f"### `{section}`\n\n{WORDS[section]}\n\n{section_text(own)}")
         before = source
     return "\n\n".join(blocks)
 

@@ -71,7 +71,7 @@ def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
 
 @compiled
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # 0.1 s between knots is long
-@pytest.mark.parametrize("name", mostly(MAKERS, "planar"))
+@pytest.mark.parametrize("name", mostly(MAKERS, "planar", "quadrotor"))
 def test_every_mode_gives_the_same_bits(name: str) -> None:
     outside = MAKERS[name]()
     expected = everything(*outside)

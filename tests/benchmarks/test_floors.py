@@ -12,6 +12,7 @@ from PIL import Image
 from benchmarks.families.floors import HEAD, MAPS, PEER, flown_plans, main, median, row_of
 
 
+@pytest.mark.slow
 def test_plans_are_flown_and_counted(capsys, tmp_path: Path) -> None:
     Image.fromarray(np.full((100, 200), 255, np.uint8)).save(tmp_path / "kr_maze1.png")
     words = ["--layouts", "2", "--solvers", PEER, "hold", "--maps", str(tmp_path)]

@@ -104,4 +104,4 @@ def test_costs_are_compared_instance_by_instance() -> None:
 def test_the_tables(capsys) -> None:
     assert main(["--instances", "3", "--ipopt", "2", "--scenarios", "navigation"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 15 and all(line.split(" | ")[3] == "3" for line in lines[2:4])
+    assert len(lines) == 22 and all(line.split(" | ")[3] == "3" for line in lines[3:5])

@@ -40,6 +40,21 @@ def test_a_table_replaces_the_one_between_the_marks_of_its_page(tmp_path: Path, 
         page.put(file, "barn", "")
 
 
+def test_a_long_table_goes_into_a_file_and_its_short_form_into_the_page(tmp_path: Path) -> None:
+    file = tmp_path / "worlds.md"
+    file.write_text("<!-- worlds -->\n<!-- end worlds -->")
+    rows = [["woods", "gco", "3 [1, 4]", "a \\| b, c"], ["woods", "ipopt", "1 [0, 2]", ""], ["mazes", "gco", "2", "d"]]
+    table = page.markdown(("world", "solver", "reached", "code"), rows)
+    short = page.crossed(table, "world", "solver", "reached")
+    assert short == "| world | gco | ipopt |\n|---|---|---|\n| woods | 3 | 1 |\n| mazes | 2 | - |"
+    few = page.chosen(table, ("world", "code"), solver=("gco",))
+    assert few == "| world | code |\n|---|---|\n| woods | a \\| b, c |\n| mazes | d |"
+    page.put(file, "worlds", f"Flown.\n\n{page.filed('all', table, few, short)}")
+    assert f"Flown.\n\nAll 3 rows: [all.csv](all.csv).\n\n{few}\n\n{short}\n\n<!-- end" in file.read_text()
+    assert (tmp_path / "all.csv").read_text().splitlines()[1] == 'woods,gco,"3 [1, 4]","a | b, c"'
+    assert page.read(tmp_path / "all.csv") == table
+
+
 @pytest.mark.parametrize("file", sorted(command.RESULTS.glob("*.md")), ids=lambda file: file.stem)
 def test_a_page_is_a_question_whose_answer_is_of_the_tables_below(file: Path) -> None:
     """After a run whose tables replace these, read the answer again and name the new commit in it."""

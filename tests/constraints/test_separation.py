@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.slow import mostly
 from torchgco import (
     ContactWarning,
     ControlBounds,
@@ -109,6 +110,7 @@ def test_solves_natively_and_in_pytorch_as_ipopt_does(native: bool) -> None:
         assert float(certify(problem, found.X, found.U).kkt_residual.max()) < 1e-4
 
 
+@pytest.mark.parametrize("native", mostly(["native", "eager"], "eager"), indirect=True)
 def test_the_rest_of_the_batch_changes_nothing(native: bool) -> None:
     whole = torchgco.solve(carts(Separation(STATES, KEPT), ControlBounds(-6.0, 6.0)))
     for b in range(B):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 import torch
 
 from torchgco import judge
@@ -19,6 +20,7 @@ WORDS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_each_layout_is_flown_as_it_is_alone(run, tmp_path: Path, capsys) -> None:
     words = [*WORDS, "solver=path_pursuit", "study.baselines=[hold]", "study.shard_size=2", "study.workers=1"]
     code, _, err = run(*words, "study.view=true", "hydra.run.dir=out")

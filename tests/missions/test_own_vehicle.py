@@ -18,7 +18,9 @@ FORESTS = Forest(start=(1, 1, 0))
 
 
 @pytest.mark.parametrize("count", mostly([2, 8], 8))
-@pytest.mark.parametrize("airframe", [OWN, CRAZYFLIE], ids=["own", "crazyflie"])
+@pytest.mark.parametrize(
+    "airframe", [pytest.param(OWN, id="own"), pytest.param(CRAZYFLIE, id="crazyflie", marks=pytest.mark.slow)]
+)
 def test_it_flies_through_forests(airframe: Airframe, count: int) -> None:
     task = Vehicle.quadrotor(airframe).among(FORESTS, range(count))
     log = Mission(Planner(presets.gco(3))).fly(task.problem)

@@ -15,6 +15,7 @@ import torch
 
 from tests.engines import engine_of
 from tests.problems import planar_batch
+from tests.slow import mostly
 from torchgco import kernels, presets
 from torchgco.native import compiler, store
 from torchgco.native.compiler import NativeError, Unit, build, find_compiler
@@ -242,7 +243,7 @@ def alive(number: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", mostly([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
 @pytest.mark.parametrize("late", [False, True], ids=["while it runs", "before Python goes on"])
 def test_an_interrupt_ends_the_compiler_and_what_it_started(late: bool, how: signal.Signals, tmp_path: Path) -> None:
     """The signal reaches Python alone, as from a scheduler, a notebook or a test."""

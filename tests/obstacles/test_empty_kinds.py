@@ -73,7 +73,7 @@ def problem_of(constraints: list[Any]) -> Problem:
     return Problem(model, cost, [limits, *constraints], x0, 15, Goal([6.0, 0], 0.5))
 
 
-DRAWS = [(seed, "native") for seed in range(8)] + [(2, "eager"), (7, "eager")]
+DRAWS = [(seed, "native") for seed in range(8)] + [(2, "eager"), pytest.param(7, "eager", marks=pytest.mark.slow)]
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.problems import planar_batch
-from torchgco import InputError, Problem, certify, judge
+from torchgco import Boxes, FunctionDynamics, InputError, Problem, QuadraticCost, Spheres, certify, judge
 from torchgco.base.shapes import Dimensions
 from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles import CONTACT_FACTOR, Obstacles
@@ -75,3 +75,17 @@ def test_distances_of_spheres_by_hand() -> None:
                 path = (1 - shares) * p[b, k].numpy() + shares * p[b, k + 1].numpy()
                 assert float(along[b, k, m]) == pytest.approx(np.linalg.norm(path - o, axis=1).min() - R, abs=1e-4)
     assert torch.equal(spheres.inflated_radii, spheres.margins) and CONTACT_FACTOR == 0.95
+
+
+@pytest.mark.parametrize("number", [0.3, torch.tensor(0.3, dtype=torch.float64)])
+def test_one_radius_stands_for_all_obstacles(number: Any) -> None:
+    centers = torch.tensor([[[1.0, 0.2], [2.0, -0.3]], [[1.2, 0.1], [torch.nan, torch.nan]]], dtype=torch.float64)
+    made = lambda radii: [Spheres(centers, radii, 0.1), Boxes(centers, 0.0 * centers + 0.1, radii=radii)]
+    x0 = torch.zeros(2, 4, dtype=torch.float64)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, position=slice(0, 2))
+    cost = QuadraticCost([1.0] * 4, [0.1] * 2, [9.0] * 4)
+    X = torch.rand(2, 11, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 2
+    full = 0.3 + 0.0 * centers[..., 0]
+    one, all_of_them = (Problem(model, cost, made(radii), x0, 10) for radii in (number, full))
+    for a, b in zip(one.constraints, all_of_them.constraints, strict=True):
+        assert torch.equal(a.value(X, X[:, :-1, :2]), b.value(X, X[:, :-1, :2]))

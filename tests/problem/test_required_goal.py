@@ -75,7 +75,11 @@ def test_derivatives_of_a_required_state_are_those_of_autodiff() -> None:
 
 
 @compiled
-@pytest.mark.parametrize("parts", [(), (DISC,)])
+@pytest.mark.parametrize(
+    ("native", "parts"),
+    [("native", ()), ("native", (DISC,)), ("eager", ()), pytest.param("eager", (DISC,), marks=pytest.mark.slow)],
+    indirect=["native"],
+)
 def test_what_a_cost_stops_short_of_is_reached(parts: tuple[Any, ...], native: bool) -> None:
     stated = torchgco.solve(points(replace(BALL, required=False), *parts))
     assert not bool(judge(points(replace(BALL, required=False), *parts), stated.U).reached.any())

@@ -21,6 +21,7 @@ from torchgco import (
     QuadraticCost,
     Solution,
 )
+from torchgco.kernels import use_native
 
 PER_PROBLEM = "x0", "centers", "radii", "vehicle", "velocities", "x_ref", "lower", "upper", "drag"
 MODEL = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1, "rk4")
@@ -47,6 +48,31 @@ def test_gradients_of_a_problem_do_not_depend_on_its_batch() -> None:
         )
         for name, one, all_of_them in zip(PER_PROBLEM, slopes, mine, strict=True):
             assert torch.equal(one, all_of_them[rows]), name
+
+
+@pytest.mark.parametrize("in_c", [pytest.param(True, marks=compiled), False])
+def test_gradients_keep_their_bits_in_both_kernels(in_c: bool) -> None:
+    """Of a model without a product of all knots with one matrix, whose last bits PyTorch's kernels can't keep."""
+    x0, high = (
+        torch.tensor([[1.0, 0.0], [-1.5, 1.0], [0.3, 0.2]], dtype=D),
+        torch.tensor([[0.8], [0.9], [0.1]], dtype=D),
+    )
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u - 0.1 * x[..., :1].sin()), -1), 2, 1, 0.2, "rk4")
+
+    def slopes(rows: list[int]) -> tuple[Tensor, ...]:
+        start, bound = x0[rows].requires_grad_(), high[rows].requires_grad_()
+        problem = Problem(model, COST, [ControlBounds(-bound, bound)], start, 8)
+        found = torchgco.solve(problem, solver="interior_point", verbose=False, ids=torch.tensor(rows))
+        assert bool(found.differentiable.all())
+        return found.X.detach(), *torch.autograd.grad(found.X[:, 4].sum(), (start, bound))
+
+    use_native(in_c)
+    try:
+        whole = slopes([0, 1, 2])
+        for rows in ([2, 0], [1]):
+            assert all(torch.equal(one, all_of[rows]) for one, all_of in zip(slopes(rows), whole, strict=True))
+    finally:
+        use_native(True)
 
 
 def test_solves_that_nothing_asks_gradients_of_keep_their_bits() -> None:

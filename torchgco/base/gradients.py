@@ -6,11 +6,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import is_dataclass
+from types import FunctionType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn import Parameter
 
 _recording: ContextVar[bool] = ContextVar("recording", default=False)
 
@@ -53,18 +56,27 @@ def is_recording() -> bool:
     return _recording.get()
 
 
+# Types of most leaves, which hold nothing: a problem has some hundred, and each solve looks at them.
+_PLAIN = frozenset((Tensor, Parameter, np.ndarray, int, float, bool, str, FunctionType, type(None)))
+
+
 def leaves(tree: Any) -> list[Any]:
     """All that nested sequences, mappings and dataclasses hold, but for these themselves."""
     found: list[Any] = []
     waiting, seen = [tree], set[int]()
     while waiting:
         part = waiting.pop()
-        if not isinstance(part, (Mapping, tuple, list)) and (isinstance(part, type) or not is_dataclass(part)):
+        holds = type(part) not in _PLAIN and (isinstance(part, (Mapping, tuple, list)) or _is_made(part))
+        if not holds:
             found.append(part)
         elif id(part) not in seen:  # parts may hold each other
             seen.add(id(part))
             waiting += [held for _, held in _parts(part)]
     return found
+
+
+def _is_made(part: Any) -> bool:
+    return is_dataclass(part) and not isinstance(part, type)
 
 
 def asking(tree: Any) -> list[Tensor]:

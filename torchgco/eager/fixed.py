@@ -43,6 +43,28 @@ def sort_rows(kinds: Kinds, model: Model, t: State) -> None:
     t.fixes[rows] = some.fixes & (moves | ~is_state | ~_looked_at(model, tight))
 
 
+def soften_rows(kinds: Kinds, model: Model, t: State, curvature: Tensor) -> None:
+    """Rows that hold as equalities give way more where units are small, in place.
+
+    Their stiffness, 1 / delta_c, is added to the curvature of the cost (b, N+1, S), of which rounding would leave
+    nothing where that is many times smaller. The least J^2 / curvature of a row's variables says by how much the cost
+    lets the row give way; a small share of it, `slight`, is enough. Of a row whose variables cost nothing the largest
+    curvature of all counts.
+    """
+    fixed = kinds.fixed(t)
+    if not bool(fixed.any()):
+        return
+    largest = curvature.flatten(1).amax(-1).view(-1, 1, 1, 1)
+    for part in model.slopes(t.X, t.U).slopes:
+        own = fixed[:, part.place.rows]
+        if bool(own.any()):
+            squares, at = part.squares(curvature)  # (b, K, p, v)
+            least = torch.where((squares > 0.0) & (at > 0.0), squares / at, torch.inf).amin(-1)
+            least = torch.where(torch.isfinite(least), least, (squares / largest).amax(-1))
+            gives = (kinds.how.slight * least).clamp(min=1.0).flatten(1)
+            t.gives[:, part.place.rows] = torch.where(own & torch.isfinite(gives), gives, 1.0)
+
+
 def _looked_at(model: Model, tight: Tensor) -> Tensor:
     """Rows of the constraints and knots with a tight row, (b, R)."""
     found = torch.zeros_like(tight)

@@ -19,6 +19,7 @@ from torchgco.eager.fixed import (
     join_multipliers,
     readmit,
     relax,
+    soften_rows,
     sort_rows,
     split_multipliers,
 )
@@ -104,12 +105,14 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
     how = kinds.how
     t.soft = torch.full_like(t.mu, how.soft)
     slopes, H = model.cost_model(t.X, t.U)
-    largest = torch.maximum(slopes.abs().flatten(1).amax(-1), H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1))
+    curvature = H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1)
+    largest = torch.maximum(slopes.abs().flatten(1).amax(-1), curvature)
     scale = how.steepest / largest
     t.scale = torch.where(torch.isfinite(scale) & (largest > 0.0), scale, t.scale)
     t.mu = first_barrier(kinds, t)
     settle(kinds, model, t)
     sort_rows(kinds, model, t)
+    soften_rows(kinds, model, t, t.scale.view(-1, 1, 1) * H.diagonal(dim1=-2, dim2=-1).abs())
     t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
     remeasure(kinds, t)
     if not how.warm:

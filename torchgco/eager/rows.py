@@ -69,6 +69,10 @@ class Dense:
         along = dz[(slice(None), *_block(self.place.knots, self.place.columns))]
         return (self.J * along.unsqueeze(-2)).abs().sum(-1)
 
+    def squares(self, of: Tensor) -> tuple[Tensor, Tensor]:
+        """J^2 (b, K, p, v), and numbers (b, N+1, S) of these variables, (b, K, 1, v)."""
+        return self.J.square(), of[(slice(None), *_block(self.place.knots, self.place.columns))].unsqueeze(-2)
+
     def add_squares(self, cc: Tensor, H: Tensor) -> None:
         """Add J' diag(cc) J, of weights cc (b, R), to H (b, N+1, S, S)."""
         weighted = self.place.of(cc).unsqueeze(-1) * self.J
@@ -99,6 +103,12 @@ class Single:
     def terms(self, dz: Tensor) -> Tensor:
         """As of `Dense`."""
         return self.push(dz).abs()
+
+    def squares(self, of: Tensor) -> tuple[Tensor, Tensor]:
+        """As of `Dense`, for the one variable of each row: (b, K, p, 1)."""
+        both = torch.cat((self.above, self.below))
+        at = of[(slice(None), *_block(self.place.knots, both))].unsqueeze(-1)
+        return torch.ones_like(at), at
 
     def add_squares(self, cc: Tensor, H: Tensor) -> None:
         """As of `Dense`."""

@@ -36,14 +36,14 @@ MADE = "aim", "r", "dx", "du", "yn", "ds", "dz"  # of a step for each problem, b
 
 def curvature(kinds: Kinds, at: Derivatives, t: State) -> Tensor:
     """The Hessian of the condensed system (b, N+1, S, S)."""
-    hold = torch.where(kinds.fixed(t), 1.0 / column(t.soft), 0.0)
+    hold = torch.where(kinds.fixed(t), 1.0 / (column(t.soft) * t.gives), 0.0)
     return at.with_squares(torch.where(kinds.inside(t), t.z / t.s, hold))
 
 
 def stepped(kinds: Kinds, step: Step, t: State) -> None:
     """The step that the factors give for the residuals `aim` and r; in place."""
     inside, fixed = kinds.inside(t), kinds.fixed(t)
-    objective, soft, mu = column(t.objective), column(t.soft), column(t.mu)
+    objective, soft, mu = column(t.objective), column(t.soft) * t.gives, column(t.mu)
     sigma = t.z / t.s
     by = torch.where(inside, sigma * step.r + mu / t.s, 0.0)
     by = torch.where(fixed, objective * t.z + step.r / soft, by)

@@ -38,6 +38,7 @@ class State:
     z: Tensor  # multipliers
     out: Tensor  # bool: inequalities outside the barrier
     fixes: Tensor  # bool: those of them that hold as equalities
+    gives: Tensor  # delta_c of a row, as a multiple of `soft`
     room: Tensor  # half the range between two bounds, 1 at most
     relaxed: Tensor  # by how much a row is
     mu: Tensor  # (b,), as all that follows
@@ -122,12 +123,12 @@ def blank(problem: Problem, X: Tensor, U: Tensor, z: Tensor) -> State:
         "s": torch.ones_like(z), "z": z.clone(),
     }  # fmt: skip
     made = {
-        **own, "out": never, "fixes": never, "room": torch.ones_like(z), "relaxed": none, "mu": zero, "scale": one,
-        "objective": one, "soft": zero, "shift": zero, "theta": zero, "phi": zero, "highest": inf, "lowest": zero,
-        "filter": X.new_full((b, PAIRS, 2), torch.inf), "last": zero, "forced": zero, "entered": zero, "slope": zero,
-        "alpha": zero, "least": inf, "left": inf, "idle": count, "made": count, "failures": count, "shortened": count,
-        "ahead": count, "restoring": no, "crawls": no, "rows_relaxed": no, "presses": no, "watching": no,
-        "rows": torch.arange(b, device=X.device),
+        **own, "out": never, "fixes": never, "gives": torch.ones_like(z), "room": torch.ones_like(z), "relaxed": none,
+        "mu": zero, "scale": one, "objective": one, "soft": zero, "shift": zero, "theta": zero, "phi": zero,
+        "highest": inf, "lowest": zero, "filter": X.new_full((b, PAIRS, 2), torch.inf), "last": zero, "forced": zero,
+        "entered": zero, "slope": zero, "alpha": zero, "least": inf, "left": inf, "idle": count, "made": count,
+        "failures": count, "shortened": count, "ahead": count, "restoring": no, "crawls": no, "rows_relaxed": no,
+        "presses": no, "watching": no, "rows": torch.arange(b, device=X.device),
     }  # fmt: skip
     made = {name: value.clone() for name, value in made.items()}
     return State(**made, kept=tuple(made[name].clone() for name in KEPT))

@@ -73,9 +73,9 @@ class Multipliers:
 
 def later(knots: Sequence[int], steps: int) -> list[int]:
     """The places of the knots `steps` stages later: the last one beyond the end, a knot's own where there is none."""
-    place = {knot: i for i, knot in enumerate(knots)}
-    end = len(knots) - 1
-    return [place.get(knot + steps, end if knot + steps > max(knots) else i) for i, knot in enumerate(knots)]
+    place, end = {knot: i for i, knot in enumerate(knots)}, len(knots) - 1
+    last = max(knots, default=0)
+    return [place.get(knot + steps, end if knot + steps > last else i) for i, knot in enumerate(knots)]
 
 
 def shifted(values: Tensor, steps: int = 1, knots: Sequence[int] | None = None, last: Tensor | None = None) -> Tensor:
@@ -87,6 +87,8 @@ def shifted(values: Tensor, steps: int = 1, knots: Sequence[int] | None = None, 
         last: int64 (B,), the place of each problem's last knot; the values after it stay. None: K - 1.
     """
     K = values.shape[1]
+    if knots is None and last is None and steps == 1:
+        return torch.cat((values[:, 1:], values[:, -1:]), dim=1)
     at = torch.tensor(later(range(K) if knots is None else knots, steps), dtype=torch.int64, device=values.device)
     if last is None:
         return values[:, at]

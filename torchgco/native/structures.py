@@ -168,7 +168,10 @@ class Interior(Structure):
         ("double", "largest_multiplier"),
         ("double", "highest lowest gain_theta gain_phi armijo switching power_theta power_phi"),
         ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
-        ("double", "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest explodes relaxes"),
+        (
+            "double",
+            "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest slight explodes relaxes",
+        ),
         ("double", "pivot noise rounding soft_growth soft_decay forced_growth"),
         ("double", "smoothing"),  # mu in units of the cost, at which the barrier stays; 0: it falls
         ("double", "seconds"),  # after which problems end with TIME_LIMIT; infinite: never

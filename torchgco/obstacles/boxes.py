@@ -39,8 +39,8 @@ class Boxes(Constraint):
         vehicle_radius: number or (B,), m; or a `Body`.
         rotations: those that turn the axes of space into the box's sides. In the plane angles (M,) or (B, M), rad; in
             space unit quaternions [w, x, y, z], (M, 4) or (B, M, 4). None: sides along the axes.
-        radii: (M,) or (B, M), m, at least 0; NaN where the centre is. The surface of a rounded box lies so far outside
-            its sides. Bodies touch at CONTACT_FACTOR (r + r_veh) from the sides. None: sharp boxes.
+        radii: one number, (M,) or (B, M), m, at least 0; NaN where the centre is. The surface of a rounded box lies so
+            far outside its sides. Bodies touch at CONTACT_FACTOR (r + r_veh) from the sides. None: sharp boxes.
         knots: default 1..N.
 
     Raises:

@@ -27,7 +27,7 @@ class Capsules(Constraint):
     Args:
         starts, ends: of the segments, (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent capsules
             (padding); M may be 0, and empty lists stand for (0, d). Equal points make a sphere.
-        radii: (M,) or (B, M), m, above 0; NaN where the start is.
+        radii: one number, (M,) or (B, M), m, above 0; NaN where the start is.
         vehicle_radius: number or (B,), m; or a `Body`.
         knots: default 1..N.
 

@@ -50,12 +50,14 @@ def rows(value: Any, name: str, d: int, dims: Dimensions) -> Tensor:
 
 
 def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor:
-    """The obstacles' own radii (B, M), 0 where absent.
+    """The obstacles' own radii (B, M), 0 where absent; one number stands for all of them.
 
     Raises:
         InputError: another shape, NaN elsewhere or not there, infinite or negative radii.
     """
-    radii = per_problem(value, name, 2, dims)
+    given = tensor(value, name, dims.like)
+    given = torch.where(absent, torch.nan, given) if given.dim() == 0 else given
+    radii = per_problem(given, name, 2, dims)
     check_shape(radii, tuple(absent.shape), name)
     if bool((torch.isnan(radii) != absent).any()):
         raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")

@@ -29,7 +29,7 @@ class Spheres(Constraint):
     Args:
         centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent obstacles (padding); M may be 0,
             and an empty list stands for (0, d).
-        radii: (M,) or (B, M), m; NaN where the centre is.
+        radii: one number, (M,) or (B, M), m; NaN where the centre is.
         vehicle_radius: number or (B,), m; or a `Body`.
         velocities: as centers, m/s; the obstacle is at centers + velocities * k dt. None: static.
         knots: default 1..N.

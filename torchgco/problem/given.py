@@ -143,7 +143,7 @@ def _facts(fields: Mapping[str, Any]) -> Iterator[Hashable]:
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
                 yield _sum(leaf.detach())
-        elif isinstance(leaf, (Number, str, bytes)):
+        elif isinstance(leaf, (int, float, str, bytes, Number)):
             yield leaf
         elif callable(leaf) or leaf is None or isinstance(leaf, slice):
             yield _Itself(leaf)

@@ -57,6 +57,7 @@ FILTER: dict[str, Any] = {
     "steepest": 1.0,  # slope or curvature of the cost, to which it is scaled
     "pivot": 1e-14, "noise": 10.0,  # least pivot, as a share of its entry; rounding of phi, in units of its last bit
     "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
+    "slight": 2e-5,  # of J^2 / curvature, times delta_c: 1e3 roundings of it, which equalities give way at least
     "relaxes": 0.01,  # of the violation tolerance, by which rows are relaxed there (1e-8: IPOPT's bound_relax_factor)
     "soft_growth": 100.0, "soft_decay": 0.1,
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c

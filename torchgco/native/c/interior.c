@@ -24,16 +24,20 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     for (int l = 0; l < LANES; l++) if (of[l]) k->pairs[l] = 0;
 }
 
-/* The largest slope or curvature of the cost in any one variable. */
-static V steepest(const Barrier *t) {
+/* The largest slope or curvature of the cost in any one variable, and the largest curvature. */
+static V steepest(const Barrier *t, V *curvature) {
     const Lanes *s = &t->lanes;
     V largest = SET(0.0), g[S], H[S * S];
+    *curvature = SET(0.0);
     for (int64_t k = 0; k <= s->of->N; k++) {
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
         cost_expand(s, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, g, H);
-        for (int i = 0; i < S; i++) largest = most(most(tgco_fabs(g[i]), tgco_fabs(H[i * S + i])), largest);
+        for (int i = 0; i < S; i++) {
+            largest = most(tgco_fabs(g[i]), largest);
+            *curvature = most(tgco_fabs(H[i * S + i]), *curvature);
+        }
     }
-    return largest;
+    return most(largest, *curvature);
 }
 
 /* The barrier parameter at which lane l begins: at least that at which it ends, where the barrier stays. */
@@ -44,7 +48,7 @@ static double first_barrier(const Barrier *t, int l) {
 
 /* Lanes `of` have just been loaded: the scale of their cost, slacks and multipliers. */
 static void begin(Barrier *t, Track *k, I of) {
-    V one = SET(1.0), zero = SET(0.0), largest;
+    V one = SET(1.0), zero = SET(0.0), largest, curvature;
     const Interior *how = t->how;
     const Problem *p = t->lanes.of;
     t->scale = tgco_choose(of, one, t->scale);
@@ -65,11 +69,12 @@ static void begin(Barrier *t, Track *k, I of) {
             for (int l = 0; l < LANES; l++)
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
-    largest = steepest(t);
+    largest = steepest(t, &curvature);
     V scale = SET(how->steepest) / largest;
     t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
+    soften_rows(t, of, t->scale * curvature);
     if (how->warm) {
         if (t->some_out) join_multipliers(t, of);
         ROWS(t, 0, {

@@ -19,6 +19,7 @@ typedef struct {
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
     V mu, shift, scale;
     V objective; /* 0 where feasibility alone is sought */
+    V *gives;    /* (rows): by how much more than `soft` says */
     V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */
     V *kept; /* the iterate before the steps on trial */
     V *memory;

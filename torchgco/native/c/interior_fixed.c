@@ -202,6 +202,53 @@ static void sort_rows(Barrier *t, I of) {
     t->some_out = any(some);
 }
 
+/* Rows that hold as equalities give way more where units are small: see eager/fixed.py. `largest` is the cost's largest
+   curvature. */
+static void soften_rows(Barrier *t, I of, V largest) {
+    const Lanes *s = &t->lanes;
+    const Problem *p = s->of;
+    V g[S], H[S * S], own[S], none = SET(INFINITY);
+    for (int64_t k = 0; k <= p->N; k++) {
+        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        int known = 0;
+        for (int64_t i = 0; i < p->constraints; i++) {
+            const Constraint *con = p->constraint + i;
+            if (con->place[k] == NOWHERE) continue;
+            int64_t q = row_of(t, i, k);
+            int holds = con->equality;
+            for (int j = 0; j < con->rows; j++) {
+                t->gives[q + j] = tgco_choose(of, SET(1.0), t->gives[q + j]);
+                holds |= t->some_out && any(of & t->fixes[q + j]);
+            }
+            if (!holds) continue;
+            if (!known) {
+                memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+                cost_expand(s, k, x, u, g, H);
+                known = 1;
+            }
+            V change[con->rows], ratio[con->rows], alone[con->rows];
+            for (int j = 0; j < con->rows; j++) { ratio[j] = none; alone[j] = SET(0.0); }
+            for (int v = 0; v < (u ? S : NX); v++) {
+                for (int w = 0; w < S; w++) own[w] = SET(w == v);
+                along(t, i, k, x, u, own, change);
+                V h = t->scale * tgco_fabs(H[v * S + v]);
+                for (int j = 0; j < con->rows; j++) {
+                    V square = change[j] * change[j];
+                    I counts = (square > SET(0.0)) & (h > SET(0.0));
+                    ratio[j] = tgco_choose(counts, least(square / h, ratio[j]), ratio[j]);
+                    alone[j] = most(square / largest, alone[j]);
+                }
+            }
+            for (int j = 0; j < con->rows; j++) {
+                V share = SET(t->how->slight) * tgco_choose(finite(ratio[j]), ratio[j], alone[j]);
+                I held = con->equality ? of : of & t->fixes[q + j];
+                held &= finite(share) & (share > SET(1.0));
+                t->gives[q + j] = tgco_choose(held, share, t->gives[q + j]);
+            }
+        }
+    }
+}
+
 /* Whether rows that were left out of lane l are violated. */
 static int breaks_rows_left_out(const Barrier *t, int l) {
     int breaks = 0;

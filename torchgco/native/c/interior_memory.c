@@ -30,7 +30,7 @@ static int64_t shape(Barrier *t, V *memory) {
     t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
-    t->room = cut(&m, rows); t->relaxed = cut(&m, rows);
+    t->room = cut(&m, rows); t->relaxed = cut(&m, rows); t->gives = cut(&m, rows);
     t->out = (I *)cut(&m, rows); t->fixes = (I *)cut(&m, rows);
     t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
     return m - memory;
@@ -54,6 +54,7 @@ static int start_barrier(Barrier *t, const Interior *how) {
     if (!t->memory) { finish_barrier(t); return 0; }
     memset(t->memory, 0, (count + 1) * sizeof(V));
     shape(t, t->memory);
+    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = SET(1.0);
     return 1;
 }
 

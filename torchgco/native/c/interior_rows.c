@@ -47,18 +47,21 @@ static inline V by_role(const Barrier *t, int64_t q, V inside, V fixed) {
     return t->some_out ? tgco_choose(t->out[q], tgco_if(t->fixes[q], fixed), inside) : inside;
 }
 
+/* The dual regularisation of a row that holds as an equality. */
+static inline V softness(const Barrier *t, int64_t q) { return t->soft * t->gives[q]; }
+
 /* What row q adds: by[0] its multiplier, by[1] the condensed residual, by[2] mu's factor, and the curvature across. */
 static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
     by[0] = t->z[q];
     if (equality) {
-        by[1] = t->objective * t->z[q] + t->r[q] / t->soft;
+        by[1] = t->objective * t->z[q] + t->r[q] / softness(t, q);
         by[2] = SET(0.0);
-        return SET(1.0) / t->soft;
+        return SET(1.0) / softness(t, q);
     }
     V sigma = t->z[q] / t->s[q], one = SET(1.0);
-    by[1] = by_role(t, q, sigma * t->r[q], t->objective * t->z[q] + t->r[q] / t->soft);
+    by[1] = by_role(t, q, sigma * t->r[q], t->objective * t->z[q] + t->r[q] / softness(t, q));
     by[2] = by_role(t, q, one / t->s[q], SET(0.0));
-    return by_role(t, q, sigma, one / t->soft);
+    return by_role(t, q, sigma, one / softness(t, q));
 }
 
 #if DIM > 0

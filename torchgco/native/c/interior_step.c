@@ -75,10 +75,10 @@ static void solve_rows(Barrier *t) {
                 V change = t->ds[q] + t->r[q];
                 if (con->equality) {
                     t->ds[q] = SET(0.0);
-                    t->dz[q] = change / t->soft;
+                    t->dz[q] = change / softness(t, q);
                 } else {
                     t->ds[q] = by_role(t, q, -change, SET(0.0));
-                    t->dz[q] = by_role(t, q, (t->mu + t->z[q] * change) / t->s[q] - t->z[q], change / t->soft);
+                    t->dz[q] = by_role(t, q, (t->mu + t->z[q] * change) / t->s[q] - t->z[q], change / softness(t, q));
                 }
             }
         }
