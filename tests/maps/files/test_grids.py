@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.maps.files import samples
 from tests.maps.files.samples import ROOM, WHITE_ROOM, png, yaml
@@ -61,6 +62,26 @@ def test_transparent_paper_is_free(tmp_path: Path) -> None:
     black[0, 0, 3] = 255
     (tmp_path / "plan.png").write_bytes(png(black))
     assert np.argwhere(grid_of(tmp_path / "plan.png", resolution=1).occupied).tolist() == [[0, 1]]
+
+
+def test_a_photo_lies_as_viewers_show_it(tmp_path: Path) -> None:
+    """A camera on its side stores rows that are columns of the picture, and says so."""
+    shown = np.full((16, 32), 255, np.uint8)
+    shown[:8, :8] = 0  # the upper left corner
+    photo, turned = Image.fromarray(np.rot90(shown).copy()), Image.Exif()
+    turned[0x0112] = 6  # to be turned by a quarter, clockwise
+    for name in ("photo.jpg", "photo.png", "photo.tif"):
+        photo.save(tmp_path / name, exif=turned.tobytes())
+        occupied = grid_of(tmp_path / name, resolution=1).occupied
+        assert occupied.shape == (32, 16) and occupied[:8, 8:].all() and occupied.sum() == 64
+
+
+@pytest.mark.parametrize(("mode", "photometric", "said"), [("I", 1, "got .*another kind"), ("I;16", 0, "white at 0")])
+def test_tif_images_whose_white_is_unknown(mode: str, photometric: int, said: str, tmp_path: Path) -> None:
+    pixels = np.array([[0, 255]], np.int32 if mode == "I" else np.uint16)
+    Image.fromarray(pixels).save(tmp_path / "a.tif", tiffinfo={262: photometric})
+    with pytest.raises(InputError, match=said):
+        read(tmp_path / "a.tif", resolution=1)
 
 
 def server(folder: Path, pixels: list[int] | np.ndarray, **keys: Any) -> np.ndarray:

@@ -63,6 +63,25 @@ def test_the_cells_of_a_world_are_those_near_its_shapes(tmp_path: Path) -> None:
     assert (layer.occupied == grid.occupied[..., (bottoms < 0.6) & (bottoms + 0.2 > 0.4)].any(-1)).all()
 
 
+def test_models_of_a_saved_world_stand_where_its_state_has_them(tmp_path: Path) -> None:
+    """Gazebo leaves the older poses in the models, and writes where they are by now into the state, in the world."""
+    state = """<state world_name="yard"><sim_time>7 0</sim_time>
+      <model name="ground"><pose>0 0 0 0 0 0</pose></model>
+      <model name="yard"><pose>4 3 0.25 0 0 -1.57</pose><scale>1 1 1</scale>
+        <link name="l"><pose>5 2 1 0.1 0.2 0.3</pose><velocity>0 0 0 0 0 0</velocity></link>
+        <model name="inner"><pose frame="">-1 -1 0.5 0 0 0</pose></model></model></state>"""
+    place = "<model name='{}'><static>1</static><pose>{}</pose>{}</model>"
+    alone = WORLD[WORLD.index('<collision name="a">') : WORLD.index("</link>\n    <model")]
+    inner = "<link name='l'><collision name='c'><geometry><sphere><radius>0.7</radius></sphere></geometry></collision>"
+    now = place.format("a", "5 2 1 0.1 0.2 0.3", f"<link name='l'>{alone}</link>")
+    now += place.format("b", "-1 -1 0.5 0 0 0", f"{inner}</link>")
+    (tmp_path / "saved.world").write_text(WORLD.replace("</world>", f"{state}</world>"))
+    (tmp_path / "now.world").write_text(f"<sdf><world>{now}</world></sdf>")
+    saved, expected = (read(tmp_path / f"{name}.world", resolution=0.2) for name in ("saved", "now"))
+    assert isinstance(saved, OccupancyGrid) and isinstance(expected, OccupancyGrid)
+    assert saved.origin.tolist() == expected.origin.tolist() and (saved.occupied == expected.occupied).all()
+
+
 @pytest.mark.parametrize(("old", "new", "said"), [
     ("<sphere><radius>0.7</radius></sphere>", "<mesh><uri>a.dae</uri></mesh>", "cylinders or spheres, got .*mesh"),
     ("<radius>0.7</radius>", "<radius>-1</radius>", "sizes above 0"),
@@ -75,6 +94,10 @@ def test_the_cells_of_a_world_are_those_near_its_shapes(tmp_path: Path) -> None:
     ("<?xml version=\"1.0\"?>", "<!DOCTYPE a [<!ENTITY b 'c'>]>", "without definitions"),
     ("sdf", "html", "<html>"),
     ("<static>true</static>", "", "in a static model, got .*none"),
+    ("</world>", "<population name='a'/></world>", "models stand in the file, got .*population"),
+    ("</world>", "<state><insertions><model name='a'/></insertions></state></world>", "got .*insertions"),
+    ("</world>", "<state><model name='yard'><scale>1 2 1</scale></model></state></world>", "saved, got .*1 2 1"),
+    ("<model name=\"inner\">", "<model name=\"inner\" placement_frame=\"l\">", "got .*placement_frame"),
 ])  # fmt: skip
 def test_worlds_that_are_refused(old: str, new: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "a.sdf").write_text(WORLD.replace(old, new))
@@ -96,6 +119,19 @@ def test_a_closed_mesh_is_solid(ending: str, tmp_path: Path) -> None:
     assert shell.is_occupied.sum() == 19 * 9 * 15 - 17 * 7 * 13  # no hole in it
     part = read(tmp_path / f"a.{ending}", resolution=0.1, box=[[2.55, -1.5, -0.2], [2.85, -1.2, 9.0]])
     assert isinstance(part, OccupancyGrid) and part.shape == (4, 3, 15) and np.allclose(part.origin, [2.5, -1.5, -0.2])
+
+
+def test_seams_of_textures_and_normals_open_no_mesh(tmp_path: Path) -> None:
+    """Modellers write corners once per face, with a normal and a place on the texture of each."""
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box(extents=[2, 1, 1])
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"vn {x} {y} {z}" for x, y, z in box.face_normals]
+    lines += [f"vt {i / 36} 0.5" for i in range(36)]
+    for i, corners in enumerate(box.faces):
+        lines.append("f " + " ".join(f"{v + 1}/{3 * i + j + 1}/{i + 1}" for j, v in enumerate(corners)))
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    grid = read(tmp_path / "a.obj", resolution=0.1)
+    assert isinstance(grid, OccupancyGrid) and grid.is_occupied.all()
 
 
 def test_an_open_mesh_is_a_surface(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -59,11 +59,12 @@ class Shape:
 def read_world(source: Source, resolution: float | None) -> OccupancyGrid:
     """Cells whose centre lies within half a diagonal of a static model's box, cylinder or sphere are occupied.
 
-    So every cell that a shape touches is, and some beside it. Planes, the sun and models that move are left out.
+    So every cell that a shape touches is, and some beside it. Planes, the sun and models that move are left out. Models
+    stand where the world's <state> has them, which Gazebo writes when a world is saved: their own poses may be older.
 
     Raises:
-        InputError: another file, no shape, geometry of other kinds, models that are included from elsewhere, poses that
-            are relative to named frames.
+        InputError: another file, no shape, geometry of other kinds, models that are included from elsewhere, drawn,
+            inserted or scaled afterwards, poses that are relative to named frames.
     """
     source.needs("resolution", resolution, "the side of a cell, m")
     assert resolution is not None
@@ -109,22 +110,54 @@ def _shapes(source: Source, root: Element) -> Iterator[Shape]:
             if uri not in EMPTY:
                 expected = "a world whose models stand in the file: `gz sdf -p FILE` writes included ones out"
                 source.refuse(expected, f"an include of {shown(uri[:60])}")
-        yield from _of_models(source, world, Frame(np.eye(3), np.zeros(3)), static=False, depth=0)
+        if world.find("population") is not None:
+            source.refuse("a world whose models stand in the file", "a population, drawn by Gazebo")
+        here, state = Frame(np.eye(3), np.zeros(3)), _state(source, world)
+        yield from _of_models(source, world, here, state, static=False, depth=0)
 
 
-def _of_models(source: Source, parent: Element, frame: Frame, static: bool, depth: int) -> Iterator[Shape]:
+def _state(source: Source, world: Element) -> Element | None:
+    """What a saved world says of where its models were by then."""
+    state = world.find("state")
+    for part in () if state is None else state:
+        if part.tag in ("insertions", "deletions") and len(part):
+            source.refuse("a world whose models stand in the file", f"{part.tag} in its state")
+    return state
+
+
+def _of_models(
+    source: Source, parent: Element, frame: Frame, state: Element | None, static: bool, depth: int
+) -> Iterator[Shape]:
     if depth > MODEL_DEPTH:
         source.refuse(f"models within models {MODEL_DEPTH} deep at most", "more")
     for model in parent.findall("model"):
-        at = frame.then(_pose(source, model))
+        kept = _kept(state, model)
+        if model.get("placement_frame"):
+            source.refuse("models placed by their own frame", f"placement_frame {shown(model.get('placement_frame'))}")
+        if kept is not None and any(float(scale) != 1.0 for scale in _numbers(source, kept, "scale", 3, (1.0,) * 3)):
+            source.refuse("models of the size in which they were saved", f"<scale> {shown(kept.findtext('scale'))}")
+        at = _placed(source, model, frame, kept)
         fixed = static or (model.findtext("static") or "").strip().lower() in ("1", "true")
-        yield from _of_models(source, model, at, fixed, depth + 1)
+        yield from _of_models(source, model, at, kept, fixed, depth + 1)
         for link in model.findall("link") if fixed else ():
-            here = at.then(_pose(source, link))
+            here = _placed(source, link, at, _kept(kept, link))
             for collision in link.findall("collision"):
                 shape = _shape(source, collision.find("geometry"), here.then(_pose(source, collision)))
                 if shape is not None:
                     yield shape
+
+
+def _kept(state: Element | None, part: Element) -> Element | None:
+    """What a state says of a model or link; None where it says nothing."""
+    found = () if state is None else state.findall(part.tag)
+    return next((kept for kept in found if kept.get("name") == part.get("name")), None)
+
+
+def _placed(source: Source, part: Element, around: Frame, kept: Element | None) -> Frame:
+    """The frame of a model or link in the world: its own pose is one in `around`, that of a state in the world."""
+    if kept is not None and (kept.findtext("pose") or "").strip():
+        return _pose(source, kept)
+    return around.then(_pose(source, part))
 
 
 def _shape(source: Source, geometry: Element | None, frame: Frame) -> Shape | None:
@@ -169,7 +202,11 @@ def _pose(source: Source, element: Element) -> Frame:
     return Frame(R, np.array([x, y, z]))
 
 
-def _numbers(source: Source, element: Element, name: str, count: int) -> list[float]:
+def _numbers(
+    source: Source, element: Element, name: str, count: int, default: Sequence[float] | None = None
+) -> Sequence[float]:
+    if default is not None and element.find(name) is None:
+        return default
     text = (element.findtext(name) or "").strip()
     try:
         found = [float(word) for word in text.split()]

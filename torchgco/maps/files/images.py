@@ -13,6 +13,7 @@ from torchgco.maps.grid import OccupancyGrid
 MOST_PIXELS = 2**26  # 8192 x 8192
 IMAGE_FILE = "a png, pgm, ppm, bmp, jpg or tif image"
 DECODERS = ("PNG", "PPM", "BMP", "JPEG", "TIFF")  # Pillow tries no other decoder
+PHOTOMETRIC = 262  # TIFF's tag of what 0 means
 DARK = 0.5  # of a floor plan: darker pixels are occupied
 
 
@@ -21,10 +22,11 @@ def read_image(
 ) -> OccupancyGrid:
     """A floor plan, dark where it is occupied; with `height`, the heights of the ground, white at `height` metres.
 
-    The lower left pixel is the first cell, x goes to the right and y up.
+    The lower left pixel is the first cell, x goes to the right and y up, as viewers show the image: a camera's
+    orientation counts.
     """
     source.needs("resolution", resolution, "the side of a pixel, m")
-    brightness, alpha = load(source)
+    brightness, alpha = load(source, upright=True)
     if height is not None:
         return above_ground(source, turned(brightness).astype(np.float64) * height, resolution, origin)
     if alpha is not None:
@@ -37,19 +39,32 @@ def turned(rows: np.ndarray) -> np.ndarray:
     return rows[::-1].T
 
 
-def load(source: Source) -> tuple[np.ndarray, np.ndarray | None]:
+def load(source: Source, upright: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
     """Brightness (rows, columns) in [0, 1], the mean of the colours, float32, and opacity likewise or None.
+
+    Args:
+        upright: whether the image is turned as its metadata say, which map_server doesn't.
 
     Raises:
         InputError: no such image, a damaged one, or one of more than `MOST_PIXELS`.
     """
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     source.size(IMAGE_FILE)
     with source.library(IMAGE_FILE), open(source.path, "rb") as file, Image.open(file, formats=DECODERS) as image:
         source.limit(image.width * image.height, MOST_PIXELS, f"pixels ({image.width:,} x {image.height:,} here)")
         image.load()
-        return _levels(source, image)
+        if image.format == "TIFF" and image.mode.startswith("I"):
+            _check_levels(source, image)
+        return _levels(source, ImageOps.exif_transpose(image) if upright else image)
+
+
+def _check_levels(source: Source, image: Any) -> None:
+    """Pillow gives numbers of 32 bits as they are, of which 65535 needn't be white, and doesn't turn white at 0."""
+    if image.mode == "I":
+        source.refuse(f"{IMAGE_FILE} of 8 or 16 bits, unsigned", "another kind of numbers")
+    if image.tag_v2.get(PHOTOMETRIC) == 0:
+        source.refuse(f"{IMAGE_FILE} whose black is 0", "16 bits with white at 0")
 
 
 def _levels(source: Source, image: Any) -> tuple[np.ndarray, np.ndarray | None]:

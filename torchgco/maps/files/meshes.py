@@ -51,6 +51,7 @@ def _loaded(source: Source) -> tuple[np.ndarray, np.ndarray, bool]:
         source.refuse("a mesh with the extra maps: pip install 'torchgco[maps]'", "no trimesh")
     with source.library(MESH_FILE):  # no resolver: files that it names, such as materials, aren't read
         mesh = trimesh.load_mesh(BytesIO(raw), file_type=kind, force="mesh", skip_materials=True)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and normals cut surfaces along their seams
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         closed = bool(mesh.is_watertight)
     if not len(faces) or not np.isfinite(vertices).all():
