@@ -26,6 +26,7 @@ EXPERIMENTS = options_of("experiment")
 MISSIONS = ("mission", "mission_study", "mission_unknown")
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("floors", "yard"),
+    "car": ("parking",),
     "quadrotor": (
         "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "gates", "mazes", "rooms", "trefoils",
         "walls", "woods",

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def vehicle(name: str):
-    scenario = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard"}.get(name, "planar_trap")
+    scenario = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard", "car": "parking"}.get(name, "planar_trap")
     return compose([f"model={name}", f"scenario={scenario}"]).vehicle
 
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
+from torchgco.dynamics import Bicycle, Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
 from torchgco.dynamics.names import states_of
 
 QUATERNION = ["qw", "qx", "qy", "qz"]
@@ -52,6 +52,7 @@ VEHICLES: dict[type[Dynamics], Look] = {
     QuadrotorPlant: Look("quadrotor", quaternion=slice(6, 10)),
     QuadrotorThrusts: Look("quadrotor", quaternion=slice(6, 10)),
     Unicycle: Look("car", heading=2),
+    Bicycle: Look("car", heading=2),
 }
 
 
