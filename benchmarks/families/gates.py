@@ -134,8 +134,8 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
 
 def text(count: int, seed: int, beside: int, minutes: float, tracks: int, moved: int) -> str:
     """The tables of forests and race."""
-    race = races(STAGES, MARGIN, tracks, moved)
-    return f"{table(forests(count, seed, beside, minutes))}\n\n{race}"
+    flown = forests(count, seed, beside, minutes)
+    return f"{table(flown)}\n\n{races(STAGES, MARGIN, tracks, moved)}"
 
 
 def forests(count: int, seed: int, beside: int, minutes: float) -> list[Flown]:
