@@ -52,7 +52,7 @@ def test_the_problem_is_a_car_whose_body_parks() -> None:
     # The car just fits: aside by the kerb's distance it touches.
     alone = problem.take([0])
     clear = clear_at(alone, 2)
-    poses = np.array([[-1.3, 0.0, 0.0], [-1.3, -0.25, 0.0], [-0.55, 0.0, 0.0], [-0.65, 0.0, 0.0], [-1.3, 0.0, 0.5]])
+    poses = np.array([[-1.3, 0.0, 0.0], [-1.3, -0.25, 0.0], [-0.6, 0.0, 0.0], [-0.7, 0.0, 0.0], [-1.3, 0.0, -0.5]])
     assert clear(poses).tolist() == [True, False, False, True, False]
     assert spheres.margins.shape[1] == 0
 

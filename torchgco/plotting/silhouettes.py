@@ -44,11 +44,15 @@ def silhouettes(body: BoundBody, X: np.ndarray, plane: Plane) -> list[np.ndarray
         rings = centers[:, :, None, list(plane)] + radii[:, None, None] * RAYS
         return list(rings.reshape(-1, *RAYS.shape))
     corners = np.array(list(product(*zip(*body.box, strict=True))))
-    states = _states(body, X)
-    turned = body.points.attitude(states[..., : body.points.n])[0].cpu().double().numpy() @ corners.T
+    turned = rotations(body, X) @ corners.T
     places = np.asarray(X)[:, None, body.position] + turned.swapaxes(-1, -2)
     seen = [place[:, list(plane)] for place in places]
     return [points[ConvexHull(points).vertices] for points in seen]
+
+
+def rotations(body: BoundBody, X: np.ndarray) -> np.ndarray:
+    """Rotations (K, d, d) of the vehicle's frame in states X (K, n)."""
+    return body.points.attitude(_states(body, X)[..., : body.points.n])[0].cpu().double().numpy()
 
 
 def draw_body(ax: Axes, body: BoundBody, X: np.ndarray, plane: Plane, colour: Any, zorder: float = 2.8) -> None:
