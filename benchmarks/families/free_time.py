@@ -275,13 +275,16 @@ def cops() -> str:
     return markdown(head, rows)
 
 
-def races(stages: Sequence[int], margin: float, tracks: int, seed: int) -> str:
-    """The table of the race: the track, and tracks with gates moved by up to 0.3 m along each axis, as aimed."""
+def races(stages: Sequence[int], margin: float, tracks: int, seed: int, more: Sequence[int] = ()) -> str:
+    """The table of the race: the track, and tracks with gates moved by up to 0.3 m along each axis, as aimed.
+
+    Moved tracks go on with `more` stages a leg.
+    """
     draws, published = torch.Generator().manual_seed(seed), torch.tensor([GATES], dtype=D)
     moved = published + 0.6 * torch.rand(tracks, len(GATES), 3, generator=draws, dtype=D) - 0.3
     rows = _raced("as published", stages, margin, published)
     if tracks > 0:
-        rows += _raced(f"{tracks} moved", stages, margin, moved)
+        rows += _raced(f"{tracks} moved", (*stages, *more), margin, moved)
     head = ["track", "N", "CONVERGED", "duration, s", "iterations", "s, with those before", "gate at 1 ms, m", "end, m",
             "rates over, share"]  # fmt: skip
     return markdown(head, rows)

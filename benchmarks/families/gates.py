@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +28,8 @@ from torchgco.scenarios import Task
 
 NEAR = 3.0  # m: spheres farther than this from our knot aren't rows of IPOPT's
 EXACT = 5e-3  # share of IPOPT's duration
-STAGES, MARGIN = (20, 80), 1e-3  # of each leg of the race, one after the other; m, of a plan that is aimed
+STAGES, MORE = (20, 80), (160,)  # of each leg of the race, one after the other; of moved tracks
+MARGIN = 1e-3  # m, of a plan that is aimed
 BANDS = (3, 5), (6, 8), (9, 12)  # numbers of gates, a row of the table each
 
 
@@ -134,20 +136,22 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
 
 def text(count: int, seed: int, beside: int, minutes: float, tracks: int, moved: int) -> str:
     """The tables of forests and race."""
-    flown = forests(count, seed, beside, minutes)
-    return f"{table(flown)}\n\n{races(STAGES, MARGIN, tracks, moved)}"
+    race = races(STAGES, MARGIN, tracks, moved, MORE)
+    print(race, file=sys.stderr, flush=True)
+    return f"{table(forests(count, seed, beside, minutes))}\n\n{race}"
 
 
 def forests(count: int, seed: int, beside: int, minutes: float) -> list[Flown]:
-    """Layouts from the first on, until the minutes of processor time are over."""
+    """Layouts from the first on, until the minutes of processor time are over, or Ctrl-C."""
     setup = torchgco.compose(["scenario=gates", f"seed={seed}"])
     layouts, flown, began = setup.layouts(count), list[Flown](), time.process_time()
-    for number in range(count):
-        task = setup.task(layouts.take([number]))
-        setup.solver.solve(task.problem, task.U0, max_seconds=1e-3)  # compiles
-        flown.append(layout_flown(task, setup.solver, number, number < beside))
-        if time.process_time() - began > 60.0 * minutes:
-            break
+    with suppress(KeyboardInterrupt):
+        for number in range(count):
+            task = setup.task(layouts.take([number]))
+            setup.solver.solve(task.problem, task.U0, max_seconds=1e-3)  # compiles
+            flown.append(layout_flown(task, setup.solver, number, number < beside))
+            if time.process_time() - began > 60.0 * minutes:
+                break
     return flown
 
 
@@ -181,9 +185,9 @@ main = Command(
     __doc__,
     "gates",
     text,
-    "layouts of seed {seed}, at most {count}, for {minutes} minutes; IPOPT on the first {beside} of them; {tracks} "
-    "tracks moved by seed {moved}, the worst of these; a margin of 1 mm where a plan is aimed; processor time of one "
-    "thread",
+    "layouts of seed {seed}, at most {count}, for at most {minutes} minutes; IPOPT on the first {beside} of them; "
+    "{tracks} tracks moved by seed {moved}, the worst of these; a margin of 1 mm where a plan is aimed; processor time "
+    "of one thread",
     "CasADi",
     count=(64, "layouts"),
     seed=(0, "of the layouts"),
