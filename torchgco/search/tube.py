@@ -135,7 +135,7 @@ class Tube(Row):
             found = ends.cost[ends.best].isfinite()
             part.note(every, paths, BOTH, tracked, chosen, chosen.live, ends, found)
 
-    def _arrivals(self, paths: Paths, free: Free, paces: int) -> Tensor:
+    def _arrivals(self, paths: Paths, free: Free, paces: int = PACES) -> Tensor:
         """Shares (B * K * paces,) of the horizon at which each candidate arrives."""
         own = (free.share * free.slower).unsqueeze(-1) * paths.stretch()
         first = own.nan_to_num(torch.inf).clamp(min=2.0 * torch.finfo(own.dtype).eps, max=LATEST_FIRST)
