@@ -24,6 +24,7 @@ from benchmarks.lib.command import Command
 from torchgco import Bicycle, Boxes, ControlBounds, Goal, Problem, QuadraticCost, StateBounds, judge
 
 VEHICLE = torchgco.compose(["scenario=parking"]).vehicle
+assert VEHICLE.footprint is not None
 (BEHIND, _), (AHEAD, SIDE) = VEHICLE.footprint  # m, of the rectangle, from the rear axle
 LENGTH, WIDTH = AHEAD - BEHIND, 2.0 * SIDE
 CAR = VEHICLE.body
