@@ -122,12 +122,10 @@ class Tube(Row):
         if part.scene.gates is None:
             paths = paths.joined(*ROADMAP.clear_path(part.scene))
         starts, usable = _starts(problem, rest)
-        paces = PACES if part.scene.gates is None else 1  # gates say when: a pace would be that of the last leg alone
-        live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(paces, dim=1)
-        starts = starts.repeat_interleave(paces, dim=1).repeat(1, paths.corners.shape[1], 1, 1)
+        live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(PACES, dim=1)
+        starts = starts.repeat_interleave(PACES, dim=1).repeat(1, paths.corners.shape[1], 1, 1)
         candidates = Candidates.begin(part.problem, starts, paths.R, paths.unit, live)
-        arrivals = self._arrivals(paths, part.free(FOLLOW.iterations), paces)
-        tracked = FOLLOW.along(candidates, paths, arrivals, paces)
+        tracked = FOLLOW.along(candidates, paths, self._arrivals(paths, part.free(FOLLOW.iterations)), PACES)
         chosen = tracked.pick(in_order(tracked)[:, :TOP])
         search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
         ends = solved(search, rows, chosen)
@@ -135,11 +133,11 @@ class Tube(Row):
             found = ends.cost[ends.best].isfinite()
             part.note(every, paths, BOTH, tracked, chosen, chosen.live, ends, found)
 
-    def _arrivals(self, paths: Paths, free: Free, paces: int = PACES) -> Tensor:
+    def _arrivals(self, paths: Paths, free: Free) -> Tensor:
         """Shares (B * K * paces,) of the horizon at which each candidate arrives."""
         own = (free.share * free.slower).unsqueeze(-1) * paths.stretch()
         first = own.nan_to_num(torch.inf).clamp(min=2.0 * torch.finfo(own.dtype).eps, max=LATEST_FIRST)
-        later = torch.linspace(0.0, 1.0, paces, dtype=first.dtype, device=first.device)
+        later = torch.linspace(0.0, 1.0, PACES, dtype=first.dtype, device=first.device)
         return (first.unsqueeze(-1) + (1.0 - first.unsqueeze(-1)) * later).flatten()
 
 
