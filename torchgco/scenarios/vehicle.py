@@ -213,7 +213,7 @@ class Vehicle:
         stages = _given(layouts.stages, self.stages)
         longest = int(np.max(stages))
         horizon = torch.as_tensor(stages, device=device) if np.ndim(stages) else None
-        radius = _given(layouts.vehicle_radius, self.radius) if self.body is None else self.body
+        radius = self.body or _given(layouts.vehicle_radius, self.radius)
         constraints: list[Constraint] = [
             Spheres(
                 tensor(layouts.centers),
