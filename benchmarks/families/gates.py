@@ -28,7 +28,7 @@ from torchgco.scenarios import Task
 
 NEAR = 3.0  # m: spheres farther than this from our knot aren't rows of IPOPT's
 EXACT = 5e-3  # share of IPOPT's duration
-STAGES, MORE = (20, 80), (160,)  # of each leg of the race, one after the other; of moved tracks
+STAGES = (20, 80)  # of each leg of the race, one after the other
 MARGIN = 1e-3  # m, of a plan that is aimed
 BANDS = (3, 5), (6, 8), (9, 12)  # numbers of gates, a row of the table each
 
@@ -136,7 +136,7 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
 
 def text(count: int, seed: int, beside: int, minutes: float, tracks: int, moved: int) -> str:
     """The tables of forests and race."""
-    race = races(STAGES, MARGIN, tracks, moved, MORE)
+    race = races(STAGES, MARGIN, tracks, moved)
     print(race, file=sys.stderr, flush=True)
     return f"{table(forests(count, seed, beside, minutes))}\n\n{race}"
 
