@@ -53,6 +53,7 @@ from torchgco.costs import Cost as Cost
 from torchgco.costs import FunctionCost as FunctionCost
 from torchgco.costs import QuadraticCost as QuadraticCost
 from torchgco.dynamics import Airframe as Airframe
+from torchgco.dynamics import Bicycle as Bicycle
 from torchgco.dynamics import Dynamics as Dynamics
 from torchgco.dynamics import FunctionDynamics as FunctionDynamics
 from torchgco.dynamics import Planar as Planar
@@ -99,8 +100,8 @@ if TYPE_CHECKING:
 # In the order of the API reference.
 __all__ = [  # noqa: RUF022
     # the problem
-    "Problem", "Goal", "FreeTime", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning",
-    "QuadrotorPlant", "QuadrotorThrusts",
+    "Problem", "Goal", "FreeTime", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "Bicycle",
+    "QuadrotorPlanning", "QuadrotorPlant", "QuadrotorThrusts",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
     "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates", "Separation",
     "FirstStepRates", "FunctionConstraint", "FunctionCost",

@@ -1,8 +1,9 @@
 """python -m benchmarks.families.bodies: vehicles whose shape decides: parallel parking, and a corridor hardly wider.
 
-A car of 4.0 x 1.8 m, its rear axle 0.7 m from its end, steered by a rate, is covered by 32 discs. It parks between two
-others at a kerb, from drawn poses beside them, with its final pose as a required goal; and it passes a corridor that is
-10 % wider than its covered width, and narrower than the ball around it, from drawn poses before it. Beside the judge,
+The car of `torchgco scenario=parking`, of 4.0 x 1.8 m, its rear axle 0.7 m from its end, steered by a rate, is covered
+by 32 discs. It parks between two others at a kerb, from drawn poses beside them, with its final pose as a required
+goal; and it passes a corridor that is 10 % wider than its covered width, and narrower than the ball around it, from
+drawn poses before it. Beside the judge,
 the true rectangle is measured against the boxes at 20 states between any two knots, by separating axes: `clear`.
 """
 
@@ -20,54 +21,26 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib import page
 from benchmarks.lib.command import Command
-from torchgco import (
-    Body,
-    Boxes,
-    ControlBounds,
-    FunctionCost,
-    FunctionDynamics,
-    Goal,
-    Problem,
-    QuadraticCost,
-    StateBounds,
-    judge,
-)
+from torchgco import Bicycle, Boxes, ControlBounds, Goal, Problem, QuadraticCost, StateBounds, judge
 
-LENGTH, WIDTH, WHEELBASE, REAR = 4.0, 1.8, 2.6, 0.7  # m
-CAR = Body.covering([-REAR, -WIDTH / 2], [LENGTH - REAR, WIDTH / 2], [8, 4])
-NAMES = ("x", "y", "heading", "speed", "steering")
-LIMITS = [ControlBounds([-1.5, -1.0], [1.5, 1.0])]
+VEHICLE = torchgco.compose(["scenario=parking"]).vehicle
+assert VEHICLE.footprint is not None
+(BEHIND, _), (AHEAD, SIDE) = VEHICLE.footprint  # m, of the rectangle, from the rear axle
+LENGTH, WIDTH = AHEAD - BEHIND, 2.0 * SIDE
+CAR = VEHICLE.body
 BETWEEN = 20  # states between two knots
 FAR = math.inf
 
 
-def car(x: Tensor, u: Tensor) -> Tensor:
-    """Rates of the rear axle's position, heading, speed and steering angle."""
-    heading, speed = x[..., 2], x[..., 3]
-    turning = speed * x[..., 4].tan() / WHEELBASE
-    return torch.stack((speed * heading.cos(), speed * heading.sin(), turning, u[..., 0], u[..., 1]), dim=-1)
-
-
-def limits(fastest: float) -> list[Any]:
-    """Bounds on controls, speed (m/s) and steering (rad)."""
-    return [*LIMITS, StateBounds([-FAR, -FAR, -FAR, -2.0, -0.6], [FAR, FAR, FAR, fastest, 0.6])]
-
-
-def parking(count: int, seed: int, gap: float = 1.35, N: int = 120, dt: float = 0.1) -> Problem:
-    """A slot of `gap` lengths between two cars at a kerb."""
-    rng, slot = np.random.default_rng(seed), gap * LENGTH
-    beside = (slot + LENGTH) / 2
-    centers, half = [[-beside, 0.0], [beside, 0], [0, -WIDTH / 2 - 1.25]], [[LENGTH / 2, WIDTH / 2]] * 2 + [[14.0, 1]]
-    low, high = [1.5, 2.4, -0.15, 0.0, 0.0], [5.0, 3.0, 0.15, 0.0, 0.0]
-    x0 = torch.tensor(rng.uniform(low, high, (count, 5)))
-    effort = lambda x, u: dt * (u.square().sum(-1) + 0.1 * x[..., 3].square())
-    dynamics = FunctionDynamics(car, 5, 2, dt, "rk4", slice(0, 2), state_names=NAMES)
-    goal = Goal(state=[REAR - LENGTH / 2, 0.0, 0.0, 0.0, 0.0], required=True)
-    return Problem(dynamics, FunctionCost(effort), [Boxes(centers, half, CAR), *limits(2.0)], x0, N, goal)
+def parking(count: int, seed: int) -> Problem:
+    """The slots of the scenario."""
+    setup = torchgco.compose(["scenario=parking", f"seed={seed}"])
+    return setup.task(setup.layouts(count)).problem
 
 
 def corridor(count: int, seed: int, wide: float = 1.1, N: int = 120, dt: float = 0.1) -> Problem:
     """Two long walls, `wide` times the covered car apart, whose middle lies aside of the start."""
+    assert CAR is not None
     rng, reach = np.random.default_rng(seed), float((CAR.offsets[:, 1].abs() + CAR.radii).max())
     middle, half = rng.uniform(-1.5, 1.5, count), wide * reach
     walls = [[[10.0, y + side * (half + 10.0)] for side in (-1.0, 1.0)] for y in middle]
@@ -75,19 +48,23 @@ def corridor(count: int, seed: int, wide: float = 1.1, N: int = 120, dt: float =
     x0 = torch.tensor(rng.uniform(low, high, (count, 5)))
     ends = torch.tensor([[[20.0, y, 0.0, 0.0, 0.0]] for y in rng.uniform(-1.5, 1.5, count)], dtype=torch.float64)
     cost = QuadraticCost([0.01, 0.01, 0, 0.01, 0.01], [0.1, 0.1], [10.0, 10, 1, 1, 1], x_ref=ends)
-    dynamics = FunctionDynamics(car, 5, 2, dt, "rk4", slice(0, 2), state_names=NAMES)
     boxes = Boxes(walls, [[[5.0, 10.0]] * 2] * count, CAR)
-    return Problem(dynamics, cost, [boxes, *limits(4.0)], x0, N, Goal(ends[:, 0, :2], 0.5, required=True))
+    limits = [
+        ControlBounds([-1.5, -1.0], [1.5, 1.0]),
+        StateBounds([-FAR, -FAR, -FAR, -2.0, -0.6], [FAR, FAR, FAR, 4.0, 0.6]),
+    ]
+    return Problem(Bicycle(dt), cost, [boxes, *limits], x0, N, Goal(ends[:, 0, :2], 0.5, required=True))
 
 
 def rectangle_clearance(problem: Problem, X: Tensor) -> np.ndarray:
     """Smallest distance (B,), m, of the rectangle of the car from the boxes along the best axis; below 0: they meet."""
-    boxes: Any = problem.obstacles[0].inscribed
+    boxes: Any = problem.obstacles[-1].inscribed
     share = torch.linspace(0, 1, BETWEEN + 1, dtype=X.dtype)[:-1].view(1, 1, -1, 1)
     x = torch.lerp(X[:, :-1, None], X[:, 1:, None], share).flatten(1, 2).numpy()
     along = np.stack((np.cos(x[..., 2]), np.sin(x[..., 2])), axis=-1)
     axes = np.stack((along, np.stack((-along[..., 1], along[..., 0]), axis=-1)), axis=-2)  # (B, K, 2, 2)
-    away = x[..., None, :2] + (LENGTH / 2 - REAR) * along[..., None, :] - boxes.centers.numpy()[:, None]  # (B, K, M, 2)
+    middle = x[..., :2] + (AHEAD + BEHIND) / 2 * along
+    away = middle[..., None, :] - boxes.centers.numpy()[:, None]  # (B, K, M, 2)
     half, own = boxes.half_sizes.numpy()[:, None], np.array([LENGTH / 2, WIDTH / 2])
     of_boxes = np.abs(away) - half - np.einsum("i,bkij->bkj", own, np.abs(axes))[..., None, :]
     seen = np.einsum("bkij,bkmj->bkmi", axes, away)

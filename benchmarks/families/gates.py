@@ -1,14 +1,16 @@
-"""python -m benchmarks.families.gates: 3 to 12 gates drawn in forests, passed in the least time; beside IPOPT by hand.
+"""python -m benchmarks.families.gates: gates drawn in forests, beside IPOPT by hand, and the published race.
 
 The layouts are those of `torchgco scenario=gates`: a quadrotor's planning model, balls of 0.5 m as gates, spheres
 between them, and a duration for each leg. IPOPT, through CasADi's SX by hand, states the same problem as multiple
-shooting; it begins with our states, controls and times, and knows the spheres within 3 m of our knots.
+shooting; it begins with our states, controls and times, and knows the spheres within 3 m of our knots. Layouts are
+flown in their order, for so many minutes of processor time. The race is that of `benchmarks.families.free_time`.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +19,7 @@ import numpy as np
 import torch
 
 import torchgco
+from benchmarks.families.free_time import races
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import markdown, share
 from torchgco import Problem, Solution, Status
@@ -25,6 +28,8 @@ from torchgco.scenarios import Task
 
 NEAR = 3.0  # m: spheres farther than this from our knot aren't rows of IPOPT's
 EXACT = 5e-3  # share of IPOPT's duration
+STAGES = (20, 80)  # of each leg of the race, one after the other
+MARGIN = 1e-3  # m, of a plan that is aimed
 BANDS = (3, 5), (6, 8), (9, 12)  # numbers of gates, a row of the table each
 
 
@@ -129,15 +134,25 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
     return one
 
 
-def text(count: int, seed: int, beside: int) -> str:
-    """The table."""
+def text(count: int, seed: int, beside: int, minutes: float, tracks: int, moved: int) -> str:
+    """The tables of forests and race."""
+    race = races(STAGES, MARGIN, tracks, moved)
+    print(race, file=sys.stderr, flush=True)
+    return f"{table(forests(count, seed, beside, minutes))}\n\n{race}"
+
+
+def forests(count: int, seed: int, beside: int, minutes: float) -> list[Flown]:
+    """Layouts from the first on, until the minutes of processor time are over, or Ctrl-C."""
     setup = torchgco.compose(["scenario=gates", f"seed={seed}"])
-    layouts, flown = setup.layouts(count), list[Flown]()
-    for number in range(count):
-        task = setup.task(layouts.take([number]))
-        setup.solver.solve(task.problem, task.U0, max_seconds=1e-3)  # compiles
-        flown.append(layout_flown(task, setup.solver, number, number < beside))
-    return table(flown)
+    layouts, flown, began = setup.layouts(count), list[Flown](), time.process_time()
+    with suppress(KeyboardInterrupt):
+        for number in range(count):
+            task = setup.task(layouts.take([number]))
+            setup.solver.solve(task.problem, task.U0, max_seconds=1e-3)  # compiles
+            flown.append(layout_flown(task, setup.solver, number, number < beside))
+            if time.process_time() - began > 60.0 * minutes:
+                break
+    return flown
 
 
 def table(flown: list[Flown]) -> str:
@@ -170,11 +185,16 @@ main = Command(
     __doc__,
     "gates",
     text,
-    "{count} layouts of seed {seed}, IPOPT on the first {beside} of them, processor time of one thread",
+    "layouts of seed {seed}, at most {count}, for at most {minutes} minutes; IPOPT on the first {beside} of them; "
+    "{tracks} tracks moved by seed {moved}, the worst of these; a margin of 1 mm where a plan is aimed; processor time "
+    "of one thread",
     "CasADi",
     count=(64, "layouts"),
     seed=(0, "of the layouts"),
     beside=(16, "layouts that IPOPT solves, too"),
+    minutes=(30.0, "of processor time, after which no further layout is begun"),
+    tracks=(10, "races with moved gates"),
+    moved=(7, "the seed of these"),
 )
 
 if __name__ == "__main__":

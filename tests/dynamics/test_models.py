@@ -7,6 +7,7 @@ import torch
 from tests.reference import models as reference
 from torchgco import (
     Airframe,
+    Bicycle,
     FunctionDynamics,
     InputError,
     Planar,
@@ -20,13 +21,14 @@ from torchgco import (
 )
 from torchgco.lagrangian.expansion import linearise
 
-MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle]
+MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle, Bicycle]
 FIELDS = {
     Planar: reference.planar_field,
     QuadrotorPlanning: reference.quadrotor_planning_field,
     QuadrotorPlant: reference.plant_field,
     RotorTracking: reference.rotor_field,
     Unicycle: reference.unicycle_field,
+    Bicycle: reference.bicycle_field,
 }
 
 

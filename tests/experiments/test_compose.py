@@ -27,6 +27,7 @@ EXPERIMENTS = options_of("experiment")
 MISSIONS = ("mission", "mission_study", "mission_unknown")
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("floors", "yard"),
+    "car": ("parking",),
     "quadrotor": (
         "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "gates", "mazes", "rooms", "trefoils",
         "walls", "woods",
@@ -100,7 +101,7 @@ def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment:
 
 @pytest.mark.parametrize("scenario", MODEL)
 def test_a_model_that_cannot_fly_a_scenario_is_refused_with_one_that_can(scenario: str) -> None:
-    fitting = ("planar", "unicycle") if scenario == "floors" else (MODEL[scenario],)  # either rests at its positions
+    fitting = ("planar", "unicycle", "car") if scenario == "floors" else (MODEL[scenario],)  # each rests there
     wanted = " or ".join(f"model={model}" for model in fitting)
     for other in options_of("model"):
         if other not in fitting:

@@ -34,6 +34,7 @@ from torchgco.explaining.places import row_told
 from torchgco.maps import PointCloud
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
+from torchgco.plotting.silhouettes import balls_at
 from torchgco.plotting.world import world_of
 from torchgco.problem.horizons import for_solvers
 from torchgco.roadmap.scene import scene_of
@@ -232,6 +233,8 @@ def test_bad_bodies_are_told() -> None:
         (lambda: Body([[0.0, 0.0]], 0.1, "yaw"), "body.attitude: expected 'heading', 'quaternion', or a function"),
         (lambda: Body.covering([0, 0], [1, 0], [2, 2]), "body.upper"),
         (lambda: Body.covering([0, 0], [1, 1], [2, 0]), "body.cells"),
+        (lambda: Body([[0.0, 0.0]], 0.1, box=[[0, 0]]), "body.box: expected two corners"),
+        (lambda: Body([[0.0, 0.0]], 0.1, box=[[0, 0], [0, 1]]), "body.box: expected two finite corners (2,)"),
         (lambda: problem_of(2, kinds(2)["spheres"], FRAME), "body.offsets: expected 2-D offsets"),
         (lambda: problem_of(3, kinds(3)["map"], ROD), "body.offsets: expected 3-D offsets"),
         (
@@ -285,7 +288,7 @@ def test_pictures_show_the_balls() -> None:
     """They stand for the vehicle: obstacles aren't grown by a radius, and contacts are those of the balls."""
     problem, X, _ = problem_of(2, kinds(2)["boxes"])
     world = world_of(problem, 1)
-    centers, radii = world.balls(X[1].numpy())
+    centers, radii = balls_at(world.body, X[1].numpy())
     assert world.first.margin == 0.0 and radii.tolist() == ROD.radii.tolist() and centers.shape == (9, 3, 2)
     x = X[1, 4].numpy()
     np.testing.assert_allclose(centers[4, 2], x[:2] + turned(2, x) @ ROD.offsets[2].numpy(), atol=1e-12)

@@ -1,4 +1,4 @@
-"""The paper's four vehicle models and the unicycle for one state and one control, and three integrators.
+"""The paper's four vehicle models, the unicycle and the bicycle for one state and one control, and three integrators.
 
 A `field(x, u)` returns dx/dt; `euler`, `midpoint` and `rk4` turn a field into `step(x, u)`. SI units,
 controls of the rotor models in rpm, quaternions scalar first. Every field also accepts complex arrays, so
@@ -65,6 +65,13 @@ def unicycle_field(x, u):
     """x (4) = [px, py, heading, speed], u (2) = [acceleration, turn rate]; returns (4)."""
     _, _, heading, speed = x
     return np.array([speed * np.cos(heading), speed * np.sin(heading), u[1], u[0]])
+
+
+def bicycle_field(x, u):
+    """x (5) = [px, py, heading, speed, steering], u (2) = [acceleration, steering rate]; 2.6 m; returns (5)."""
+    _, _, heading, speed, steering = x
+    turning = speed * np.sin(steering) / np.cos(steering) / 2.6
+    return np.array([speed * np.cos(heading), speed * np.sin(heading), turning, u[0], u[1]])
 
 
 def thrust_acceleration(q, a, gravity):

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def vehicle(name: str):
-    scenario = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard"}.get(name, "planar_trap")
+    scenario = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard", "car": "parking"}.get(name, "planar_trap")
     return compose([f"model={name}", f"scenario={scenario}"]).vehicle
 
 
@@ -60,7 +60,7 @@ def test_the_built_in_models_are_those_of_the_configurations() -> None:
     assert set(BUILT_IN) == {path.stem for path in (ROOT / "conf" / "model").glob("*.yaml")}
     for name, form in BUILT_IN.items():
         assert form == (vehicle(name).dimension, vehicle(name).dynamics.n) and fitting(*form) == f"model={name}"
-    assert fitting(2, None) == "model=planar or model=unicycle" == fitting(2, 5)
+    assert fitting(2, None) == "model=planar or model=unicycle or model=car" == fitting(2, 7)
 
 
 @pytest.mark.parametrize(
@@ -85,11 +85,12 @@ def test_of_two_models_in_the_plane_the_one_that_fits_is_named(words: str, line:
 def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
     Layouts(centers=[[[0.0, 0.0]]], radii=[[0.1]]).save(tmp_path / "bare.npz")
     words = ["scenario=layouts", f"scenario.path={tmp_path / 'bare.npz'}"]
-    for name in ("planar", "unicycle"):
+    for name in ("planar", "unicycle", "car"):
         setup = compose([*words, f"model={name}"])
         assert setup.task().problem.n == BUILT_IN[name][1]
     with pytest.raises(
-        InputError, match="expected model=planar or model=unicycle, as bare is 2-D, or scenario=crossing or"
+        InputError,
+        match="expected model=planar or model=unicycle or model=car, as bare is 2-D, or scenario=crossing or",
     ):
         compose([*words, "model=quadrotor"])
 

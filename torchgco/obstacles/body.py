@@ -43,6 +43,7 @@ class Body:
         attitude: what turns the vehicle's frame into that of space. "heading": the model's state of this name, in the
             plane; "quaternion": the model's states qw, qx, qy, qz, in space, divided by their norm; or a function of
             states (..., n) that returns rotation matrices (..., d, d).
+        box: corners (lower, upper), (d,) each, of a box that the balls cover, m, which pictures show in their place.
 
     Raises:
         InputError: offsets or radii that aren't finite numbers of these shapes, no ball, a negative radius, another
@@ -53,6 +54,7 @@ class Body:
     offsets: Any
     radii: Any
     attitude: str | Callable[[Tensor], Tensor] = "heading"
+    box: Any = None
 
     def __post_init__(self) -> None:
         offsets = numbers(self.offsets, "body.offsets")
@@ -69,6 +71,8 @@ class Body:
         if self.attitude not in ("heading", "quaternion") and not callable(self.attitude):
             expected = "'heading', 'quaternion', or a function of states that returns rotation matrices"
             raise InputError("body.attitude", expected, shown(self.attitude))
+        if self.box is not None:
+            object.__setattr__(self, "box", _corners(self.box, offsets.shape[1]))
         object.__setattr__(self, "offsets", offsets.clone())
         object.__setattr__(self, "radii", radii.clone())
 
@@ -97,7 +101,7 @@ class Body:
             raise InputError("body.cells", f"{len(low)} whole numbers of at least 1", shown(cells))
         size = (high - low) / low.new_tensor(cells)
         each = [low[a] + size[a] * (torch.arange(n, dtype=low.dtype, device="cpu") + 0.5) for a, n in enumerate(cells)]
-        return cls(torch.cartesian_prod(*each), float(0.5 * size.norm()) / CONTACT_FACTOR, attitude)
+        return cls(torch.cartesian_prod(*each), float(0.5 * size.norm()) / CONTACT_FACTOR, attitude, (low, high))
 
     @property
     def inscribed_radius(self) -> float:
@@ -137,7 +141,7 @@ class Body:
         points = BodyPoints(offsets, attitude, dims.n, dims.position, inner.knots)
         own = replace(dims, n=d, position=slice(0, d))
         balls = tuple(with_radius(obstacles, float(radius)).bind(own) for radius in self.radii)
-        return BoundBody(balls, inner, points)
+        return BoundBody(balls, inner, points, self.box)
 
 
 def numbers(value: Any, field: str) -> Tensor:
@@ -145,6 +149,17 @@ def numbers(value: Any, field: str) -> Tensor:
     if isinstance(value, Tensor) and (value.is_floating_point() or value.dtype == torch.int64):
         value = value.to("cpu", torch.float64)
     return tensor(value, field, torch.empty(0, dtype=torch.float64, device="cpu"))
+
+
+def _corners(box: Any, d: int) -> tuple[tuple[float, ...], ...]:
+    """The corners of a box, as numbers."""
+    if not isinstance(box, Sequence) or len(box) != 2:
+        raise InputError("body.box", "two corners, (lower, upper)", shown(box))
+    low, high = (numbers(corner, "body.box") for corner in box)
+    shaped = low.shape == high.shape == (d,)
+    if not shaped or not bool((torch.isfinite(low) & torch.isfinite(high) & (high > low)).all()):
+        raise InputError("body.box", f"two finite corners ({d},), the second above the first", shown(box))
+    return tuple(low.tolist()), tuple(high.tolist())
 
 
 def directions(d: int) -> Tensor:
@@ -213,6 +228,7 @@ class BoundBody(Obstacles):
     balls: tuple[Obstacles, ...]  # the obstacles of each ball, whose states are its center alone
     inner: Obstacles  # those of the ball about the position that the body holds
     points: BodyPoints
+    box: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # corners of the box that the balls cover, m
 
     batched: ClassVar[tuple[str, ...]] = ("balls", "inner", "points")
 

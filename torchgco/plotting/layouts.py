@@ -17,11 +17,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
+from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid
 from torchgco.plotting.gates import draw_gates
 from torchgco.plotting.grid import grid, put_head
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
+from torchgco.plotting.silhouettes import draw_body, extent
 from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
 
 ROCK = "#CFC8BA"
@@ -44,6 +46,7 @@ class Flight:
     end: str  # "" at the goal, else INFEASIBLE or SHORT
     contacts: np.ndarray  # (C, d) m
     still: bool  # it stays at the start
+    states: np.ndarray  # (K, n) along the path
 
 
 def layout_grid(
@@ -52,6 +55,7 @@ def layout_grid(
     trials: pd.DataFrame,
     columns: int | None = None,
     rows: int = 3,
+    body: BoundBody | None = None,
 ) -> Figure:
     """Maps of the first columns x rows layouts with each solver's trajectories; in space also their side views.
 
@@ -62,6 +66,7 @@ def layout_grid(
             one under study, drawn over the others.
         trials: with columns scenario, model, layout, solver, feasible, reached.
         columns: default: 4 in the plane, 3 in space.
+        body: of the vehicle, in the place of vehicle_radius: the first solver's is drawn at some knots; None: a ball.
 
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
@@ -77,7 +82,7 @@ def layout_grid(
     for solver, states in paths.items():
         if states.ndim != 3 or len(states) != count:
             raise InputError(f"trajectories.{solver}", f"shape ({count}, N+1, n)", states.shape)
-    scene = scene_of(layouts)
+    scene = scene_of(layouts, body)
     columns = columns or (4 if scene.dimension == 2 else 3)
     count = min(count, columns * rows)
     flights = flights_of(scene, {solver: states[:count] for solver, states in paths.items()}, trials)
@@ -120,7 +125,7 @@ def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFra
             path = X[:, : scene.dimension]
             moved = np.linalg.norm(flown(path) - scene.start[i], axis=-1).max(initial=0.0)
             still = len(flown(path)) > 1 and bool(moved < STILL * _way(scene, i))
-            found[solver].append(Flight(path, end, contacts(scene, i, path), still))
+            found[solver].append(Flight(path, end, contacts(scene, i, path, X), still, X[: len(flown(path))]))
     return found
 
 
@@ -136,6 +141,8 @@ def views(scene: Scene, flights: Mapping[str, list[Flight]], count: int, columns
         shown = range(first, min(first + columns, count))
         here = [row[i] for row in flights.values() for i in shown]
         whole = [flown(flight.path) for flight in here if not flight.end]
+        if scene.body is not None:
+            whole += [extent(scene.body, flight.states) for flight in here if not flight.end]
         boxes.append(view(scene, shown, whole, [flown(flight.path) for flight in here if flight.end]))
     low, high = min(box[0, 0] for box in boxes), max(box[1, 0] for box in boxes)
     tallest = max(float(np.ptp(box, axis=0)[1:].max()) for box in boxes)
@@ -248,6 +255,9 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane:
             # The first is the thinnest: one of the same course shows at its sides.
             wide = 1.6 if level == len(flights) - 1 else 2.2
             ax.plot(*path[:, plane].T, linewidth=wide, linestyle=solver_dash(solver), **look)
+            if scene.body is not None and level == len(flights) - 1:
+                draw_body(ax, scene.body, flight.states, plane, colours[solver], 2.0)
+                drawn.add("body")
         away = leaving(np.transpose([ax.get_xlim(), ax.get_ylim()]), path[:, plane])
         ended = _ended(flight, away is not None)
         # A solver that returned nothing has its mark at the start.
@@ -342,6 +352,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str])
         "own": Patch(facecolor=ROCK, label=f"obstacle{where}"),
         "grown": Patch(label="plus the vehicle's radius", **outline),
         "near": Patch(linestyle=":", label=f"near {first}, missed by this cut", **outline),
+        "body": Patch(facecolor="none", edgecolor=INK, label=f"the body of {first}, at some knots"),
     }
     handles += [handle for kind, handle in shapes.items() if kind in drawn]
     handles += moving_handles(first, colours.get(first, EDGE)) if "moving" in drawn else []

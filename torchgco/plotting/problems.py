@@ -13,7 +13,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch
+from matplotlib.patches import Patch
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape
@@ -34,6 +34,7 @@ from torchgco.plotting.layouts import (
 )
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import flown, leaving, passes, view
+from torchgco.plotting.silhouettes import draw_body, extent
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.trajectory import LIMIT
 from torchgco.plotting.world import World, distances, world_of
@@ -46,7 +47,6 @@ PANELS_ACROSS = 4  # of histories
 PANEL = 1.45  # inches, the height of a history
 TALLEST_SCENE = 4.2  # inches, the height of a scene
 SHOWN_PROBLEMS = 6  # problems that are shown where none are named
-DRAWN = 9  # knots of a trajectory at which the balls of a body are drawn
 LIMIT_SPANS = 1.0  # spans of the data within which a limit is shown
 
 
@@ -164,10 +164,9 @@ class _Map:
         moving = [c for scene in world.scenes for course in courses for c in moving_corners(scene, 0, course.paths[0])]
         box = np.stack([np.min([box[0], *(c[0] for c in moving)], 0), np.max([box[1], *(c[1] for c in moving)], 0)])
         for course in courses:
-            centers, radii = world.balls(course.X[: len(flown(course.paths[0]))])
-            for i, radius in enumerate(radii if course.keeps else ()):
-                ends = centers[:, i].min(0) - radius, centers[:, i].max(0) + radius
-                box = np.stack([np.minimum(box[0], ends[0]), np.maximum(box[1], ends[1])])
+            if world.body is not None and course.keeps:
+                reached = extent(world.body, course.X[: len(flown(course.paths[0]))])
+                box = np.stack([np.minimum(box[0], reached.min(0)), np.maximum(box[1], reached.max(0))])
         gates = outlines(problem, courses[0].b)
         for corners, radius in gates:
             box = np.stack([np.minimum(box[0], corners.min(0) - radius), np.maximum(box[1], corners.max(0) + radius)])
@@ -237,21 +236,14 @@ class _Map:
                 ax.plot(*away[0][:, None], color=course.colour, zorder=6, clip_on=False, **marker("away", away[1]))
                 drawn.add("away")
         states = course.X[: len(flown(course.paths[0]))]
-        centers, radii = self.world.balls(states[_some(len(states))])
-        for place, radius in ((place, radius) for knot in centers for place, radius in zip(knot, radii, strict=True)):
-            ball: dict[str, Any] = {"facecolor": "none", "edgecolor": course.colour, "linewidth": 0.7, "alpha": 0.7}
-            ax.add_patch(Circle(tuple(place[list(plane)]), radius, zorder=2.8, **ball))
+        if self.world.body is not None:
+            draw_body(ax, self.world.body, states, plane, course.colour)
             drawn.add("body")
         touched = contacts(self.world.obstacles, flown(course.paths[0]), self.world.first.dt, states)
         if len(touched):
             ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **marker("contact"))
             drawn.add("contact")
         return drawn
-
-
-def _some(count: int) -> np.ndarray:
-    """Places of knots at which a body is drawn, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, DRAWN)).round().astype(int)) if count else np.zeros(0, int)
 
 
 def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:

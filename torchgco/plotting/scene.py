@@ -11,7 +11,9 @@ import numpy as np
 from torchgco.judging.contact import deepest, map_depth, pieces
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import Solid, bodies
+from torchgco.plotting.silhouettes import balls_at
 from torchgco.scenarios.stored_maps import map_of
 
 Arrays = Mapping[str, np.ndarray]
@@ -32,6 +34,7 @@ class Scene:
         dt: s, 0 where unknown: moving obstacles are then drawn where they start.
         ids: (L,) index of each layout in its file or generator.
         map: of all layouts, or one of each, or None.
+        body: the vehicle's, in the place of the margin; None: it is a ball.
         gates: (L, G, d+1) centres and radii of balls to be passed in this order, nan where absent; or None.
     """
 
@@ -44,6 +47,7 @@ class Scene:
     ids: np.ndarray
     map: DistanceField | None = None
     gates: np.ndarray | None = None
+    body: BoundBody | None = None
 
     @property
     def dimension(self) -> int:
@@ -62,8 +66,8 @@ class Pass(NamedTuple):
     distance: float  # m, the least between the surfaces at full radii
 
 
-def scene_of(layouts: Arrays) -> Scene:
-    """The scene of all layouts in the arrays of a layout file."""
+def scene_of(layouts: Arrays, body: BoundBody | None = None) -> Scene:
+    """The scene of all layouts in the arrays of a layout file, for a vehicle that is a ball or has a body."""
     count, d = len(layouts["radii"]), np.shape(layouts["centers"])[2]
 
     def point(name: str) -> np.ndarray:
@@ -74,12 +78,13 @@ def scene_of(layouts: Arrays) -> Scene:
         bodies=tuple(bodies(layouts, i) for i in range(count)),
         start=point("start"),
         goal=point("goal"),
-        margin=float(layouts.get("vehicle_radius", 0.0)),
+        margin=float(layouts.get("vehicle_radius", 0.0)) if body is None else 0.0,
         goal_radius=float(layouts.get("goal_radius", np.nan)),
         dt=float(layouts.get("dt", 0.0)),
         ids=np.asarray(layouts.get("layout", np.arange(count))),
         map=map_of(layouts),
         gates=gates_in(layouts),
+        body=body,
     )
 
 
@@ -119,21 +124,26 @@ def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
     return found
 
 
-def contacts(scene: Scene, i: int, path: np.ndarray) -> np.ndarray:
+def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
     """Places (C, d) where a path (N+1, d) touches obstacles or the map of layout i: the deepest of each contact.
 
     Bodies touch at CONTACT_FACTOR of their radii, and distances are measured as by the judge; between the knots the
-    path is straight.
+    path is straight, and the states (N+1, n) change evenly, by which a vehicle's body turns.
     """
     places, knots = pieces(flown(path))
     depth = np.full(max(len(places) - 1, 0), -np.inf)
     if len(places) == 0:
         return deepest(places, depth)
-    for body in scene.bodies[i]:
-        reach = CONTACT_FACTOR * (body.radius + scene.margin)
-        depth = np.maximum(depth, reach - body.along(places, scene.dt * knots, reach))
-    if (own := scene.map_of(i)) is not None:
-        depth = np.maximum(depth, map_depth(own, places, scene.margin))
+    balls = [(places, scene.margin)]
+    if scene.body is not None and states is not None:
+        centers, radii = balls_at(scene.body, pieces(states[: len(flown(path))])[0])
+        balls = [(centers[:, p], float(radius)) for p, radius in enumerate(radii)]
+    for ball, margin in balls:
+        for body in scene.bodies[i]:
+            reach = CONTACT_FACTOR * (body.radius + margin)
+            depth = np.maximum(depth, reach - body.along(ball, scene.dt * knots, reach))
+        if (own := scene.map_of(i)) is not None:
+            depth = np.maximum(depth, map_depth(own, ball, margin))
     return deepest(places, depth)
 
 

@@ -16,6 +16,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import PercentFormatter
 
 from torchgco.base.errors import InputError
+from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE
 from torchgco.plotting.layouts import draw_layout, ends, flights_of, views
 from torchgco.plotting.maps import unknown_handles
@@ -53,7 +54,12 @@ STUDY_MARGIN = 0.55  # inches at the left of a chart, whose labels are wider tha
 
 
 def study_figure(
-    layouts: Arrays, trajectories: Arrays, trials: pd.DataFrame, summary: pd.DataFrame, columns: Columns = "two"
+    layouts: Arrays,
+    trajectories: Arrays,
+    trials: pd.DataFrame,
+    summary: pd.DataFrame,
+    columns: Columns = "two",
+    body: BoundBody | None = None,
 ) -> Figure:
     """Maps of the first layouts, from above; rates with Wilson intervals; shares of layouts up to a cost.
 
@@ -61,6 +67,7 @@ def study_figure(
         layouts, trajectories, trials: of one scenario and model, as for `layouts.layout_grid`; with costs, too.
         summary: as `experiments.statistics.summarise` returns it.
         columns: of a paper in two columns that the figure spans.
+        body: of the vehicle, as for `layouts.layout_grid`.
 
     A layout counts for the costs of a solver where it was reached; a line ends at the share of these.
 
@@ -71,7 +78,7 @@ def study_figure(
         raise InputError("columns", "one or two", columns)
     if len(summary[["scenario", "model"]].drop_duplicates()) != 1:
         raise InputError("summary", "one scenario and model", summary[["scenario", "model"]].drop_duplicates().values)
-    form, scene = PRINTS[columns], scene_of(layouts)
+    form, scene = PRINTS[columns], scene_of(layouts, body)
     count = min(len(layouts["radii"]), 2 * form.maps)
     flights = flights_of(scene, {name: np.asarray(X[:count]) for name, X in trajectories.items()}, trials)
     boxes = views(scene, flights, count, min(form.maps, count))

@@ -15,6 +15,7 @@ from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.plotting.bodies import Ball, Box, Plane, Solid
 from torchgco.plotting.scene import Scene
+from torchgco.plotting.silhouettes import body_of
 from torchgco.problem.problem import Problem
 
 GRID_POINTS = 160  # points along x at which the distance from other kinds of obstacles is looked at
@@ -28,28 +29,17 @@ class World:
         scenes: at least one; all have the same start and goal.
         others: bound obstacles that are neither spheres nor boxes nor a map, of this problem alone.
         obstacles: all of them, of this problem alone.
+        body: the vehicle's; None where it is a ball.
     """
 
     scenes: tuple[Scene, ...]
     others: tuple[Obstacles, ...]
     obstacles: tuple[Obstacles, ...]
+    body: BoundBody | None = None
 
     @property
     def first(self) -> Scene:
         return self.scenes[0]
-
-    @property
-    def body(self) -> BoundBody | None:
-        """Obstacles whose vehicle is a body, the first ones; None where there are none."""
-        return next((part for part in self.obstacles if isinstance(part, BoundBody)), None)
-
-    def balls(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Centers (K, P, d) and radii (P,) of the vehicle's balls in states X (K, n), m; none without a body."""
-        if (body := self.body) is None:
-            return np.zeros((len(X), 0, self.first.dimension)), np.zeros(0)
-        offsets = body.points.offsets
-        centers = body.points.at(torch.as_tensor(X, dtype=offsets.dtype, device=offsets.device).unsqueeze(0))[0]
-        return centers.cpu().numpy(), np.array([float(ball.vehicle_radius[0]) for ball in body.balls])
 
 
 def world_of(problem: Problem, b: int) -> World:
@@ -81,7 +71,7 @@ def world_of(problem: Problem, b: int) -> World:
         for vehicle, held in (by_radius or none).items()
     ]
     scenes += [Scene(((),), start, goal, vehicle, radius, dt, np.array([b]), field) for vehicle, field in maps]
-    return World(tuple(scenes), tuple(others), tuple(one.obstacles))
+    return World(tuple(scenes), tuple(others), tuple(one.obstacles), body_of(one))
 
 
 def _bodies(part: BoundSpheres | BoundBoxes | BoundOscillatingBoxes) -> list[Solid]:

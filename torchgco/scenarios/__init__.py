@@ -9,6 +9,7 @@ from torchgco.scenarios.gates import GateForest, Race
 from torchgco.scenarios.layouts import Layouts, concatenate
 from torchgco.scenarios.maps import MapFile
 from torchgco.scenarios.mazes import Mazes
+from torchgco.scenarios.parking import Parking
 from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
 from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
 from torchgco.scenarios.rooms import Rooms
@@ -28,6 +29,7 @@ __all__ = [
     "Layouts",
     "MapFile",
     "Mazes",
+    "Parking",
     "PlanarRandom",
     "PlanarTrap",
     "Race",

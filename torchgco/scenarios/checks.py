@@ -36,6 +36,7 @@ Number = Annotated[int, Within(0, MOST_OBSTACLES)]
 Density = Annotated[float, Within(0, TOO_LARGE)]
 Range = Annotated[tuple[Coordinate, Coordinate], INCREASING]
 Sizes = Annotated[tuple[Size, Size], INCREASING]
+Sizes2 = tuple[Length, Length]
 Speeds = Annotated[tuple[Speed, Speed], INCREASING]
 Point2 = tuple[Coordinate, Coordinate]
 Point3 = tuple[Coordinate, Coordinate, Coordinate]
@@ -275,6 +276,12 @@ def free_time(value: Any) -> np.ndarray | None:
     if not 0 < least <= most or weight < 0:
         raise InputError("layouts.free_time", "0 < least <= most, and a weight of at least 0", given.tolist())
     return given
+
+
+def required(value: Any) -> bool | None:
+    """Whether the goal is a constraint, as a file holds it: also an array without axes."""
+    held = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    return None if held is None else check_value(held, bool, "layouts.goal_required")
 
 
 def control_bounds(lower: Any, upper: Any) -> tuple[np.ndarray | None, np.ndarray | None]:

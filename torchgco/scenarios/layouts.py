@@ -31,6 +31,7 @@ BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 SINES = ("box_amplitudes", "box_rates", "box_phases")
 GATES = ("gate_centers", "gate_radii")
 TIME = "free_time"
+BINDS = "goal_required"
 NAMED_ARRAYS = (
     *REQUIRED,
     "velocities",
@@ -42,6 +43,7 @@ NAMED_ARRAYS = (
     *checks.SCALARS,
     *CONTROLS,
     TIME,
+    BINDS,
     "best_cost",
 )
 IDS = "layout"
@@ -74,6 +76,7 @@ class Layouts:
             last of a layout with fewer; or None. They divide the stages into legs of about as many.
         free_time: (3,) least and most length of a stage, as multiples of dt, and the cost of a second: the duration is
             free, of each leg by itself, and time is the cost; or None.
+        goal_required: whether the goal is a constraint also where the time is given; None: where it is free alone.
         map: the distance field of a map that all layouts share, or of L grids of the same size, one for each; or None.
             In a file: the arrays `map_occupied`, `map_origin` and `map_resolution`, or `map_points` and `map_radius`,
             and `map_unknown`.
@@ -105,6 +108,7 @@ class Layouts:
     gate_centers: np.ndarray | None = None
     gate_radii: np.ndarray | None = None
     free_time: np.ndarray | None = None
+    goal_required: bool | None = None
     map: DistanceField | None = None
     name: str = "layouts"
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
@@ -126,6 +130,7 @@ class Layouts:
         for name, value in zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True):
             put(name, value)
         put(TIME, checks.free_time(self.free_time))
+        put(BINDS, checks.required(self.goal_required))
         for name in ("start", "goal"):
             put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
         lengths = {state.shape[1] for state in (self.start, self.goal) if state is not None} - {centers.shape[2]}
@@ -287,7 +292,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
     if not parts:
         raise InputError("layouts", "at least one part to concatenate", "none")
     _same("dimension", [part.dimension for part in parts])
-    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SHARED, *CONTROLS, TIME)}
+    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SHARED, *CONTROLS, TIME, BINDS)}
     width = max(part.radii.shape[1] for part in parts)
     parts = [part.pad(width) for part in parts]
     joined = ("start", "goal", "velocities", "best_cost")

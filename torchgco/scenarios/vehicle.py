@@ -21,6 +21,7 @@ from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.maps.field import Field
+from torchgco.obstacles.body import Body
 from torchgco.obstacles.boxes import Boxes
 from torchgco.obstacles.oscillating import OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres
@@ -34,7 +35,7 @@ STATE_ARRAYS = ("state_weight", "terminal_weight", "start", "goal")  # fields wi
 CONTROL_LIMITS = ("control_lower", "control_upper")
 CONTROL_ARRAYS = ("control_weight", "control_reference", *CONTROL_LIMITS)
 # The models of conf/model: dimension of space and number of states.
-BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "quadrotor": (3, 14), "rotors": (3, 13)}
+BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "car": (2, 5), "quadrotor": (3, 14), "rotors": (3, 13)}
 # Share of the control weights that is left, per second, where time is the cost: without any, controls that time doesn't
 # ask for would be anything.
 BESIDE_TIME = 1e-4
@@ -68,8 +69,12 @@ class Vehicle:
         stages: N.
         state_lower, state_upper: (n,), bounds on the states at all knots but the first; None for a state, or for all:
             no bound.
-        arrives: which states must be those of the goal at the end, where layouts leave the time free; None: the
-            position, within the goal's radius.
+        arrives: which states must be those of the goal at the end, where layouts require the goal or leave the time
+            free; None: the position, within the goal's radius.
+        footprint: corners [lower, upper] of the box that the vehicle fills, (d,) each from its position along its own
+            axes, m: a `Body` of balls that cover it takes the place of the radius, of the layouts' too; None: the
+            vehicle is a ball.
+        cells: of a footprint, d whole numbers: how many balls there are along each axis, as of `Body.covering`.
 
     Raises:
         InputError: a field of another kind, length or out of its range; on `task`: layouts of another dimension, with
@@ -92,6 +97,8 @@ class Vehicle:
     state_lower: Sequence[Extended | None] | None = None
     state_upper: Sequence[Extended | None] | None = None
     arrives: Sequence[Natural] | None = None
+    footprint: Sequence[Sequence[float]] | None = None
+    cells: Sequence[Count] | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "vehicle")
@@ -101,6 +108,9 @@ class Vehicle:
                 raise InputError(f"vehicle.{name}", f"{n} numbers", repr(getattr(self, name)))
         if self.arrives is not None and not all(i < n for i in self.arrives):
             raise InputError("vehicle.arrives", f"some of the states 0..{n - 1}", repr(self.arrives))
+        if (self.footprint is None) != (self.cells is None):
+            raise InputError("vehicle.cells", "numbers for a footprint, and none without one", repr(self.cells))
+        _ = self.body
         for names, length in ((STATE_ARRAYS, n), (CONTROL_ARRAYS, m)):
             for name in names:
                 if len(getattr(self, name)) != length:
@@ -148,6 +158,20 @@ class Vehicle:
         position = self.dynamics.position
         return 0 if position is None else position.stop - position.start
 
+    @property
+    def body(self) -> Body | None:
+        """The balls that cover the footprint, turned by the model's heading or quaternion; None without one."""
+        if self.footprint is None or self.cells is None:
+            return None
+        if len(self.footprint) != 2:
+            raise InputError("vehicle.footprint", "two corners of a box", repr(self.footprint))
+        attitude = "heading" if self.dimension == 2 else "quaternion"
+        try:
+            return Body.covering(self.footprint[0], self.footprint[1], self.cells, attitude)
+        except InputError as error:
+            field = "vehicle.cells" if error.field == "body.cells" else "vehicle.footprint"
+            raise InputError(field, error.expected, error.got) from None
+
     def limits(self, name: Literal["control_lower", "control_upper"]) -> list[float]:
         """The bounds (m,), with those of the dynamics where the vehicle gives none.
 
@@ -189,11 +213,12 @@ class Vehicle:
         stages = _given(layouts.stages, self.stages)
         longest = int(np.max(stages))
         horizon = torch.as_tensor(stages, device=device) if np.ndim(stages) else None
+        radius = self.body or _given(layouts.vehicle_radius, self.radius)
         constraints: list[Constraint] = [
             Spheres(
                 tensor(layouts.centers),
                 tensor(layouts.radii),
-                _given(layouts.vehicle_radius, self.radius),
+                radius,
                 None if layouts.velocities is None else tensor(layouts.velocities),
             ),
             ControlBounds(
@@ -205,12 +230,11 @@ class Vehicle:
             turns, radii = (
                 None if value is None else tensor(value) for value in (layouts.box_rotations, layouts.box_radii)
             )
-            radius = _given(layouts.vehicle_radius, self.radius)
             boxes = Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, radii)
             sines = [getattr(layouts, name) for name in SINES]
             constraints.append(boxes if sines[0] is None else OscillatingBoxes(boxes, *map(tensor, sines)))
         if layouts.map is not None:
-            constraints.append(Field(layouts.map, _given(layouts.vehicle_radius, self.radius)))
+            constraints.append(Field(layouts.map, radius))
         constraints += self._state_bounds
         gates, legs = gates_of(layouts, longest)
         constraints += [] if gates is None else [replace(gates, centers=tensor(gates.centers))]
@@ -223,7 +247,8 @@ class Vehicle:
         )  # fmt: skip
         goal_radius = _given(layouts.goal_radius, self.goal_radius)
         center = tensor(goal)[:, dynamics.position]
-        end = Goal(center, goal_radius) if time is None else self._required(tensor(goal), center, goal_radius)
+        binds = time is not None or layouts.goal_required is True
+        end = self._required(tensor(goal), center, goal_radius) if binds else Goal(center, goal_radius)
         problem = Problem(dynamics, cost, constraints, tensor(start), longest, end, horizon, time=time)
         U0 = tensor(list(self.control_reference)).expand(layouts.count, longest, -1).contiguous()
         return Task(problem, U0, center, goal_radius, layouts)
@@ -241,7 +266,7 @@ class Vehicle:
         return [StateBounds(sides[0], sides[1])]
 
     def _required(self, goal: Tensor, center: Tensor, radius: float) -> Goal:
-        """The goal that has to be met, at states (B, n), where time is the cost."""
+        """The goal that has to be met, at states (B, n)."""
         if self.arrives is None:
             return Goal(center, radius, required=True)
         free = torch.ones_like(goal[0], dtype=torch.bool)

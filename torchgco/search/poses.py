@@ -154,6 +154,8 @@ def clear_at(problem: Problem, heading: int) -> Callable[[Array], NDArray[np.boo
 
 def _clear(part: Obstacles, states: Tensor) -> Tensor:
     """Whether the vehicle in states (1, K, n) touches none of some obstacles, (K,)."""
+    if part.margins.shape[-1] == 0:
+        return torch.ones_like(states[0, :, 0], dtype=torch.bool)
     inner = _room(part.inscribed, states[..., part.position])
     good = inner >= 0.0
     if not isinstance(part, BoundBody):

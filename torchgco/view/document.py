@@ -18,7 +18,7 @@ from torchgco.view.flights import Flight
 from torchgco.view.outlines import outlines_of
 from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
-from torchgco.view.vehicles import Look
+from torchgco.view.vehicles import Look, Shape
 
 SHARED_FROM = 500  # obstacles of one kind from which on layouts with the same ones share them
 
@@ -33,10 +33,11 @@ class Document:
         dimension: of space, 2 or 3.
         dt: between two knots.
         look: of the vehicle.
-        radius: of the vehicle, 0 where there are no obstacles.
+        radius: of the vehicle, 0 where there are no obstacles; of a body, its reach.
         solvers: their names, the one under study first.
         constraints: names of the problem's constraints, in their order.
         mission: whether the trajectories are flights in closed loop.
+        shape: of a vehicle with a body; None: a ball of the radius.
     """
 
     title: str
@@ -48,6 +49,7 @@ class Document:
     solvers: Sequence[str]
     constraints: Sequence[str] = ()
     mission: bool = False
+    shape: Shape | None = None
     notes: list[str] = field(default_factory=list)
     labels: list[dict[str, Any]] = field(default_factory=list)
     parts: list[str] = field(default_factory=list)
@@ -101,7 +103,7 @@ class Document:
 
     def _shapes(self, obstacles: Sequence[Obstacles], b: int) -> list[Any]:
         found = []
-        for part in obstacles:
+        for part in (part.inscribed for part in obstacles):  # those of a body are the obstacles of each of its balls
             shapes = shapes_of(part, b)
             if shapes is None:
                 note = f"not drawn: {type(part).__name__}"
@@ -120,13 +122,15 @@ class Document:
             "body": self.look.body, "radius": number(self.radius), "mission": self.mission, "version": VERSION,
             "solvers": [{"name": name, "colour": colours[name]} for name in self.solvers],
             "constraints": list(self.constraints), "layouts": self.labels, "notes": self.notes,
+            "shape": None if self.shape is None else self.shape.packed(),
         }  # fmt: skip
         return Packing().sealed(text)
 
 
 def _extent(problem: Problem, b: int) -> list[list[float | None]] | None:
     """Lower and upper corner of the maps of a problem, m; None without one."""
-    fields = [(part.field, int(part.which[b])) for part in problem.obstacles if isinstance(part, BoundField)]
+    parts = (part.inscribed for part in problem.obstacles)
+    fields = [(part.field, int(part.which[b])) for part in parts if isinstance(part, BoundField)]
     if not fields:
         return None
     low, high = [field.origin[g] for field, g in fields], [field.upper[g] for field, g in fields]

@@ -12,10 +12,11 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import Obstacles
+from torchgco.plotting.silhouettes import body_of
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST_HALF, Packing, number
 from torchgco.view.sensed import Sensed
-from torchgco.view.vehicles import Look
+from torchgco.view.vehicles import Look, turned
 
 Rows = list[tuple[str, str]]
 
@@ -140,7 +141,7 @@ def flights_of(
         touching: (B,) bool: where contact is looked for.
     """
     knots, found, dt = violated(problem, X, U, admitted), [], getattr(problem.dynamics, "dt", None) or 1.0
-    states = X.detach().cpu().double().numpy()
+    states, body = X.detach().cpu().double().numpy(), body_of(problem)
     for b in range(problem.B):
         kept = whole(states[b])
         path, at = kept[:, problem.position], slice(0, len(kept))
@@ -150,5 +151,6 @@ def flights_of(
             part = problem.take(torch.tensor([b], device=X.device))
             places = contacts(part.obstacles, path, dt, kept)
         told = [*rows[b], *worst_row(problem, bad, which)]
-        found.append(Flight(solver, path, look.attitude(kept), results[b], told, bad, which, places))
+        attitude = look.attitude(kept) if body is None else turned(body, kept)
+        found.append(Flight(solver, path, attitude, results[b], told, bad, which, places))
     return found

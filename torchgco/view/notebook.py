@@ -8,7 +8,6 @@ from torchgco.base.errors import InputError
 from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
 from torchgco.obstacles.base import ADMITTED
-from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
@@ -16,7 +15,7 @@ from torchgco.view.document import Document
 from torchgco.view.flights import Rows, constraint_name, flights_of
 from torchgco.view.page import page
 from torchgco.view.searches import search_of
-from torchgco.view.vehicles import look_of
+from torchgco.view.vehicles import look_of, shape_of
 
 
 def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPage:
@@ -33,14 +32,15 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         raise InputError("dynamics.position", "a position in the plane or in space", f"{dimension} states")
     if problem.B == 0:
         raise InputError("problem", "at least one problem to show", "an empty batch")
-    check_no_body(problem, "vehicle_radius", "a number for the page, which draws a ball: torchgco.plot draws bodies")
+    shape = shape_of(problem)
     look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
     flights = flights_of(problem, look, solution.X, solution.U, name, results, rows, ADMITTED, touching)
     t_of, dt = _times(problem, solution)
     N, radius = problem.N, max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
     document = Document(
         title="torchgco", about=f"{problem.B} problems, {problem.N} stages" if problem.B > 1 else f"{problem.N} stages",
-        dimension=dimension, dt=dt, look=look, radius=radius, solvers=[name],
+        dimension=dimension, dt=dt, look=look, solvers=[name],
+        radius=radius if shape is None else shape.reach, shape=shape,
         constraints=[constraint_name(part) for part in problem.constraints],
     )  # fmt: skip
     for b, flight in enumerate(flights):

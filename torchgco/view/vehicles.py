@@ -1,19 +1,24 @@
 """Which body stands for a vehicle on the page, and which of its states turn it.
 
 `VEHICLES[Boat] = Look("car", heading=2)` shows a model of your own. A model that isn't listed is a dart: it turns with
-states that are called `qw`, `qx`, `qy`, `qz` or `heading`, else it points to where it goes.
+states that are called `qw`, `qx`, `qy`, `qz` or `heading`, else it points to where it goes. A vehicle with a `Body` is
+drawn as that, and turned by it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from torchgco.dynamics import Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
+from torchgco.dynamics import Bicycle, Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
 from torchgco.dynamics.names import states_of
 from torchgco.obstacles.attitude import QUATERNION
+from torchgco.obstacles.body import BoundBody
+from torchgco.plotting.silhouettes import body_of, rotations
+from torchgco.problem.problem import Problem
+from torchgco.view.shapes import NOT_TURNED, turns
 
 HEADING = "heading"
 NO_WAY = 1e-9  # m: a way that is shorter has no direction
@@ -52,6 +57,7 @@ VEHICLES: dict[type[Dynamics], Look] = {
     QuadrotorPlant: Look("quadrotor", quaternion=slice(6, 10)),
     QuadrotorThrusts: Look("quadrotor", quaternion=slice(6, 10)),
     Unicycle: Look("car", heading=2),
+    Bicycle: Look("car", heading=2),
 }
 
 
@@ -80,3 +86,45 @@ def _pointing(p: np.ndarray) -> np.ndarray:
     yaw, pitch = 0.5 * np.arctan2(y, x), -0.5 * np.arctan2(z, np.hypot(x, y))
     turn = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     return np.stack((turn[0] * turn[2], -turn[1] * turn[3], turn[0] * turn[3], turn[1] * turn[2]), axis=-1)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What stands for a vehicle with a `Body`: the box that its balls cover, else the balls.
+
+    Args:
+        balls: (P, 4) centers in the vehicle's frame, z = 0 in the plane, and radii, m.
+        box: lower and upper corner there, (2, d), m; None: none is known.
+        reach: the radius of the ball about the position that holds all, m.
+    """
+
+    balls: np.ndarray
+    box: np.ndarray | None
+    reach: float
+
+    def packed(self) -> dict[str, Any]:
+        """As the page reads it."""
+        box = None if self.box is None else np.round(self.box, 4).tolist()
+        return {"balls": np.round(self.balls, 4).tolist(), "box": box}
+
+
+def shape_of(problem: Problem) -> Shape | None:
+    """The body of a problem's vehicle; None where it is a ball."""
+    if (body := body_of(problem)) is None:
+        return None
+    offsets, radii = body.points.offsets[0].cpu().double().numpy(), body.radii[0].cpu().double().numpy()
+    balls = np.column_stack((offsets, np.zeros((len(offsets), 3 - offsets.shape[1])), radii))
+    box = None if body.box is None else np.array(body.box)
+    return Shape(balls, box, float((np.linalg.norm(offsets, axis=1) + radii).max()))
+
+
+def turned(body: BoundBody, X: np.ndarray) -> np.ndarray:
+    """Quaternions (K, 4) by which a body is turned in states X (K, n)."""
+    axes = rotations(body, X).swapaxes(-1, -2)
+    found = turns(axes)
+    if found is None:
+        return np.tile(np.array(NOT_TURNED), (len(axes), 1))
+    if found.ndim == 2:
+        return found
+    zero = np.zeros(len(found))
+    return np.stack((np.cos(0.5 * found), zero, zero, np.sin(0.5 * found)), axis=-1)

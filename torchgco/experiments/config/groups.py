@@ -36,6 +36,7 @@ from torchgco.scenarios import (
     LayoutFile,
     MapFile,
     Mazes,
+    Parking,
     PlanarRandom,
     PlanarTrap,
     Race,
@@ -51,7 +52,7 @@ from torchgco.search import Passes
 
 FAMILIES: tuple[type[Any], ...] = (
     Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
-    Floors, GateForest, Race,
+    Floors, GateForest, Race, Parking,
 )  # fmt: skip
 ANYWHERE = {2: "unicycle", 3: "quadrotor"}  # the model for layouts that give positions alone
 BY_DIMENSION = "torchgco.by_dimension"

@@ -31,7 +31,7 @@ from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
 from torchgco.view.document import Document
 from torchgco.view.flights import constraint_name
-from torchgco.view.vehicles import Look
+from torchgco.view.vehicles import Look, shape_of
 
 MEASURED_AT_ONCE = 64  # layouts whose trajectories are measured at once
 
@@ -126,12 +126,14 @@ class Study:
 def document_of(study: Study, problem: Problem, look: Look) -> Document:
     """The page of a study in the making, from the problems of some of its layouts."""
     solvers, at = list(study.manifest.solvers), problem.position
+    shape = shape_of(problem)
     radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=study.vehicle.radius)
     count = f"{study.layouts.count} layouts" if study.layouts.count > 1 else "1 layout"
     return Document(
         title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
         about=f"{count}, {study.vehicle.name}, seed {study.seed}, {problem.N} stages of "
         f"{problem.dynamics.dt:g} s",
-        dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=solvers,
+        dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, solvers=solvers,
+        radius=radius if shape is None else shape.reach, shape=shape,
         constraints=[constraint_name(part) for part in problem.constraints], mission=study.missions,
     )  # fmt: skip

@@ -28,6 +28,7 @@ from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
+from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
@@ -47,6 +48,7 @@ def write_report(
     trajectories: Callable[[Arrays], Arrays] | None = None,
     figures: bool = True,
     printed: Columns | None = None,
+    body: BoundBody | None = None,
 ) -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
@@ -55,11 +57,12 @@ def write_report(
             the arrays of `solutions.npz`; None: no such picture.
         figures: False: tables alone.
         printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
+        body: of the vehicle, which these pictures draw; None: a ball.
 
     Raises:
         InputError: the table is missing, unreadable or empty, or the trajectories don't fit the layouts.
     """
-    return _written(folder, read_trials(folder / TRIALS), trajectories, figures=figures, printed=printed)
+    return _written(folder, read_trials(folder / TRIALS), trajectories, figures=figures, printed=printed, body=body)
 
 
 def _written(
@@ -69,6 +72,7 @@ def _written(
     form: str = "table",
     figures: bool = True,
     printed: Columns | None = None,
+    body: BoundBody | None = None,
 ) -> str:
     parts = parts_of(trials)
     write_tables(folder, parts)
@@ -78,10 +82,10 @@ def _written(
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
             states = trajectories(solutions)
         if figures:
-            held["layouts"] = lambda: layout_grid(layouts, states, trials)
+            held["layouts"] = lambda: layout_grid(layouts, states, trials, body=body)
         if printed:
             for form in ("png", "pdf"):
-                held[f"study.{form}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed)
+                held[f"study.{form}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed, body)
     draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
     return format_report(parts, form)
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
-from torchgco.scenarios.layouts import BOXES, GATES, SINES, TIME
+from torchgco.scenarios.layouts import BINDS, BOXES, GATES, SINES, TIME
 from torchgco.scenarios.stored_maps import map_arrays
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
@@ -180,6 +180,8 @@ def layout_digests(
             own |= {name: getattr(layouts, name)[i][here] for name in GATES}
         if layouts.free_time is not None:
             own[TIME] = layouts.free_time
+        if layouts.goal_required is not None:
+            own[BINDS] = layouts.goal_required
         if isinstance(layouts.stages, np.ndarray):
             own["stages"] = int(layouts.stages[i])
         if alone and layouts.map is not None:

@@ -65,7 +65,8 @@ export class Flights {
       line.castShadow = true;
       group.add(line, ghost);
     }
-    const body = vehicle(this.head.body, this.head.radius || 0.012 * this.space.size, colour, this.space.flat);
+    const { radius, shape } = this.head;
+    const body = vehicle(this.head.body, radius || 0.012 * this.space.size, colour, this.space.flat, shape);
     body.add(dot(colour));
     group.add(body, ...this.marks(flight, points));
     const parts = flight.plan ? new MissionParts(flight, colour, this.space) : null;

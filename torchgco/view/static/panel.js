@@ -52,6 +52,7 @@ export function build(head, act) {
   for (const name of ["follow", "through", "unknown", "grown", "searched", ...PARTS]) {
     by(name).addEventListener("change", (event) => act.toggle(name, event.target.checked));
   }
+  by("grown").closest("label").hidden = Boolean(head.shape); // a body has no radius by which obstacles could grow
   by("play").addEventListener("click", act.play);
   by("time").addEventListener("input", (event) => act.time(Number(event.target.value)));
   by("speed").replaceChildren(...SPEEDS.map((speed) => make("option", { text: `${speed}×`, value: speed, selected: speed === 1 })));

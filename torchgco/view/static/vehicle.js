@@ -1,16 +1,40 @@
 // The body of a vehicle, and the ball or disc of its radius.
 import * as THREE from "./three.module.min.js";
 
-/** A vehicle of a radius, m, nose along x, z up; `kind` is "ball", "car", "quadrotor" or "dart". */
-export function vehicle(kind, radius, colour, flat) {
+/** A vehicle of a radius, m, nose along x, z up; `kind` is "ball", "car", "quadrotor" or "dart". One with a body has its shape. */
+export function vehicle(kind, radius, colour, flat, shape) {
   const group = new THREE.Group();
   const paint = new THREE.MeshLambertMaterial({ color: colour });
   const dark = new THREE.MeshLambertMaterial({ color: 0x30343a });
+  if (shape) {
+    group.add(...solids(shape, paint, dark, flat), ...shape.balls.map((ball) => reach(ball[3], colour, flat, ball)));
+    return group;
+  }
   const built = { ball, car, quadrotor, dart }[kind](radius, paint, dark, flat);
   built.forEach((mesh) => (mesh.castShadow = true));
   group.add(...built);
   if (kind !== "ball") group.add(reach(radius, colour, flat));
   return group;
+}
+
+/** The box that a body's balls cover, with a dark mark ahead; without one the balls are all there is. */
+function solids({ balls, box }, paint, dark, flat) {
+  if (!box) return balls.map(([x, y, z, radius]) => placed(ball(0.98 * radius, paint, dark, flat)[0], x, y, z));
+  const [low, high] = box;
+  const [long, wide] = [high[0] - low[0], high[1] - low[1]];
+  const tall = flat ? 0.3 * wide : high[2] - low[2];
+  const middle = [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), flat ? 0 : 0.5 * (low[2] + high[2])];
+  const mark = [low[0] + 0.72 * long, middle[1], middle[2] + 0.03 * tall];
+  const made = [mesh(new THREE.BoxGeometry(long, wide, tall), paint, middle)];
+  made.push(mesh(new THREE.BoxGeometry(0.12 * long, 0.8 * wide, tall), dark, mark));
+  made.forEach((one) => (one.castShadow = true));
+  return made;
+}
+
+function placed(one, x, y, z) {
+  one.position.set(x, y, z);
+  one.castShadow = true;
+  return one;
 }
 
 function mesh(geometry, material, place = [0, 0, 0]) {
@@ -66,8 +90,8 @@ function quadrotor(radius, paint, dark) {
 }
 
 /** What obstacles count: a ball, in the plane a disc. */
-function reach(radius, colour, flat) {
+function reach(radius, colour, flat, place = [0, 0, 0]) {
   const look = { color: colour, transparent: true, opacity: 0.16, depthWrite: false };
   const shape = flat ? new THREE.CircleGeometry(radius, 40) : new THREE.SphereGeometry(radius, 24, 16);
-  return mesh(shape, new THREE.MeshLambertMaterial(look));
+  return mesh(shape, new THREE.MeshLambertMaterial(look), place.slice(0, 3));
 }
