@@ -33,7 +33,5 @@ class EachPlant(RotorPlant):
         return torch.from_numpy(after).to(x)
 
     @abstractmethod
-    def one(
-        self, x: np.ndarray, u: np.ndarray, force: np.ndarray, deviation: tuple[float, float, float]
-    ) -> np.ndarray:
+    def one(self, x: np.ndarray, u: np.ndarray, force: np.ndarray, deviation: tuple[float, float, float]) -> np.ndarray:
         """A state (17,) one step later; deviation is (mass_error, thrust_error, drag) of this vehicle."""

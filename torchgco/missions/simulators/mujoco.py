@@ -81,7 +81,10 @@ class _Quadrotor:
         if (model.nq, model.nv, model.nu) != (7, 6, 4) or model.na not in (0, 4):
             got = f"{model.nq} coordinates, {model.nu} actuators with {model.na} states"
             raise InputError("plant.model", "one free body (7 coordinates), and 4 actuators with 0 or 4 states", got)
-        if model.na and not np.isin(model.actuator_dyntype, (lib.mjtDyn.mjDYN_FILTER, lib.mjtDyn.mjDYN_FILTEREXACT)).all():
+        if (
+            model.na
+            and not np.isin(model.actuator_dyntype, (lib.mjtDyn.mjDYN_FILTER, lib.mjtDyn.mjDYN_FILTEREXACT)).all()
+        ):
             raise InputError("plant.model", "actuators with dyntype none, filter or filterexact", "another")
         if np.any(model.actuator_biastype != lib.mjtBias.mjBIAS_NONE):
             raise InputError("plant.model", "actuators without bias", "one with")
@@ -145,7 +148,9 @@ def _rotors(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
     forces, torques = wrenches[:, :3], wrenches[:, 3:]
     lift = forces[:, 2]
     if not bool((lift > 0).all()) or bool((np.abs(forces[:, :2]) > SIDEWAYS * lift[:, None]).any()):
-        raise InputError("plant.model", "actuators that push along the body's z axis", f"forces {forces.round(6).tolist()}")
+        raise InputError(
+            "plant.model", "actuators that push along the body's z axis", f"forces {forces.round(6).tolist()}"
+        )
     x, y, yaw = -torques[:, 1] / lift, torques[:, 0] / lift, torques[:, 2] / lift
     found = [np.flatnonzero((x * a > 0) & (y * b > 0)) for a, b in CORNERS]
     if any(len(one) != 1 for one in found):
@@ -156,7 +161,9 @@ def _rotors(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
     turned = bool(signs[0] < 0)
     if not np.array_equal(signs, np.array((1, -1, 1, -1)) * (-1 if turned else 1)):
         wanted = "opposite rotors that turn the same way, and neighbours the other way"
-        raise InputError("plant.model", wanted, f"yaw torques {yaw[order].round(6).tolist()} m, clockwise from front left")
+        raise InputError(
+            "plant.model", wanted, f"yaw torques {yaw[order].round(6).tolist()} m, clockwise from front left"
+        )
     if turned:  # the rear left one is at the front left of the turned axes
         order = np.roll(order, 1)
     return order, lift[order], turned

@@ -61,7 +61,9 @@ class RotorpyPlant(EachPlant):
         return np.concatenate((after["x"], after["v"], after["q"][WXYZ], after["w"], thrusts))
 
 
-def parameters_of(frame: Airframe, mass_error: float = 0.0, thrust_error: float = 0.0, drag: float = 0.0) -> dict[str, Any]:
+def parameters_of(
+    frame: Airframe, mass_error: float = 0.0, thrust_error: float = 0.0, drag: float = 0.0
+) -> dict[str, Any]:
     """The package's parameters of a vehicle; arguments as of `RotorpyPlant`."""
     h, per_speed = frame.arm / math.sqrt(2.0), frame.thrust_coefficient * (1.0 + thrust_error) / RADIANS**2
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = frame.inertia
