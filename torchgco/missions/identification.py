@@ -6,7 +6,7 @@ Three fits follow each other. Rotors: the root s of a thrust, which is proportio
 
 with u as it was some time steps before, where there is a delay. Mass and drag: m (v' + g e3) + d v = F R e3. Inertia
 and the torques about z: J w' + w x J w + k_a w_z e3 - k_r (F1 - F2 + F3 - F4) e3 is what thrusts do at the arm. That is
-given: arm and inertia can't both be told from rates and thrusts. Thrusts are means over a time step, of the first fit.
+given: rates and thrusts don't separate arm and inertia. Thrusts are means over a time step, of the first fit.
 """
 
 from __future__ import annotations
