@@ -109,7 +109,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.families.simulators", description="Fly, and count.")
     parser.add_argument("--count", type=int, default=64, help="missions of each row")
     parser.add_argument("--unidentified", type=int, default=64, help="missions of rows without identification")
-    parser.add_argument("--x2", metavar="FILE", help="skydio_x2/x2.xml of mujoco_menagerie, with its yaw gears mended")
+    parser.add_argument("--x2", metavar="FILE", help="skydio_x2/x2.xml of mujoco_menagerie, with its yaw gears corrected")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "simulators")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/simulators.md")
     asked = parser.parse_args(words)
