@@ -31,7 +31,7 @@ from benchmarks.speed import __main__ as speed
 from torchgco import Problem
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
-from torchgco.experiments.reports import export, report, view
+from torchgco.experiments.reports import export, identify, report, view
 from torchgco.judging.certificate import CHORDS
 from torchgco.judging.judge import CLEARANCES
 from torchgco.kernels import EagerWarning
@@ -102,6 +102,8 @@ def accept(command: str) -> None:
         view._parser().parse_args(words)
     elif program == "torchgco-export":
         export._parser().parse_args(words)
+    elif program == "torchgco-identify":
+        accept_overrides(identify._parser().parse_args(words).words)
     elif program == "make":
         accept_make(words)
     elif program == "python":

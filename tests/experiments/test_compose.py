@@ -90,10 +90,11 @@ def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment:
     for mission in options_of("mission"):
         setup = checked(f"experiment={experiment}", f"mission={mission}", "scenario=walls", "solver=al_ilqr")
         assert setup.mission is not None and setup.mission.planner.solver == presets.al_ilqr(3)
-    if find_spec("drone_models") is None:
-        assert "plant: " in refused(f"experiment={experiment}", "plant=drone_models", "solver=al_ilqr")
-    else:
-        assert checked(f"experiment={experiment}", "plant=drone_models", "solver=al_ilqr").mission is not None
+    for plant in ("drone_models", "mujoco", "rotorpy"):
+        if find_spec(plant) is None:
+            assert "plant: " in refused(f"experiment={experiment}", f"plant={plant}", "solver=al_ilqr")
+        else:
+            assert checked(f"experiment={experiment}", f"plant={plant}", "solver=al_ilqr").mission is not None
     for scenario in ("planar_random", "woods"):
         words = [f"experiment={experiment}", "mission=null", "plant=null", f"scenario={scenario}", "solver=hold"]
         assert checked(*words).mission is None

@@ -1,0 +1,147 @@
+"""`torchgco-identify`: the airframe of a plant from a few recorded flights, as a file that `vehicle=` takes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.version import VERSION
+from torchgco.dynamics.quadrotor import Airframe
+from torchgco.experiments.config.build import compose
+from torchgco.experiments.config.checks import NAME
+from torchgco.experiments.ending import ended, say
+from torchgco.experiments.reports.finished import TRUST, Study
+from torchgco.experiments.reports.mission_report import TIME_STEPS
+from torchgco.experiments.reports.parser import RunParser
+from torchgco.experiments.results.files import damaged, write
+from torchgco.experiments.results.limits import read_table
+from torchgco.missions.identification import Identified, identify, record
+from torchgco.missions.planning_problem import airframe_of
+
+FILE = Path("mine") / "vehicle" / "identified.yaml"
+UNITS = {
+    "mass": "kg", "inertia": "kg m^2", "arm": "m; given", "rotor_torque": "m", "rotational_drag": "N m s/rad",
+    "rotor_time_constant": "s, the delay in it", "thrust_min": "N per rotor", "thrust_max": "N per rotor",
+    "hover_speed": "rpm", "gravity": "m/s^2; given", "drag": "N s/m", "radius": "m; given",
+}  # fmt: skip
+Recorded = tuple[Tensor, Tensor, float, Airframe]  # states, commands, time step, the airframe that was planned with
+
+
+def flights(overrides: Sequence[str], seed: int = 0) -> Recorded:
+    """Test flights of the plant that a command line names; see `record`.
+
+    Raises:
+        InputError: as `compose` and the plant.
+    """
+    setup = compose(["experiment=mission", *overrides])
+    if setup.mission is None:
+        raise InputError("mission", "one with a plant", "none")
+    plant, frame = setup.mission.plant, airframe_of(setup.vehicle.dynamics)
+    return *record(plant, frame, seed), plant.dt, frame
+
+
+def missions(folder: Path, trust: bool = False) -> Recorded:
+    """The flights of a finished study of at most four missions, as its plant was logged.
+
+    Raises:
+        InputError: as `Study.read`, and a study without the time steps of its plant.
+    """
+    study = Study.read(folder, trust)
+    path = folder / TIME_STEPS
+    if not path.is_file():
+        raise InputError("--run", f"a study of at most four missions, with {TIME_STEPS}", folder)
+    try:
+        table = read_table(path, trust)
+        parts = [part for _, part in table.groupby(["solver", "mission"], sort=False)]
+        dt = float(parts[0]["t"].iloc[1] - parts[0]["t"].iloc[0])
+        x, u = (_together(parts, letter, first, count) for letter, first, count in (("x", 0, 17), ("u", 1, 4)))
+    except InputError:
+        raise
+    except Exception as error:  # damaged bytes make readers raise nearly anything
+        raise damaged(path, f"is damaged ({type(error).__name__})") from None
+    return x, u[:, :-1], dt, airframe_of(study.vehicle.dynamics)
+
+
+def _together(parts: Sequence, letter: str, first: int, count: int) -> Tensor:
+    """Columns of several flights (B, K, count), NaN after the end of each."""
+    held = [part[[f"{letter}{i}" for i in range(first, first + count)]].to_numpy(float) for part in parts]
+    whole = np.full((len(held), max(map(len, held)), count), np.nan)
+    for row, own in zip(whole, held, strict=True):
+        row[: len(own)] = own
+    return torch.from_numpy(whole)
+
+
+def document(found: Identified, source: str) -> str:
+    """The file of an airframe, for the group `vehicle`."""
+    met = [name for name, was in zip(("least", "greatest"), found.limits_met, strict=True) if was]
+    lines = [
+        f"# Identified by torchgco {VERSION} from {found.samples} time steps: {source}.",
+        f"# Delay {found.delay:g} s; limits of thrust that were met: {' and '.join(met) or 'none'}; the fits leave",
+        f"# {found.thrust_error:.1%} of the roots of thrusts, {found.force_error:.1%} of forces, "
+        f"{found.torque_error:.1%} of torques.",
+        "_target_: torchgco.dynamics.Airframe",
+    ]
+    for field in fields(found.airframe):
+        value = getattr(found.airframe, field.name)
+        text = f"[{', '.join(str(list(row)) for row in value)}]" if field.name == "inertia" else str(value)
+        lines.append(f"{field.name}: {text} # {UNITS[field.name]}")
+    return "\n".join(lines) + "\n"
+
+
+def table(before: Airframe, found: Identified) -> str:
+    """What differs from the vehicle that was planned with, a line each."""
+    lines = []
+    for field in fields(before):
+        old, new = (getattr(frame, field.name) for frame in (before, found.airframe))
+        if field.name == "inertia":
+            old, new = (tuple(row[i] for i, row in enumerate(J)) for J in (old, new))
+        if old != new:
+            shown = [", ".join(f"{v:.4g}" for v in (one if isinstance(one, tuple) else (one,))) for one in (old, new)]
+            lines.append(f"{field.name:<20} {shown[0]:>24} -> {shown[1]} {UNITS[field.name].split(',')[0]}")
+    return "\n".join([*lines, f"{'delay':<20} {'':>24} -> {found.delay:g} s"])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = RunParser(
+        prog="torchgco-identify",
+        description="Identify mass, inertia, rotors, limits, delay and drag of a plant; write them as a vehicle.",
+    )
+    parser.add_argument(
+        "words", metavar="KEY=VALUE", nargs="*", help="as torchgco takes them: plant=mujoco vehicle=paper"
+    )
+    parser.add_argument("--run", metavar="RUN", type=Path, help="of a finished study: its missions, not test flights")
+    parser.add_argument("--output", metavar="FILE", type=Path, default=FILE, help=f"default: {FILE}")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the test flights; default: 0")
+    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`torchgco-identify`. Returns the exit code, see `ended`."""
+
+    def work() -> int:
+        options = _parser().parse_args(arguments)
+        path = options.output
+        if path.suffix != ".yaml" or path.parent.name != "vehicle" or not NAME.fullmatch(path.stem):
+            raise InputError("--output", "FOLDER/vehicle/NAME.yaml, as --config-dir FOLDER vehicle=NAME reads it", path)
+        if options.run is not None and options.words:
+            raise InputError("command line", "--run RUN or KEY=VALUE, not both", options.words[0])
+        told = str(options.run) if options.run is not None else " ".join(options.words)
+        given = flights(options.words, options.seed) if options.run is None else missions(options.run, options.trust)
+        found = identify(*given)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError("--output", "a folder that can be made", error) from None
+        write(path, lambda file: file.write(document(found, told or "plant=rotors").encode()))
+        say(f"{table(given[3], found)}\n{path}: torchgco --config-dir {path.parent.parent} vehicle={path.stem} ...")
+        return 0
+
+    return ended("torchgco-identify", work)
