@@ -15,9 +15,9 @@ from torchgco.base.errors import InputError
 from torchgco.base.version import VERSION
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.experiments.config.build import compose
-from torchgco.experiments.config.checks import NAME
+from torchgco.experiments.config.checks import NAME_PATTERN
 from torchgco.experiments.ending import ended, say
-from torchgco.experiments.reports.finished import TRUST, Study
+from torchgco.experiments.reports.finished import Study
 from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.files import damaged, write
@@ -119,7 +119,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--run", metavar="RUN", type=Path, help="of a finished study: its missions, not test flights")
     parser.add_argument("--output", metavar="FILE", type=Path, default=FILE, help=f"default: {FILE}")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the test flights; default: 0")
-    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 
@@ -129,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def work() -> int:
         options = _parser().parse_args(arguments)
         path = options.output
-        if path.suffix != ".yaml" or path.parent.name != "vehicle" or not NAME.fullmatch(path.stem):
+        if path.suffix != ".yaml" or path.parent.name != "vehicle" or not NAME_PATTERN.fullmatch(path.stem):
             raise InputError("--output", "FOLDER/vehicle/NAME.yaml, as --config-dir FOLDER vehicle=NAME reads it", path)
         if options.run is not None and options.words:
             raise InputError("command line", "--run RUN or KEY=VALUE, not both", options.words[0])

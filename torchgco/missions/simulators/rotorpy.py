@@ -108,7 +108,7 @@ def _named(name: str) -> tuple[Any, np.ndarray]:
 def _multirotor() -> Any:
     """The package's class."""
     try:
-        from rotorpy.vehicles.multirotor import Multirotor
+        from rotorpy.vehicles.multirotor import Multirotor  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError("plant", "RotorPy (`pip install torchgco[rotorpy]`)", error) from None
     return Multirotor
