@@ -17,7 +17,7 @@ from tests.missions.test_plants import random_states
 from torchgco import Airframe, InputError
 from torchgco.missions import RotorPlant
 from torchgco.missions.simulators import mujoco, rotorpy
-from torchgco.missions.simulators.mjcf import CORNERS, mjcf
+from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, mjcf
 from torchgco.missions.simulators.mujoco import MujocoPlant
 from torchgco.missions.simulators.rotorpy import RotorpyPlant, parameters_of
 
@@ -57,7 +57,7 @@ def test_the_model_that_is_written_has_the_airframes_mass_inertia_and_rotors() -
 def test_parameters_of_rotorpy_are_the_airframes() -> None:
     given = parameters_of(OWN, mass_error=0.25, thrust_error=0.1, drag=0.3)
     assert given["mass"] == 1.5 and [np.sign(place[:2]).tolist() for place in given["rotor_pos"].values()] == [
-        list(corner) for corner in CORNERS
+        list(corner) for corner in ROTOR_CORNERS
     ]
     hover = math.sqrt(OWN.hover_thrust / given["k_eta"])  # rad/s
     assert given["k_eta"] == pytest.approx(1.1 * OWN.thrust_coefficient * (60 / (2 * math.pi)) ** 2)

@@ -25,16 +25,16 @@ from torchgco.base.shapes import check_tensor
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.plant import Plant, flown, hovering
 
-SLOW, CALM = 8.0, 10.0  # m/s and rad/s: samples beyond don't count, as air and long steps tell there
-WIDE = 3.4  # of the logarithm of the root of a thrust coefficient: thirty times more or less
-LATEST = 10  # time steps of a delay that are tried
-BETTER = 0.9  # share of the error without a delay, below which a delay is believed
+SLOW_FLIGHT, CALM_FLIGHT = 8.0, 10.0  # m/s and rad/s: samples beyond don't count, as air and long steps tell there
+THRUST_RANGE = 3.4  # of the logarithm of the root of a thrust coefficient: thirty times more or less
+MOST_DELAY = 10  # time steps of a delay that are tried
+DELAY_GAIN = 0.9  # share of the error without a delay, below which a delay is believed
 LEAST = 50  # samples of a fit
 RESOLVED = 1.0  # time steps: Euler's steps, as the tracker's are, go beyond the end of a faster lag
-BEYOND = 0.01  # share of the root of a limit by which a command has to ask for more, to have met it
-TURNING = 0.02  # of the thrust in hover: rotors that stand still take long to turn again
-ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of the inertia
-SPINS = np.array((1.0, -1.0, 1.0, -1.0))  # of the torques about z
+ASKED_MORE = 0.01  # share of the root of a limit by which a command has to ask for more, to have met it
+LEAST_SPIN = 0.02  # of the thrust in hover: rotors that stand still take long to turn again
+INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of the inertia
+ROTOR_SPINS = np.array((1.0, -1.0, 1.0, -1.0))  # of the torques about z
 
 
 @dataclass(frozen=True)
@@ -112,11 +112,13 @@ def identify(x: Tensor, u: Tensor, dt: float, airframe: Airframe) -> Identified:
     first, second = states[:, :-1].reshape(-1, 17), states[:, 1:].reshape(-1, 17)
     F = thrusts.reshape(-1, 4)
     calm = [np.isfinite(part).all(1) for part in (first, second, F)]
-    calm += [np.linalg.norm(part[:, 3:6], axis=1) < SLOW for part in (first, second)]
-    calm += [np.linalg.norm(part[:, 10:13], axis=1) < CALM for part in (first, second)]
+    calm += [np.linalg.norm(part[:, 3:6], axis=1) < SLOW_FLIGHT for part in (first, second)]
+    calm += [np.linalg.norm(part[:, 10:13], axis=1) < CALM_FLIGHT for part in (first, second)]
     use = np.logical_and.reduce(calm)
     if int(use.sum()) < LEAST:
-        raise InputError("x", f"at least {LEAST} time steps within {SLOW:g} m/s and {CALM:g} rad/s", int(use.sum()))
+        raise InputError(
+            "x", f"at least {LEAST} time steps within {SLOW_FLIGHT:g} m/s and {CALM_FLIGHT:g} rad/s", int(use.sum())
+        )
     first, second, F = first[use], second[use], F[use]
     mass, drag, force_error = _mass(first, second, F, dt, airframe)
     inertia, turning, torque_error = _inertia(first, second, F, dt, airframe)
@@ -159,7 +161,7 @@ class _Rotors:
 
     def limits(self, mass: float, dt: float, given: Airframe) -> dict[str, float]:
         """The limits and the time constant of an airframe that the tracker can follow."""
-        least = TURNING * mass * given.gravity / 4.0
+        least = LEAST_SPIN * mass * given.gravity / 4.0
         return {
             "thrust_min": max(self.low**2, least), "thrust_max": self.high**2,
             "rotor_time_constant": max(self.T + self.late * dt, RESOLVED * dt),
@@ -174,9 +176,9 @@ def _later(u: np.ndarray, late: int) -> np.ndarray:
 def _rotors(F: np.ndarray, u: np.ndarray, dt: float, given: Airframe) -> _Rotors:
     """The fit for thrusts F (B, K+1, 4) and commands u (B, K, 4), with the delay that explains most."""
     best: _Rotors | None = None
-    for late in range(min(LATEST, u.shape[1] // 2) + 1):
+    for late in range(min(MOST_DELAY, u.shape[1] // 2) + 1):
         found = _rotors_late(F, u, late, dt, given)
-        if best is None or found.error < (BETTER if best.late == 0 else 1.0) * best.error:
+        if best is None or found.error < (DELAY_GAIN if best.late == 0 else 1.0) * best.error:
             best = found
     assert best is not None
     return best
@@ -198,7 +200,7 @@ def _rotors_late(F: np.ndarray, u: np.ndarray, late: int, dt: float, given: Airf
         return (a * before + (1.0 - a) * end - after) / hover
 
     lag = math.log(given.rotor_time_constant), math.log(root)
-    ends = (math.log(dt / 20.0), lag[1] - WIDE, 0.0, 0.0), (math.log(5.0), lag[1] + WIDE, 100.0, 100.0)
+    ends = (math.log(dt / 20.0), lag[1] - THRUST_RANGE, 0.0, 0.0), (math.log(5.0), lag[1] + THRUST_RANGE, 100.0, 100.0)
     fits = []
     for within in (after, root * speed):  # limits that were met, and none
         begin = np.clip((*lag, float(within.min()) / hover, float(within.max()) / hover), *ends)
@@ -206,7 +208,7 @@ def _rotors_late(F: np.ndarray, u: np.ndarray, late: int, dt: float, given: Airf
     z = min(fits, key=lambda fit: fit.cost).x
     T, root, low, high = math.exp(z[0]), math.exp(z[1]), *(np.sort(z[2:]) * hover)
     asked = float(root * speed.min()), float(root * speed.max())
-    met = bool(asked[0] < (1.0 - BEYOND) * low), bool(asked[1] > (1.0 + BEYOND) * high)
+    met = bool(asked[0] < (1.0 - ASKED_MORE) * low), bool(asked[1] > (1.0 + ASKED_MORE) * high)
     error = float(np.sqrt(np.mean(left(z) ** 2)))
     return _Rotors(root**2, T, max(low, asked[0]), min(high, asked[1]), late, met, error)
 
@@ -237,17 +239,17 @@ def _inertia(
     torque = F @ given.allocation(torch.zeros(1, dtype=torch.float64)).numpy().T
     torque[:, 2] = 0.0
     about, columns = np.array((0.0, 0.0, 1.0)), list[np.ndarray]()
-    for i, j in ENTRIES:
+    for i, j in INERTIA_ENTRIES:
         J = np.zeros((3, 3))
         J[i, j] = J[j, i] = 1.0
         columns.append(rate @ J + np.cross(w, w @ J))
-    columns += [-(F @ SPINS)[:, None] * about, w[:, 2:] * about]
+    columns += [-(F @ ROTOR_SPINS)[:, None] * about, w[:, 2:] * about]
     A, scale = np.stack([column.ravel() for column in columns], axis=1), _scale(given)
     begin = np.linalg.lstsq(A * scale, torque.ravel(), rcond=None)[0]
 
     def left(z: np.ndarray) -> np.ndarray:
         J, spin, loss = _unpacked(z * scale)
-        moment = torque - np.cross(w, w @ J) + (spin * (F @ SPINS) - loss * w[:, 2])[:, None] * about
+        moment = torque - np.cross(w, w @ J) + (spin * (F @ ROTOR_SPINS) - loss * w[:, 2])[:, None] * about
         return (np.linalg.lstsq(J, moment.T, rcond=None)[0].T - rate).ravel()
 
     z = least_squares(left, begin, x_scale=np.maximum(np.abs(begin), 1e-3)).x
@@ -260,7 +262,7 @@ def _inertia(
 def _unpacked(theta: np.ndarray) -> tuple[np.ndarray, float, float]:
     """The inertia (3, 3), the yaw torque and its drag, from the unknowns of `_inertia`."""
     J = np.zeros((3, 3))
-    for value, (i, j) in zip(theta, ENTRIES, strict=False):
+    for value, (i, j) in zip(theta, INERTIA_ENTRIES, strict=False):
         J[i, j] = J[j, i] = value
     return J, float(theta[6]), float(theta[7])
 

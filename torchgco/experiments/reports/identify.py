@@ -25,8 +25,8 @@ from torchgco.experiments.results.limits import read_table
 from torchgco.missions.identification import Identified, identify, record
 from torchgco.missions.planning_problem import airframe_of
 
-FILE = Path("mine") / "vehicle" / "identified.yaml"
-UNITS = {
+VEHICLE_FILE = Path("mine") / "vehicle" / "identified.yaml"
+AIRFRAME_UNITS = {
     "mass": "kg", "inertia": "kg m^2", "arm": "m; given", "rotor_torque": "m", "rotational_drag": "N m s/rad",
     "rotor_time_constant": "s, the delay in it", "thrust_min": "N per rotor", "thrust_max": "N per rotor",
     "hover_speed": "rpm", "gravity": "m/s^2; given", "drag": "N s/m", "radius": "m; given",
@@ -91,7 +91,7 @@ def document(found: Identified, source: str) -> str:
     for field in fields(found.airframe):
         value = getattr(found.airframe, field.name)
         text = f"[{', '.join(str(list(row)) for row in value)}]" if field.name == "inertia" else str(value)
-        lines.append(f"{field.name}: {text} # {UNITS[field.name]}")
+        lines.append(f"{field.name}: {text} # {AIRFRAME_UNITS[field.name]}")
     return "\n".join(lines) + "\n"
 
 
@@ -104,7 +104,7 @@ def table(before: Airframe, found: Identified) -> str:
             old, new = (tuple(row[i] for i, row in enumerate(J)) for J in (old, new))
         if old != new:
             shown = [", ".join(f"{v:.4g}" for v in (one if isinstance(one, tuple) else (one,))) for one in (old, new)]
-            lines.append(f"{field.name:<20} {shown[0]:>24} -> {shown[1]} {UNITS[field.name].split(',')[0]}")
+            lines.append(f"{field.name:<20} {shown[0]:>24} -> {shown[1]} {AIRFRAME_UNITS[field.name].split(',')[0]}")
     return "\n".join([*lines, f"{'delay':<20} {'':>24} -> {found.delay:g} s"])
 
 
@@ -117,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         "words", metavar="KEY=VALUE", nargs="*", help="as torchgco takes them: plant=mujoco vehicle=paper"
     )
     parser.add_argument("--run", metavar="RUN", type=Path, help="of a finished study: its missions, not test flights")
-    parser.add_argument("--output", metavar="FILE", type=Path, default=FILE, help=f"default: {FILE}")
+    parser.add_argument("--output", metavar="FILE", type=Path, default=VEHICLE_FILE, help=f"default: {VEHICLE_FILE}")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the test flights; default: 0")
     return parser
 

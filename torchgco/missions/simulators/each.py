@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgco.missions.plant import RotorPlant, column
 
-FARTHEST = 1e6  # of any number of a state, in its unit: simulators stop the process, or begin anew, far beyond
+FARTHEST_STATE = 1e6  # of any number of a state, in its unit: simulators stop the process, or begin anew, far beyond
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class EachPlant(RotorPlant):
         deviations = torch.cat([error.expand(len(x), 1) for error in errors], dim=1).tolist()
         after = np.full(states.shape, np.nan)
         for i, state in enumerate(states):
-            if bool((np.abs(state) < FARTHEST).all()):  # false for NaN, too
+            if bool((np.abs(state) < FARTHEST_STATE).all()):  # false for NaN, too
                 after[i] = self.one(state, speeds[i], push[i], (deviations[i][0], deviations[i][1], deviations[i][2]))
         return torch.from_numpy(after).to(x)
 

@@ -8,7 +8,12 @@ from xml.etree import ElementTree
 from torchgco.dynamics.quadrotor import Airframe
 
 THIN = 0.1  # of a radius: heights and thicknesses that are drawn
-CORNERS = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # signs of x and y of the rotors: front left, then clockwise from above
+ROTOR_CORNERS = (
+    (1, 1),
+    (1, -1),
+    (-1, -1),
+    (-1, 1),
+)  # signs of x and y of the rotors: front left, then clockwise from above
 
 
 def mjcf(airframe: Airframe, timestep: float = 0.005, mass: float | None = None) -> str:
@@ -34,7 +39,7 @@ def mjcf(airframe: Airframe, timestep: float = 0.005, mass: float | None = None)
     _add(body, "inertial", pos=(0, 0, 0), mass=weight, fullinertia=(xx, yy, zz, xy, xz, yz))
     actuators = _add(root, "actuator")
     drawn = {"contype": 0, "conaffinity": 0, "group": 2}
-    for i, (x, y) in enumerate(CORNERS, 1):
+    for i, (x, y) in enumerate(ROTOR_CORNERS, 1):
         place, spin = (x * h, y * h, 0), k if i % 2 else -k
         _add(body, "site", name=f"rotor{i}", pos=place)
         _add(body, "geom", type="capsule", fromto=(0, 0, 0, *place), size=THIN * airframe.arm, **drawn)

@@ -13,11 +13,11 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.simulators.each import EachPlant
-from torchgco.missions.simulators.mjcf import CORNERS, mjcf
+from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, mjcf
 
-LONGEST = 0.005  # s, of a time step of MuJoCo in a model that we write
+LONGEST_STEP = 0.005  # s, of a time step of MuJoCo in a model that we write
 SIDEWAYS = 1e-6  # share of a thrust that an actuator may push across the body's z axis
-TURN = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn about z
+QUARTER_TURN = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn about z
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class _Quadrotor:
         lib, model, data, order = self.lib, self.model, self.data, self.order
         q, w = x[6:10], x[10:13]
         if self.turned:
-            q, w = _product(q, (TURN[0], 0.0, 0.0, -TURN[3])), np.array((-w[1], w[0], w[2]))
+            q, w = _product(q, (QUARTER_TURN[0], 0.0, 0.0, -QUARTER_TURN[3])), np.array((-w[1], w[0], w[2]))
         q = q / np.linalg.norm(q)
         lib.mj_resetData(model, data)  # also what MuJoCo would start its next step from: a step has the state alone
         arm = _rotation(q) @ self.center
@@ -132,7 +132,7 @@ class _Quadrotor:
         p, v = data.qpos[:3] + R @ self.center, data.qvel[:3] + R @ np.cross(w, self.center)
         held = data.act if self.model.na else np.clip(data.ctrl, self.low, self.high)
         if self.turned:
-            q, w = _product(q, TURN), np.array((w[1], -w[0], w[2]))
+            q, w = _product(q, QUARTER_TURN), np.array((w[1], -w[0], w[2]))
         return np.concatenate((p, v, q, w, self.gains * held[self.order]))
 
 
@@ -152,7 +152,7 @@ def _rotors(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
             "plant.model", "actuators that push along the body's z axis", f"forces {forces.round(6).tolist()}"
         )
     x, y, yaw = -torques[:, 1] / lift, torques[:, 0] / lift, torques[:, 2] / lift
-    found = [np.flatnonzero((x * a > 0) & (y * b > 0)) for a, b in CORNERS]
+    found = [np.flatnonzero((x * a > 0) & (y * b > 0)) for a, b in ROTOR_CORNERS]
     if any(len(one) != 1 for one in found):
         places = list(zip(x.round(3).tolist(), y.round(3).tolist(), strict=True))
         raise InputError("plant.model", "one rotor in each quadrant around the centre of mass", f"rotors at {places} m")
@@ -171,7 +171,7 @@ def _rotors(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
 
 @lru_cache(maxsize=256)
 def _written(frame: Airframe, mass_error: float, drag: float, dt: float) -> _Quadrotor:
-    text = mjcf(frame, dt / math.ceil(dt / LONGEST - 1e-9), frame.mass * (1.0 + mass_error))
+    text = mjcf(frame, dt / math.ceil(dt / LONGEST_STEP - 1e-9), frame.mass * (1.0 + mass_error))
     try:
         model = _mujoco().MjModel.from_xml_string(text)
     except ValueError as error:

@@ -13,11 +13,11 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.simulators.each import EachPlant
-from torchgco.missions.simulators.mjcf import CORNERS
+from torchgco.missions.simulators.mjcf import ROTOR_CORNERS
 
 RADIANS = 2.0 * math.pi / 60.0  # per second, of one rpm
 XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]  # the package's order of a quaternion from ours, and ours from the package's
-SOLVER = {"method": "RK45", "rtol": 1e-6, "atol": 1e-9}  # the package's own tolerance is 1e-3 of a step
+ODE_SOLVER = {"method": "RK45", "rtol": 1e-6, "atol": 1e-9}  # the package's own tolerance is 1e-3 of a step
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def parameters_of(
     return {
         "mass": frame.mass * (1.0 + mass_error), "num_rotors": 4,
         "Ixx": xx, "Iyy": yy, "Izz": zz, "Ixy": xy, "Ixz": xz, "Iyz": yz,
-        "rotor_pos": {f"r{i}": np.array([a * h, b * h, 0.0]) for i, (a, b) in enumerate(CORNERS, 1)},
+        "rotor_pos": {f"r{i}": np.array([a * h, b * h, 0.0]) for i, (a, b) in enumerate(ROTOR_CORNERS, 1)},
         "rotor_directions": np.array([1, -1, 1, -1]), "rotor_speed_min": low, "rotor_speed_max": high,
         "k_eta": per_speed, "k_m": frame.rotor_torque * per_speed, "tau_m": frame.rotor_time_constant,
         **dict.fromkeys(("k_d", "k_z"), (frame.drag + drag) / (4.0 * hover)),
@@ -81,7 +81,7 @@ def parameters_of(
 
 @lru_cache(maxsize=256)
 def _written(frame: Airframe, *deviation: float) -> tuple[Any, np.ndarray]:
-    vehicle = _multirotor()(parameters_of(frame, *deviation), integrator_kwargs=SOLVER)
+    vehicle = _multirotor()(parameters_of(frame, *deviation), integrator_kwargs=ODE_SOLVER)
     return vehicle, np.array([0.0, 0.0, -vehicle.mass * frame.gravity])
 
 
@@ -92,12 +92,16 @@ def _named(name: str) -> tuple[Any, np.ndarray]:
     for path in (f"rotorpy.vehicles.{name}_params", name):
         try:
             given = import_module(path).quad_params
-            vehicle = _multirotor()(given, integrator_kwargs=SOLVER)
+            vehicle = _multirotor()(given, integrator_kwargs=ODE_SOLVER)
         except (ImportError, AttributeError, KeyError, ValueError, TypeError) as error:
             last = last or error
             continue
         places, signs = vehicle.rotor_geometry[:, :2], np.asarray(vehicle.rotor_dir)
-        if places.shape != (4, 2) or not np.array_equal(np.sign(places), CORNERS) or signs.tolist() != [1, -1, 1, -1]:
+        if (
+            places.shape != (4, 2)
+            or not np.array_equal(np.sign(places), ROTOR_CORNERS)
+            or signs.tolist() != [1, -1, 1, -1]
+        ):
             wanted = "four rotors from the front left clockwise, which turn by 1, -1, 1, -1"
             raise InputError("plant.parameters", wanted, f"rotors at {places.tolist()}, {signs.tolist()}")
         return vehicle, vehicle.weight.copy()
