@@ -13,7 +13,7 @@ from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family
 from torchgco.scenarios.layouts import Layouts
 
-KERB = 10.0  # m: the kerb goes on so far behind the parked cars
+KERB_END = 10.0  # m: the kerb goes on so far behind the parked cars
 KERB = 2.0  # m, its depth
 
 Lengths = Annotated[float, Above(0, "car lengths"), AtMost(checks.TOO_LARGE, "car lengths")]
@@ -66,6 +66,6 @@ class Parking(Family):
         beside = (self.gap + 1.0) * self.length / 2.0
         centers = [[-beside, 0.0], [beside, 0.0], [0.0, -(self.width + KERB) / 2.0 - self.kerb]]
         parked = [self.length / 2.0, self.width / 2.0]
-        half = [parked, parked, [beside + self.length / 2.0 + KERB, KERB / 2.0]]
+        half = [parked, parked, [beside + self.length / 2.0 + KERB_END, KERB / 2.0]]
         among = self._layout(box_centers=np.array([centers]), box_half_sizes=np.array([half]), goal_required=True)
         return replace(among, start=start)

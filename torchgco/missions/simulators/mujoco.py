@@ -17,7 +17,7 @@ from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, mjcf
 
 LONGEST_STEP = 0.005  # s, of a time step of MuJoCo in a model that we write
 SIDEWAYS = 1e-6  # share of a thrust that an actuator may push across the body's z axis
-QUARTER_TURN = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn about z
+QUARTER_ROUND = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn about z
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class _Quadrotor:
         lib, model, data, order = self.lib, self.model, self.data, self.order
         q, w = x[6:10], x[10:13]
         if self.turned:
-            q, w = _product(q, (QUARTER_TURN[0], 0.0, 0.0, -QUARTER_TURN[3])), np.array((-w[1], w[0], w[2]))
+            q, w = _product(q, (QUARTER_ROUND[0], 0.0, 0.0, -QUARTER_ROUND[3])), np.array((-w[1], w[0], w[2]))
         q = q / np.linalg.norm(q)
         lib.mj_resetData(model, data)  # also what MuJoCo would start its next step from: a step has the state alone
         arm = _rotation(q) @ self.center
@@ -132,7 +132,7 @@ class _Quadrotor:
         p, v = data.qpos[:3] + R @ self.center, data.qvel[:3] + R @ np.cross(w, self.center)
         held = data.act if self.model.na else np.clip(data.ctrl, self.low, self.high)
         if self.turned:
-            q, w = _product(q, QUARTER_TURN), np.array((w[1], -w[0], w[2]))
+            q, w = _product(q, QUARTER_ROUND), np.array((w[1], -w[0], w[2]))
         return np.concatenate((p, v, q, w, self.gains * held[self.order]))
 
 
