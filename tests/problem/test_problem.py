@@ -10,13 +10,17 @@ from torch import Tensor
 
 from tests.problems import HOVER, START, planar_batch
 from torchgco import (
+    Boxes,
+    Capsules,
     ControlBounds,
     Cost,
+    Field,
     FirstStepRates,
     FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
     InputError,
+    OccupancyGrid,
     Planar,
     Problem,
     QuadraticCost,
@@ -203,6 +207,9 @@ def test_shapes_that_parts_state_are_those_of_their_rows() -> None:
         RateBounds([-1.0, -inf], [1.0, 1.0]),
         Spheres([[5.0, 5.0], [7.0, 7.0], [9.0, 9.0]], [1.0, 1.0, 0.5], 0.1),
         Spheres([[5.0, 5.0]], [1.0], 0.1, velocities=[[0.1, 0.0]]),
+        Boxes([[5.0, 5.0], [7.0, 7.0]], [[1.0, 1.0], [0.5, 1.0]], 0.1, [0.0, 0.3], knots=[1, 2]),
+        Capsules([[5.0, 5.0]], [[7.0, 7.0]], [1.0]),
+        Field(OccupancyGrid(np.eye(4, dtype=bool), (4.0, 4.0), 1.0), 0.1, knots=knots),
     ]
     dynamics = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, position=slice(0, 2))
     problem = Problem(dynamics, QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4), parts, torch.zeros(2, 4), 5)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions
-from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.constraints.base import Constraint, Sense, count_of, resolve_knots
 from torchgco.maps.distance import ALL_FREE, DistanceField
 from torchgco.maps.exact import distance_within
 from torchgco.maps.grid import OccupancyGrid
@@ -134,6 +134,9 @@ class BoundField(Obstacles):
     @property
     def sizes(self) -> Tensor:
         return (self.vehicle_radius + self.field.thickness).unsqueeze(-1)
+
+    def row_shape(self, N: int) -> tuple[int, int]:
+        return count_of(self.knots, N + 1), 1
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self.counted(self._rows(X[:, self.knots, self.position]), ABSENT, X.shape[1])

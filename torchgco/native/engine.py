@@ -123,13 +123,13 @@ class Engine:
         """X (B, N+1, n) from U (B, N, m)."""
         X = U.new_empty(problem.B, problem.N + 1, problem.n)
         X[:, 0] = problem.x0
-        self._run("tgco_open_loop", problem.B, self.packed(problem, X=X, U=U.contiguous()))
+        self._run("tgco_open_loop", problem.B, self._rolled(problem, X=X, U=U.contiguous()))
         return X
 
     def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, G: Tensor) -> tuple[Tensor, Tensor]:
         """X and U of a rollout of U + K (x - X) from the first knots of X; G = [K d] (B, N, m, n+1), d isn't used."""
         X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
-        self._run("tgco_closed_loop", problem.B, self.packed(problem, X=X, U=U, gains=G.contiguous()))
+        self._run("tgco_closed_loop", problem.B, self._rolled(problem, X=X, U=U, gains=G.contiguous()))
         return X, U
 
     def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
@@ -232,6 +232,12 @@ class Engine:
         packed.fill(values)
         return packed
 
+    def _rolled(self, problem: Problem, **values: Any) -> c.Problem:
+        """The model alone, and further fields: what rollouts read. Many problems are rolled out and not solved."""
+        packed = self._model(problem).copy()
+        packed.fill(values)
+        return packed
+
     def terms(self, lagrangian: Lagrangian, best: Multipliers | None = None, **values: Any) -> c.Problem:
         """The same with the terms that the Lagrangian adds to the cost; `best` are those of an outer loop's best."""
         if best is not None:
@@ -262,14 +268,21 @@ class Engine:
             object.__setattr__(problem, "packed", self._made(problem))
         return vars(problem)["packed"]
 
+    def _model(self, problem: Problem) -> c.Problem:
+        """The model's part of it; kept with the problem."""
+        if "model_packed" not in vars(problem):
+            packed = c.Problem(N=problem.N, **shared_fields(self.shared))
+            if self.model.count > 0 and problem.B > 0:
+                numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
+                packed.parameters = array(numbers, knots=True)
+            object.__setattr__(problem, "model_packed", packed)
+        return vars(problem)["model_packed"]
+
     def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
-        rows = self._constraints(problem)
-        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows, **shared_fields(self.shared))
-        if self.model.count > 0:
-            numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
-            packed.parameters = array(numbers, knots=True)
+        rows, packed = self._constraints(problem), self._model(problem).copy()
+        packed.constraints, packed.constraint = len(rows), rows
         cost, shared = self.cost, self.shared.cost
         packed.cost_data = quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, shared)
         packed.bounded = int(self.cost is None and is_bounded(problem.cost))

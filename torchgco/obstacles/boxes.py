@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
-from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.constraints.base import Constraint, Sense, count_of, resolve_knots
 from torchgco.obstacles.base import ABSENT, Obstacles, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
@@ -132,6 +132,9 @@ class BoundBoxes(Obstacles):
     @property
     def sizes(self) -> Tensor:
         return self.depths
+
+    def row_shape(self, N: int) -> tuple[int, int]:
+        return count_of(self.knots, N + 1), self.absent.shape[1]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self.counted(self._rows(X[:, self.knots, self.position]), ABSENT, X.shape[1])
