@@ -53,4 +53,4 @@ def run_until(run, monkeypatch):
 @pytest.fixture
 def without_report(monkeypatch):
     """Studies write no summary and no figures, which take most of the time of a small study."""
-    monkeypatch.setattr(study, "write_report", lambda folder, trajectories, figures, printed: "")
+    monkeypatch.setattr(study, "write_report", lambda *arguments: "")
