@@ -28,6 +28,7 @@ import torchgco
 from benchmarks.families import oracle, quality
 from benchmarks.lib.command import Command
 from benchmarks.speed import __main__ as speed
+from tests.slow import mostly
 from torchgco import Problem
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
@@ -241,9 +242,10 @@ def registries() -> Iterator[None]:
         registry.update(entries)
 
 
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if any(language == PYTHON for language, _ in blocks(page))], ids=name_of
-)
+RUN = [page for page in PAGES if any(language == PYTHON for language, _ in blocks(page))]
+
+
+@pytest.mark.parametrize("page", mostly(RUN, *(page for page in RUN if page.name == "free_time.md")), ids=name_of)
 def test_every_python_block_runs(page: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if page.name in ("receding.md", "gradients.md") and find_compiler() is None:
         pytest.skip("no C compiler, which compiled problems and forward_ad.dual_level need")

@@ -12,6 +12,7 @@ from torch import Tensor
 
 import torchgco
 from tests.engines import compiled, engine_of
+from tests.slow import mostly
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost, kernels
 from torchgco.base.values import NO_VALUES
 from torchgco.kernels import EagerWarning, measured
@@ -40,7 +41,7 @@ def problem(rows: slice = slice(None), **more: Any) -> Problem:
     return Problem(dynamics, cost, [slow, weak], torch.zeros(len(GOALS[rows]), 4, dtype=D), N, **more)
 
 
-@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize("native", mostly([True, False], False))
 def test_every_problem_has_its_own_values(native: bool) -> None:
     kernels.use_native(native)
     try:

@@ -68,7 +68,7 @@ def test_every_scenario_has_a_model_that_the_matrix_names() -> None:
     assert set(MODEL) | {"layouts", "map"} == set(options_of("scenario")) and set(OF_MODEL) == set(options_of("model"))
 
 
-@pytest.mark.parametrize("experiment", mostly(EXPERIMENTS, *set(EXPERIMENTS[1:]) - set(EXPERIMENTS[::4])))
+@pytest.mark.parametrize("experiment", mostly(EXPERIMENTS, *set(EXPERIMENTS[1:]) - {EXPERIMENTS[4]}))
 def test_every_experiment_composes_with_every_scenario_model_and_solver(experiment: str) -> None:
     """As it is, and on every scenario and file; models are named or left to the scenario, solvers take turns."""
     setup = checked(f"experiment={experiment}")

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import HOLD, problem_line
+from tests.slow import mostly
 from torchgco.base.errors import InputError
 from torchgco.experiments.reports.report import main as report
 from torchgco.experiments.results import files
@@ -67,7 +68,7 @@ def same(one: tuple[pd.DataFrame, bytes], other: tuple[pd.DataFrame, bytes]) -> 
 
 
 @pytest.mark.usefixtures("without_report")
-@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("damage", mostly(DAMAGE, "empty", "text"))
 @pytest.mark.parametrize("name", FINISHED)
 def test_a_damaged_file_of_a_finished_study_is_named_and_repaired(name: str, damage: str, run, out) -> None:
     before = results(out)
@@ -128,7 +129,7 @@ FOREIGN = {
 
 
 @pytest.mark.usefixtures("without_report")
-@pytest.mark.parametrize("case", FOREIGN)
+@pytest.mark.parametrize("case", mostly(FOREIGN, "scene", "layouts"))
 def test_a_shard_of_something_else_is_refused(case: str, run, run_until, tmp_path, out) -> None:
     before = results(out)
     (source,), words = FOREIGN[case]
@@ -155,7 +156,7 @@ def test_repair_does_not_overwrite_another_study(run, out) -> None:
 STEPS = ["study.json", "config.yaml", "hold-000002-000003.npz", "trials.parquet", "layouts.npz", "summary.csv"]
 
 
-@pytest.mark.parametrize("name", [*STEPS, "rates.png", "done"])
+@pytest.mark.parametrize("name", mostly([*STEPS, "rates.png", "done"], *STEPS[1:4], "rates.png"))
 def test_a_full_disk_gets_one_line_and_leaves_no_parts(name: str, run, tmp_path, monkeypatch, request) -> None:
     if name not in ("summary.csv", "rates.png"):
         request.getfixturevalue("without_report")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from torchgco import (
     Unicycle,
     certify,
     judge,
-    show,
 )
 from torchgco.baselines import PathPursuit
 from torchgco.judging.contact import contacts
@@ -137,11 +135,8 @@ def test_a_frame_is_judged_in_space() -> None:
     assert float(verdict.clearance) == pytest.approx(1.0 - 0.95 * 0.3, abs=1e-9)
 
 
-def test_what_draws_or_flies_a_ball_refuses_a_body() -> None:
-    problem, X, U = scene([[3.0, 3.0]], [0.1], TURN)
-    found = SimpleNamespace(X=X, U=U, detach=lambda: found)
-    with pytest.raises(InputError, match="vehicle_radius: expected a number for the page"):
-        show(problem, found)  # type: ignore[arg-type]
+def test_pursuit_follows_a_ball_and_refuses_a_body() -> None:
+    problem, _, U = scene([[3.0, 3.0]], [0.1], TURN)
     with pytest.raises(InputError, match="vehicle_radius: expected a number for path_pursuit"):
         goal = Goal([5.0, 0.0], 0.5)
         PathPursuit().solve(Problem(problem.dynamics, problem.cost, problem.constraints, problem.x0, 2, goal), U)

@@ -244,7 +244,7 @@ def alive(number: int) -> bool:
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
 @pytest.mark.parametrize("how", mostly([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
-@pytest.mark.parametrize("late", [False, True], ids=["while it runs", "before Python goes on"])
+@pytest.mark.parametrize("late", mostly([False, True], True), ids=["while it runs", "before Python goes on"])
 def test_an_interrupt_ends_the_compiler_and_what_it_started(late: bool, how: signal.Signals, tmp_path: Path) -> None:
     """The signal reaches Python alone, as from a scheduler, a notebook or a test."""
     numbers, script = tmp_path / "numbers", tmp_path / "slow"
@@ -415,6 +415,7 @@ torchgco.solve(problem, U0, solver="interior_point")
 """
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_both_libraries_are_compiled_at_the_same_time(tmp_path: Path) -> None:
     """All units of both have begun before the first one has ended, and the model's is compiled once."""

@@ -263,7 +263,7 @@ def test_slopes_are_numbers_in_any_precision(dtype: torch.dtype) -> None:
     parts = [FunctionConstraint(lambda u: u.sum(-1, keepdim=True), "equality", of="u"), ControlBounds(-200.0, 200.0)]
     model = FunctionDynamics(lambda x, u: x + u, 3, 3, 1.0, "none")
     cost = QuadraticCost(*weights, x_ref=[300.0, 500.0, 200.0])
-    problem = Problem(model, cost, parts, torch.tensor([[1000.0, 0.0, 0.0]], dtype=dtype), 10)
+    problem = Problem(model, cost, parts, torch.tensor([[1000.0, 0.0, 0.0]], dtype=dtype), 5)
     found = torchgco.solve(problem, solver="interior_point")
     multipliers = replace(found.multipliers, mu=torch.full_like(found.cost, 1e12))  # stiffness that rounds
     left = optimality(Lagrangian(problem, multipliers, None, True), found.X, found.U).left

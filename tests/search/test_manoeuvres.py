@@ -81,6 +81,7 @@ def test_poses_are_clear_ball_by_ball() -> None:
     assert not found[room < -0.2].any()  # bodies touch a little beneath the full surface
 
 
+@pytest.mark.slow
 def test_a_path_of_poses_can_be_driven_and_is_clear() -> None:
     problem = corridor([[1.2, 1.0, 0.2]])
     clear, step = clear_at(problem, 2), 0.2

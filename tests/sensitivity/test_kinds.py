@@ -24,6 +24,7 @@ from tests.sensitivity.problems import (
     solved,
     weights,
 )
+from tests.slow import mostly
 from torchgco import Problem
 from torchgco.kernels import use_native
 
@@ -52,12 +53,12 @@ def check(
     assert float(mine[0].abs()) > 1e-3 or name == "lower"
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", mostly(KINDS, *KINDS[::3]))
 def test_among_discs(name: str) -> None:
     check(discs, numbers, name)
 
 
-@pytest.mark.parametrize("name", tuple(box_numbers()))
+@pytest.mark.parametrize("name", mostly(box_numbers(), *tuple(box_numbers())[::2]))
 def test_around_a_box(name: str) -> None:
     check(boxed, large_numbers, name)
 

@@ -87,7 +87,9 @@ def solved(problem: Problem, native: bool, give: Tensor | None = None) -> KktSol
 
 
 @pytest.mark.parametrize("native", [True, False])
-@pytest.mark.parametrize(("traced_cost", "barrier"), [(True, False), (False, False), (False, True)])
+@pytest.mark.parametrize(
+    ("traced_cost", "barrier"), [(True, False), pytest.param(False, False, marks=pytest.mark.slow), (False, True)]
+)
 def test_solutions_are_those_of_a_dense_matrix(native: bool, traced_cost: bool, barrier: bool) -> None:
     """With rows that hold as equalities, or that give way to their multipliers by shares of very different sizes."""
     problem = curved(traced_cost)

@@ -11,6 +11,7 @@ from tests.reference.augmented_lagrangian import Schedule
 from tests.reference.augmented_lagrangian import solve as reference_solve
 from tests.reference.guidance import cpuf_hook
 from tests.reference.mppi import MppiSettings
+from tests.slow import mostly
 from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.solvers.contracts import Progress
@@ -55,6 +56,7 @@ def _reference(problem, U0, b: int, tolerance: float, limit: int, guided: bool):
 
 @pytest.mark.parametrize("guided", [False, True], ids=["al_ilqr", "gco"])
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("native", mostly(["native", "eager"], "eager"), indirect=True)
 def test_iterates_follow_the_nested_loops(case: str, guided: bool, native: bool) -> None:
     make, tolerance, limit = CASES[case]
     problem, U0 = make()

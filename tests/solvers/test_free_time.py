@@ -10,6 +10,7 @@ import torch
 
 import torchgco
 from tests.problems import assert_same_bits
+from tests.slow import mostly
 from torchgco import (
     Airframe,
     ControlBounds,
@@ -201,7 +202,7 @@ def plant() -> Problem:
     return flight(QuadrotorPlant(0.1), [ControlBounds(low, high), turns], Airframe().hover_thrust)
 
 
-@pytest.mark.parametrize("name", ["euler", "midpoint", "rk4", pytest.param("plant", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", mostly(["euler", "midpoint", "rk4", "plant"], "rk4", "plant"))
 def test_quaternions_keep_their_norm_at_the_least_time(name: str) -> None:
     """Twenty seconds at the least time: the thrust isn't what the norm of a quaternion makes of it."""
     problem = plant() if name == "plant" else planning(name)
