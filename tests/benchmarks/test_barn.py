@@ -157,6 +157,7 @@ def test_a_scan_marks_the_near_sides_of_cylinders() -> None:
     assert len(cells) > 3 and (np.abs(away - RADIUS) <= CELL).all() and (cells[:, 1] < 5.0).all()
 
 
+@pytest.mark.slow
 def test_a_world_is_driven_through_a_lidar() -> None:
     layouts, known = worlds()
     assert layouts.start is not None

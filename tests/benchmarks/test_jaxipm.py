@@ -86,6 +86,7 @@ def test_two_instances_are_solved_to_the_published_tolerance(scenario: Scenario)
     np.testing.assert_allclose(cost[0], KNOWN[scenario.name], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_ipopt_as_published_finds_the_same() -> None:
     """Model, rows and guess are written a second time in CasADi."""
     published, own = by_ipopt(NAMED["tracking, pace 1.0"], torch.arange(2))

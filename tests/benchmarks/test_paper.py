@@ -86,6 +86,7 @@ def test_figures_of_a_mission_show_samples_medians_and_names() -> None:
     assert names == [["x", "y", "z"], ["roll", "pitch", "yaw"], ["x", "y", "z"]]
 
 
+@pytest.mark.slow
 def test_samples_of_a_mission_belong_to_their_control_step() -> None:
     (part,) = flights.fly(["gco_paper"], 0.15)
     for step, call in enumerate(part.sampled):

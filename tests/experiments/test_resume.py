@@ -162,6 +162,7 @@ def filed(tmp_path):
     return [*words, "hydra.run.dir=out"], save
 
 
+@pytest.mark.slow
 def test_success_follows_the_best_costs_of_the_file(run, filed, tmp_path) -> None:
     words, save = filed
     save(1e6, 1e6)

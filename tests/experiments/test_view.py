@@ -56,6 +56,7 @@ def test_missions_show_track_and_plan(run, tmp_path) -> None:
         np.testing.assert_allclose(flight["plan"], held["plan"][0, 1, :count], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_missions_with_a_sensor_show_what_was_seen(run, tmp_path, capsys, monkeypatch) -> None:
     words = ["experiment=mission_unknown", "mission.duration=0.3", "scenario.num_obstacles=5", "study.figures=false"]
     small = ["mission.lidar.rays=[60,10]", "mission.explorer.around=[4,2]", "study.view=true", "hydra.run.dir=unknown"]

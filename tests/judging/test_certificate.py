@@ -97,6 +97,7 @@ def test_an_arc_that_bulges_into_a_sphere_is_caught() -> None:
     assert float(certify(straight, X, U).clearance) == pytest.approx(chord - 0.02)
 
 
+@pytest.mark.slow
 def test_the_plants_bound_holds_for_its_true_path() -> None:
     """Plant steps a hundred times finer never leave the bound of one step."""
     start = torch.zeros(1, 17, dtype=torch.float64)

@@ -12,7 +12,7 @@ from torchgco.judging.maps import EXACT_TO, segment_distances
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_segments_from_cells(d: int) -> None:
     grid = random_grid(d, share=0.03)
     part = bound(DistanceField.of(grid))

@@ -83,6 +83,7 @@ def judged(
     return judge_flight(position, float(t[1] - t[0]), among(centers, contact, velocities), goal, radius)
 
 
+@pytest.mark.slow
 def test_random_flights_are_judged_as_by_dense_sampling() -> None:
     seen = []
     for seed in range(80):

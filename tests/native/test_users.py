@@ -178,6 +178,7 @@ def test_solve_is_native_for_a_users_own_car_and_cost() -> None:
     assert bool((solution.cost < 0.3 * problem.cost.total(*problem.at_rest)).all())
 
 
+@pytest.mark.slow
 def test_a_native_solve_does_not_load_dynamo() -> None:
     code = (
         "import sys, torchgco; from tests.native.users import errands; from dataclasses import replace;"

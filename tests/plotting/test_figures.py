@@ -29,6 +29,7 @@ def colour(patch: Rectangle) -> str:
     return to_hex(patch.get_facecolor()).upper()
 
 
+@pytest.mark.slow
 def test_figures_need_no_pyplot() -> None:
     modules = ("rates", "sweeps", "layouts", "distributions", "convergence", "style", "trajectory", "missions")
     modules += ("animation",)

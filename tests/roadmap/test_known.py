@@ -18,7 +18,7 @@ from torchgco.roadmap.roadmap import Roadmap
 SOME = torch.tensor([0, 2, 3])
 
 
-@pytest.fixture(params=["native", "pytorch"])
+@pytest.fixture(params=mostly(["native", "pytorch"], "pytorch"))
 def scene(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
     """Trunks among which some problems need more points, in groups of three problems."""
     monkeypatch.setattr(searches, "LONG", 1.01)

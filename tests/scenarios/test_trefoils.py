@@ -63,6 +63,7 @@ def test_cubes_move_on_trefoils() -> None:
                 assert np.allclose((amplitudes * np.sin(rates * t + phases)).sum(axis=0), formula, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_start_and_goal_are_clear_at_the_beginning() -> None:
     region = [[-3, 108], [-6, 6], [0.5, 4.5]]
     scenario = Trefoils(region=region, num_obstacles=100)

@@ -80,6 +80,7 @@ def test_a_coarse_disc_is_cleared_for_every_start() -> None:
     assert bool(judge(problem, solution.U).sound.all())
 
 
+@pytest.mark.slow
 def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
     """In this maze the first growth, by what the solve missed, leads to a deeper cut than before."""
     setup = compose(["scenario=mazes", "scenario.walls=4", "seed=99"])

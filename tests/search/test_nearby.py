@@ -129,6 +129,7 @@ def test_a_trajectory_is_refined_among_the_obstacles_near_it(kind: str, enough: 
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_both_searches_are_recorded_and_the_second_is_told(monkeypatch) -> None:
     _, many, U0 = planar("spheres", 9.0)
     wrong, solver = Nearby.wrong, quick_gco(many)
