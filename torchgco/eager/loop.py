@@ -112,10 +112,10 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
     t.mu = first_barrier(kinds, t)
     settle(kinds, model, t)
     sort_rows(kinds, model, t)
-    if bool(kinds.fixed(t).any()):
+    if bool(kinds.equality.any()):
         diagonal = t.scale.view(-1, 1, 1) * H.diagonal(dim1=-2, dim2=-1).abs()
-        share = torch.full_like(t.mu, how.slight)
-        t.gives = gives_of(model, model.slopes(t.X, t.U), diagonal, share, kinds.fixed(t))
+        share, rows = torch.full_like(t.mu, how.slight), kinds.equality.expand_as(t.out)
+        t.gives = gives_of(model, model.slopes(t.X, t.U), diagonal, share, rows)
     t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
     remeasure(kinds, t)
     if not how.warm:

@@ -256,14 +256,14 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
     }
 }
 
-/* Whether a row of constraint i at knot k holds as an equality in one of the lanes `of`; `active` says it of all rows. */
+/* Whether a row of constraint i at knot k is one of equalities, or `active`, in one of the lanes `of`; bounds that coincide
+   are as stiff as can be: they hide no curvature but their own variable's. */
 static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, const V *active) {
     const Constraint *con = t->lanes.of->constraint + i;
     if (con->place[k] == NOWHERE) return 0;
     int64_t q = row_of(t, i, k);
     int hold = con->equality;
-    for (int j = 0; j < con->rows; j++, q++)
-        hold |= active ? any(of & (active[q] > SET(0.0))) : t->some_out && any(of & t->fixes[q]);
+    for (int j = 0; active && j < con->rows; j++) hold |= any(of & (active[q + j] > SET(0.0)));
     return hold;
 }
 
@@ -271,7 +271,7 @@ static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, const V *acti
    `moves` are. The slopes f are those of the iterate. */
 static void soften_rows(Barrier *t, I of, V share, const V *active) {
     const Problem *p = t->lanes.of;
-    int some = t->some_out || active;
+    int some = active != 0;
     for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
     for (int64_t i = 0; i < p->constraints; i++) some |= p->constraint[i].equality;
     if (!some) return;
