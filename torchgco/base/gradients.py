@@ -76,6 +76,7 @@ def leaves(tree: Any) -> list[Any]:
 
 
 def _is_made(part: Any) -> bool:
+    """Whether this is an object of a dataclass."""
     return is_dataclass(part) and not isinstance(part, type)
 
 
@@ -107,6 +108,6 @@ def _parts(tree: Any) -> list[tuple[Any, Any]]:
         return list(tree.items())
     if isinstance(tree, (tuple, list)):
         return list(enumerate(tree))
-    if is_dataclass(tree) and not isinstance(tree, type) and hasattr(tree, "__dict__"):
+    if _is_made(tree) and hasattr(tree, "__dict__"):
         return list(vars(tree).items())
     return []
