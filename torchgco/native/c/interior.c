@@ -82,7 +82,7 @@ static V steepest(const Barrier *t, V *plain) {
     *plain = zero;
     for (int v = 0; v < S; v++) {
         V by = most(size[v], SET(SMALLEST));
-        by = tgco_choose((size[v] > zero) & (by < SET(SMALL)), by, one);
+        by = tgco_choose((size[v] > zero) & (by < SET(ORDINARY)), by, one);
         largest = most(most(slope[v] * by, bend[v] * by * by), largest);
         *plain = most(most(slope[v], bend[v]), *plain);
     }
