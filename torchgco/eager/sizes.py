@@ -14,11 +14,11 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.model import Model
 
 ORDINARY = 1e-2  # sizes from here on are those of ordinary units
-SMALLEST = 1e-6  # sizes below may be rounding of larger numbers
+ROUNDED = 1e-6  # sizes below may be rounding of larger numbers
 
 
 def steepest(model: Model, X: Tensor, U: Tensor, slopes: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
-    """The largest slope or curvature (b,) of the cost in any variable, in units of its size if this is below `ORDINARY`.
+    """The largest slope or curvature (b,) of the cost in any variable, in units of its size where this is small.
 
     Beside it, the same (b,) in the problem's own units.
 
@@ -33,7 +33,7 @@ def steepest(model: Model, X: Tensor, U: Tensor, slopes: Tensor, H: Tensor) -> t
     size = torch.maximum(size, torch.cat((X.abs().amax(1), U.abs().amax(1)), dim=-1))
     _measure_bounds(model, size)
     _infer(model, X, U, size)
-    by = torch.where((size > 0.0) & (size < ORDINARY), size.clamp(min=SMALLEST), 1.0)
+    by = torch.where((size > 0.0) & (size < ORDINARY), size.clamp(min=ROUNDED), 1.0)
     slopes, curvature = slopes.amax(1), curvature.amax(1)
     largest = lambda by: torch.maximum(slopes * by, curvature * by * by).amax(-1)
     return largest(by), largest(torch.ones_like(by))
