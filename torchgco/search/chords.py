@@ -37,9 +37,9 @@ class ClearChords(Row):
 
     Obstacles grow by 1.1 times the clearance that the last solve missed, or a little more, and the solve continues from
     the best trajectory: by AL-iLQR, and where that finds nothing by the interior point alone. A trajectory is replaced
-    where the new one is feasible for the obstacles as they are, has arrived if the old one had, and keeps more clearance
-    between the knots. Openings may leave no room for it: there a more expensive trajectory of the passes before that is
-    clear is taken back.
+    where the new one is feasible for the obstacles as they are, has arrived if the old one had, and keeps clearer of
+    them between the knots. Openings may leave no room for it: there a more expensive trajectory of the passes before
+    that is clear is taken back.
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before; in maps, by the interior point alone,
