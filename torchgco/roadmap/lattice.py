@@ -23,6 +23,7 @@ MAPS_KEPT = 8  # maps whose clearances are kept, the most recent ones, by field
 LATTICE_REACH = 2.0  # vehicle's radii, and at least so many spacings, that the lattice extends beyond a map
 BESIDE_MAP = 1.3  # times as large as they are, spheres and boxes beside a map lie within the lattice
 LATTICE_NODES = 2**24  # nodes of a lattice; one that would need more doesn't extend to start and goal
+SAMPLED = {2: 2**16, 3: 2**18}  # nodes of a lattice among spheres and boxes, about, by the dimension of space
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,41 @@ def lattice_of(fields: Sequence[BoundField], solids: Sequence[Solids], ends: Arr
     clearances = _clearances(first, np.concatenate(points))
     origin = np.asarray(first.origins[0].numpy() - first.field.spacing * clearances.low, np.float64)
     return Lattice(clearances, origin, tuple(others), present)
+
+
+def sampled(solids: Sequence[Solids], ends: Array) -> Lattice:
+    """The clearances of one problem at the nodes of a lattice around spheres and boxes and two points (2, d).
+
+    No clearance counts as more than twice the largest size, or four spacings.
+    """
+    d, each = ends.shape[1], [one for part in solids for one in _each(part)]
+    reaches = [(one.centers[0, 0].numpy(), (one.extent[0, 0] + one.radii[0, 0]).numpy()) for one in each]
+    points = np.concatenate([ends, *((center - reach, center + reach) for center, reach in reaches)])
+    wide = np.ptp(points, axis=0)
+    count = lambda spacing: np.ceil(wide / spacing + 2.0 * LATTICE_REACH).astype(int) + 1
+    spacing = float(wide.max()) / SAMPLED[d] ** (1.0 / d)
+    while np.prod(count(0.9 * spacing), dtype=float) <= SAMPLED[d]:  # where space is flat or long
+        spacing *= 0.9
+    origin, size = points.min(0) - LATTICE_REACH * spacing, count(spacing)
+    most = max([4.0 * spacing, *(2.0 * float(one.sizes[0, 0]) for one in each)])
+    values = np.full(size, most, np.float32)
+    for one, (center, reach) in zip(each, reaches, strict=True):
+        low, high = (np.rint((center + side * (reach + most) - origin) / spacing).astype(int) for side in (-1.0, 1.0))
+        near = tuple(slice(max(0, a), b + 1) for a, b in zip(low, high, strict=True))
+        nodes = np.stack(
+            np.meshgrid(*(np.arange(n)[own] for n, own in zip(size, near, strict=True)), indexing="ij"), -1
+        )
+        away = one.signed_distance(torch.from_numpy(origin + spacing * nodes.reshape(1, -1, d)))
+        np.minimum(values[near], away.numpy().reshape(nodes.shape[:-1]), out=values[near])
+    return Lattice(Clearances(values, np.zeros(d, int), size, spacing, 0.0, 0.0, False), origin, (), ())
+
+
+def _each(part: Solids) -> list[Solids]:
+    """The obstacles of one problem that are there, one by one."""
+    return [
+        type(part)(*(own[:, j : j + 1] for own in vars(part).values()))
+        for j in (~part.absent[0]).nonzero().flatten().tolist()
+    ]
 
 
 def _clearances(field: BoundField, points: Array) -> Clearances:

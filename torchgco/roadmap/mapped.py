@@ -23,7 +23,7 @@ from torchgco.base.tree import on_cpu, take
 from torchgco.roadmap import blocks as searched
 from torchgco.roadmap.blocks import Blocks, blocks_of
 from torchgco.roadmap.geometry import Inflated, Scene
-from torchgco.roadmap.lattice import Array, Lattice, lattice_of
+from torchgco.roadmap.lattice import Array, Lattice, lattice_of, sampled
 from torchgco.roadmap.search import DIVERSITY, HOPS
 
 # The most cells of a search, the clearance of free ones in spacings of the nodes, and whether free ones are merged; of
@@ -51,7 +51,7 @@ Search = Callable[[Lattice, Array, Price, float, float], list[Array]]  # with th
 
 
 def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Tensor]:
-    """As `Roadmap.paths`, where there are maps among the obstacles."""
+    """As `Roadmap.paths`, over blocks of a lattice: of maps, or of nodes among spheres and boxes."""
     return in_each(scene, count, overlap, partial(paths, count=count, corners=HOPS + 1))
 
 
@@ -79,8 +79,12 @@ def in_one(scene: Scene, b: int, overlap: float, search: Search) -> list[Array]:
 
     ends = torch.stack((scene.start[b], scene.goal[b])).double().cpu().numpy()
     with computing_on(torch.device("cpu")):  # the search is of NumPy's arrays, wherever the problem lies
-        lattice = lattice_of(obstacles.maps, obstacles.kinds, ends)
-        return search(lattice, ends, price, float(obstacles.maps[0].vehicle_radius[0]), float(obstacles.largest))
+        if obstacles.maps:
+            lattice, radius = lattice_of(obstacles.maps, obstacles.kinds, ends), obstacles.maps[0].vehicle_radius
+        else:
+            lattice = sampled(obstacles.kinds, ends)
+            radius = lattice.spacing
+        return search(lattice, ends, price, float(radius), float(obstacles.largest))
 
 
 def sweep_alike(paths: Tensor, obstacles: Inflated) -> Tensor:

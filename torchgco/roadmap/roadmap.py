@@ -86,6 +86,10 @@ class Roadmap:
             for course in self._courses(scene, some, first, count, library, known or Known()):
                 corners[place[course.rows]] = torch.stack(course.paths[:count], dim=1)
                 found[place[course.rows]] = course.found
+        some = (scene.obstacles.sizes[rows] > 0.0).any(-1) & (scene.start[rows] != scene.goal[rows]).any(-1)
+        lost = (~found & some).nonzero().flatten()
+        if lost.numel() > 0:
+            corners[lost], found[lost] = paths_in_maps(scene.take(rows[lost]), count, self.max_overlap)
         return corners, found
 
     def clear_path(self, scene: Scene) -> tuple[Tensor, Tensor]:
