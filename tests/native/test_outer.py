@@ -19,6 +19,7 @@ from torchgco.lagrangian.state import SolveEnd
 from torchgco.native.engine import Engine
 from torchgco.native.packing import is_bounded
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.horizons import for_solvers
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Call
 
@@ -100,6 +101,22 @@ def test_guided_and_printed_solves_agree(preset: str, monkeypatch: pytest.Monkey
     native, other = both(monkeypatch, lambda: solver.outer_loop(Call.checked(problem, U0), solver.guidance))
     assert native.guided.tolist() == other.guided.tolist() and native.outer.tolist() == other.outer.tolist()
     torch.testing.assert_close(native.best.cost, other.best.cost, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("N", [1, 7, 8, 25])
+def test_lines_count_up_to_each_problems_own_last_knot(N: int) -> None:
+    problem, U0 = planar_batch(B=5, N=N, obstacles=9, seed=4)
+    part, spheres = (
+        for_solvers(replace(problem, horizon=[1 + b * (N - 1) // 4 for b in range(5)])),
+        problem.obstacles[0],
+    )
+    X = open_loop(part, U0 + 0.3 * torch.randn(U0.shape, generator=torch.Generator().manual_seed(1), dtype=U0.dtype))
+    X[:, -1, :2] = spheres.inflated().centers[:, 0]
+    rows = [spheres.take([b]).chord_clearance(X[[b], : 2 + b * (N - 1) // 4], 0.0) for b in range(5)]
+    torch.testing.assert_close(chord_clearance(part, X, 0.0), torch.cat(rows), rtol=1e-12, atol=1e-12)
+    assert bool((chord_clearance(problem, X, 0.0) < 0).all())
+    X[1, 1, 0] = torch.nan
+    assert torch.isnan(chord_clearance(part, X, 0.0)).tolist() == [False, True, False, False, False]
 
 
 @pytest.mark.parametrize("moving", [False, True])

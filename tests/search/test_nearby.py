@@ -46,6 +46,15 @@ def trajectories(solution: Solution) -> tuple[torch.Tensor, ...]:
     return solution.X, solution.U, solution.cost, solution.status, solution.iterations
 
 
+def test_fewer_obstacles_leave_the_scale_of_the_cost_as_it_is() -> None:
+    _, many, U0 = planar("spheres", 9.0)
+    near = Nearby.of(Call.checked(many, U0))
+    assert near is not None
+    scale = near.given.problem.cost_scale
+    assert near.call.problem.cost_scale is scale
+    assert all(map(torch.equal, scale, near.call.problem.renewed().cost_scale))
+
+
 @pytest.mark.parametrize("kind", ["spheres", "boxes"])
 def test_far_obstacles_change_no_bit(kind: str) -> None:
     few, many, U0 = planar(kind, 9.0)

@@ -24,6 +24,7 @@ from torchgco import (
     QuadraticCost,
     Roadmap,
     judge,
+    presets,
     solve,
 )
 from torchgco.dynamics.rollout import open_loop
@@ -33,6 +34,12 @@ from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.homotopy import classes
 from torchgco.search import Follow, Refine
 from torchgco.solvers.ilqr import descend
+
+
+def test_rows_that_fit_keep_the_steps_that_they_have_made() -> None:
+    space, plane = (presets.gco(d).passes.paths for d in (3, 2))
+    assert space.fitting(4) is space and plane.fitting(2) is plane
+    assert plane.fitting(3).follow.initial_offsets == ()
 
 
 def test_a_proposal_ends_near_the_goal_and_has_a_penalty() -> None:

@@ -32,7 +32,10 @@ from torchgco import (
 from torchgco.base.tree import take
 from torchgco.baselines import CasADiSolver
 from torchgco.dynamics.rollout import open_loop
+from torchgco.kernels import interior_of
+from torchgco.native.codegen.source import LANES
 from torchgco.native.compiler import find_compiler
+from torchgco.native.interior import InteriorEngine
 from torchgco.solvers import interior
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
@@ -404,7 +407,7 @@ def test_a_result_has_the_same_bits_in_every_batch() -> None:
     problem = flights()
     together = solved(problem)
     assert len(set(together.iterations.tolist())) > 2
-    for rows in ([3], [19], range(7), range(8), range(9), range(19, -1, -1), [5, 5, 5, 2, 5]):
+    for rows in ([3], [19], [3, 19], [3, 19, 4], range(7), range(8), range(9), range(19, -1, -1), [5, 5, 5, 2, 5]):
         index = torch.tensor(list(rows))
         assert_same_bits(solved(problem.take(index)), together.take(index))
     try:
@@ -412,6 +415,21 @@ def test_a_result_has_the_same_bits_in_every_batch() -> None:
         assert_same_bits(solved(problem), together)
     finally:
         torch.set_num_threads(1)  # as conftest has it
+
+
+def test_few_problems_take_few_lanes_but_not_a_few_of_many() -> None:
+    """A second library would be compiled in the middle of a large solve."""
+    problem = flights()
+    assert [lanes_of(problem.take(slice(0, count)).renewed()) for count in (1, 3, 20)] == [2, 4, LANES]
+    assert lanes_of(problem) == lanes_of(problem.take([0])) == LANES
+    few = problem.take([0, 1]).renewed()
+    assert lanes_of(few) == lanes_of(few.take([0, 1, 0, 1, 0])) == 2
+
+
+def lanes_of(problem: Problem) -> int:
+    kernels = interior_of(problem)
+    assert isinstance(kernels, InteriorEngine)
+    return kernels.lanes
 
 
 def test_an_empty_batch_has_an_empty_solution() -> None:
@@ -496,6 +514,22 @@ def test_a_start_inside_an_obstacle_has_a_status_of_its_own() -> None:
     solution, rest = solved(inside), torch.tensor([0, 2, 3])
     assert solution.statuses[1] == Status.INVALID_START
     assert_same_bits(solution.take(rest), solved(problem).take(rest))
+
+
+def test_controls_are_rolled_out_only_where_they_are_needed_beside_states(monkeypatch) -> None:
+    """A problem that never begins has the rollout of its controls, whatever the states."""
+    problem = everything()
+    x0 = problem.x0.clone()
+    x0[1, :2] = torch.tensor([-0.3, 0.12])
+    inside = Problem(problem.dynamics, problem.cost, problem.constraints, x0, problem.N)
+    X0 = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1)
+    refused = InteriorPoint().solved(Call.checked(inside, zeros(inside)), X0)
+    rollout = open_loop(inside.dynamics, x0, zeros(inside))
+    assert int(refused.status[1]) == Status.INVALID_START
+    torch.testing.assert_close(refused.best.X[1], rollout[1], rtol=1e-12, atol=1e-12)
+    assert float(refused.best.violation[1]) > 0
+    monkeypatch.setattr(interior, "guessed", lambda call: pytest.fail("rolled out"))
+    assert bool((InteriorPoint().solved(Call.checked(problem, zeros(problem)), X0).iterations > 0).all())
 
 
 def test_where_no_time_is_left_the_guess_is_returned_and_not_called_feasible() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import fields, is_dataclass, replace
+from functools import cache
 from typing import Any, ClassVar, Self, TypeAlias
 
 import torch
@@ -49,8 +51,21 @@ def take(tree: Any, index: Rows) -> Any:
         rows = (take(leaf, index) for leaf in tree)
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
     if is_dataclass(tree) and not isinstance(tree, type):
-        return replace(tree, **{f.name: take(getattr(tree, f.name), index) for f in fields(tree)})
+        return _changed(tree, lambda leaf: take(leaf, index))
     return tree
+
+
+def _changed(tree: Any, change: Callable[[Any], Any]) -> Any:
+    """A dataclass with each of its fields changed; they are checked already."""
+    other = object.__new__(type(tree))
+    for name in _names(type(tree)):
+        object.__setattr__(other, name, change(getattr(tree, name)))
+    return other
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(kind))
 
 
 class LastTaken:
@@ -126,7 +141,7 @@ def copied(tree: Any) -> Any:
     if isinstance(tree, tuple):
         return tuple(copied(leaf) for leaf in tree)
     if is_dataclass(tree) and not isinstance(tree, type):
-        return replace(tree, **{f.name: copied(getattr(tree, f.name)) for f in fields(tree)})
+        return _changed(tree, copied)
     return tree
 
 
@@ -145,5 +160,5 @@ def put(tree: Any, index: Tensor, rows: Any) -> None:
         for leaf, new in zip(tree, rows, strict=True):
             put(leaf, index, new)
     elif is_dataclass(tree) and not isinstance(tree, type):
-        for f in fields(tree):
-            put(getattr(tree, f.name), index, getattr(rows, f.name))
+        for name in _names(type(tree)):
+            put(getattr(tree, name), index, getattr(rows, name))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable
+from functools import partial
 
 import torch
 
@@ -64,7 +65,7 @@ def kernels_of(problem: Problem) -> Kernels:
 def _natively(problem: Problem) -> NativeKernels | None:
     warned = problem.known.warned
     try:
-        return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
+        return NativeKernels(_engine(problem), problem.B, lambda error: _warn(warned, error))
     except (InputError, NativeError) as error:
         _check_eager(problem)
         _warn(warned, error)
@@ -99,7 +100,8 @@ def expect_interior(problem: Problem) -> None:
 
 def _engine(problem: Problem) -> Engine:
     """The engine of an earlier solve where nothing that its code depends on has changed, else a new one."""
-    before, ahead = signature(problem), begin_interior if problem.known.expects_interior else None
+    before, expects = signature(problem), problem.known.expects_interior
+    ahead = partial(begin_interior, B=problem.B) if expects else None
     if before is None:
         return Engine(problem, ahead)
     key = before.key, find_compiler()

@@ -39,14 +39,15 @@ class NativeKernels:
 
     Args:
         engine: the library of the problems' form.
+        B: problems of a solve, all in all; see `InteriorEngine`.
         warn: is called with the reason why something is left to PyTorch's kernels.
     """
 
     name = "native"
     compiled = True
 
-    def __init__(self, engine: Engine, warn: Callable[[Exception], None]) -> None:
-        self.engine, self._warn = engine, warn
+    def __init__(self, engine: Engine, B: int, warn: Callable[[Exception], None]) -> None:
+        self.engine, self.B, self._warn = engine, B, warn
         self._samplers: dict[Hashable, Sampler] = {}
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
@@ -110,7 +111,7 @@ class NativeKernels:
 
     def interior(self, problem: Problem) -> InteriorKernels:
         try:
-            return InteriorEngine(self.engine)
+            return InteriorEngine(self.engine, self.B)
         except InputError as error:  # second derivatives whose code would be too long
             self._warn(error)
             return TorchKernels().interior(problem)

@@ -254,11 +254,13 @@ class Engine:
     def _summed(self, lagrangian: Lagrangian, best: Multipliers | None = None) -> c.Problem:
         """The problem with multipliers, penalties and guide."""
         multipliers = lagrangian.multipliers
-        rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
-        for row, lam in zip(rows, multipliers.lam, strict=True):
-            row.lam = None if _is_blank(lam) else lam.contiguous()
-        for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
-            row.best = lam
+        rows = self._fixed(lagrangian.problem)[1]
+        if best is not None or not all(map(_is_blank, multipliers.lam)):
+            rows = [constraint.copy() for constraint in rows]
+            for row, lam in zip(rows, multipliers.lam, strict=True):
+                row.lam = None if _is_blank(lam) else lam.contiguous()
+            for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
+                row.best = lam
         own = {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
         return self.packed(lagrangian.problem, **own, **guide_of(lagrangian.penalty))
 

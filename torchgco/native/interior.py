@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import torch
@@ -24,22 +25,19 @@ FEW_LANES = 2, 4  # lanes of libraries for few problems
 class InteriorEngine:
     """The library of a form of problems; compiled when it is made.
 
+    Args:
+        B: problems of a solve, all in all. For few of them there are libraries that solve as few side by side: lanes
+            without a problem take time, too.
+
     Raises:
         InputError: a part without a counterpart in C.
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-        self.library = self._with_lanes(LANES)
-
-    def for_few(self, B: int) -> tuple[ctypes.CDLL, int]:
-        """A library for B problems, and how many it solves side by side: lanes without a problem take time, too."""
-        lanes = next((lanes for lanes in FEW_LANES if B <= lanes < LANES), LANES)
-        return self._with_lanes(lanes), lanes
-
-    def _with_lanes(self, lanes: int) -> ctypes.CDLL:
-        return self.engine.further(("interior", lanes), lambda: self.engine.form.units(INTERIOR, lanes=lanes))
+    def __init__(self, engine: Engine, B: int) -> None:
+        self.engine, self.lanes = engine, _lanes(B)
+        units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
+        self.library: ctypes.CDLL = engine.further(("interior", self.lanes), units)
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
@@ -66,7 +64,7 @@ class InteriorEngine:
             row.lam = lam
         packed = self.engine.packed(problem, X=X, U=U, constraint=rows, **out)
         run(
-            self.library.tgco_interior, B, LANES,
+            self.library.tgco_interior, B, self.lanes,
             Interior.complete(
                 of=packed, barrier=barrier, free_start=None if free is None else free.double().contiguous(),
                 **ends, **options,
@@ -98,7 +96,7 @@ class InteriorEngine:
         sides = {name: part.clone(memory_format=torch.contiguous_format) for name, part in sides.items()}
         costates, left = X.new_zeros(B, problem.N + 1, n), X.new_zeros(right.a.shape[0], B)
         run(
-            self.library.tgco_kkt, B, LANES,
+            self.library.tgco_kkt, B, self.lanes,
             Kkt.complete(
                 of=packed, active=active.double().contiguous(), give=give, y=costates, left=left, **sides, problems=B,
                 free_start=None if free is None else free.double().contiguous(), count=right.a.shape[0],
@@ -108,7 +106,11 @@ class InteriorEngine:
         return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, out["status"] == Status.CONVERGED)
 
 
-def begin_interior(engine: Engine) -> None:
-    """Start to compile both libraries of a form of which the first one is about to be loaded."""
+def begin_interior(engine: Engine, B: int) -> None:
+    """Start to compile both libraries for B problems of a form of which the first one is about to be loaded."""
     with suppress(InputError):
-        begin(engine.form.units(), engine.form.units(INTERIOR))
+        begin(engine.form.units(), engine.form.units(INTERIOR, lanes=_lanes(B)))
+
+
+def _lanes(B: int) -> int:
+    return next((lanes for lanes in FEW_LANES if B <= lanes < LANES), LANES)

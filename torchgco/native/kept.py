@@ -36,7 +36,7 @@ class Kept:
         B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
         self.engine, self.problem = kernels.engine, problem
         self._read: Shared | None = None  # what functions have captured, when C was last given it
-        self.library, self.lanes = kernels.for_few(B)
+        self.library, self.lanes = kernels.library, kernels.lanes
         self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
         self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
         self.gains = like.new_zeros(B, N, m, n + 1)

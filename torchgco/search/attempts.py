@@ -207,7 +207,7 @@ class Search:
     def begin(self, first: SolveEnd) -> None:
         """Keep the first solve of every problem."""
         self._best = Best(self.call, first, self.solver, self.recorder, self.record)
-        self._caught = copied(first)
+        self._caught = first  # of which `Best` has a copy
 
     def next_pass(self, number: int, name: str) -> None:
         """Count the passes in the records."""
@@ -273,14 +273,15 @@ class Search:
         if not proposals.continues:
             rows = self.rows(proposals.when)
             rows = rows[~self.steered[rows]]
-            watches = self.call.callback is not None or self.call.deadline is not None
-            watch = partial(self._watched, rows) if watches else unwatched
-            problem, places = self.call.problem.take(rows), self.call.rows[rows]
-            begun = Round(problem, proposals.at_once, watch, places, self.record) if rows.numel() > 0 else None
-            self._round = None if begun is None else (rows, begun)
+            self._round = (rows, self._begun_round(proposals, rows)) if rows.numel() > 0 else None
         if self._round is not None:
             rows, begun = self._round
             self.best.worked[rows[begun.improve(proposals)]] = True
+
+    def _begun_round(self, proposals: PathProposals, rows: Tensor) -> Round:
+        watches = self.call.callback is not None or self.call.deadline is not None
+        watch = partial(self._watched, rows) if watches else unwatched
+        return Round(self.call.problem.take(rows), proposals.at_once, watch, self.call.rows[rows], self.record)
 
     def take_round(self) -> tuple[Tensor, Round] | None:
         """The problems of the round of proposals, and the round; it is over."""

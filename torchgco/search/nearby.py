@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchgco.base.tree import put
 from torchgco.constraints.base import Constraint
-from torchgco.kernels import chord_clearance, kernels_of, measured
+from torchgco.kernels import chord_clearance, cost_unit, measured
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.obstacles.base import Obstacles, Solids
@@ -109,8 +109,10 @@ def without_obstacles(problem: Problem) -> Problem | None:
 
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
-    kernels_of(problem)  # which both then share: two forms would trace the problem twice
+    """The problems with fewer obstacles, which share kernels and the scale of the cost: neither depends on these."""
+    cost_unit(problem)
     other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None, interior=None))
+    object.__setattr__(other, "cost_scale", problem.cost_scale)
     return other
 
 

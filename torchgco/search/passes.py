@@ -145,8 +145,8 @@ class IntoGoal(Row):
         if goal is not None and goal.required:  # its rows attract all attempts
             return
         rows = search.rows("close")
-        start = take(best.end.best, rows)
         if rows.numel() > 0:
+            start = take(best.end.best, rows)
             call = replace(search.call.take(rows), U0=start.U, warm=start.multipliers)
             best.improve(rows, call, penalty=_goal_region(call.problem))
 

@@ -141,7 +141,8 @@ class Paths(Row):
 
     def fitting(self, m: int) -> Self:
         """Without initial offsets that have another number of controls than m."""
-        return replace(self, follow=self.follow.fitting(m))
+        follow = self.follow.fitting(m)
+        return self if follow is self.follow else replace(self, follow=follow)  # the same has its steps already
 
 
 @dataclass(frozen=True)

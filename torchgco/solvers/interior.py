@@ -155,25 +155,30 @@ class InteriorPoint(Solver):
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         kernels = interior_of(problem)
-        guess = guess or guessed(call)
-        rollout = guess.X
-        X = rollout if X0 is None else torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
+        if X0 is None:
+            guess = guess or guessed(call)
+            X = guess.X
+        else:
+            X = torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
         status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
         X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
         end = SolveEnd.blank(problem, call.U0)
-        end.best.X[:] = rollout  # where a solve never begins
-        end.best.cost[:], end.best.violation[:] = guess.cost, guess.violation
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
+        begun = torch.zeros_like(status, dtype=torch.bool)
         for part in rows.split(REPORTED_AT_ONCE):
             if call.late:
                 end.status[part] = Status.TIME_LIMIT
                 continue
             self._some(kernels, call.take(part), X[part], part, end, smoothing)
+            begun[part] = True
             if call.callback is not None:
                 done = int((end.status != Status.RUNNING).sum())
                 call.callback(Progress(1, call.rows[part], done, problem.B))
+        if not bool(begun.all()):
+            others = (~begun).nonzero().flatten()
+            put(end.best, others, take(guess or guessed(call), others))
         return end
 
     def no_worse(self, call: Call, guess: Iterate, end: SolveEnd) -> SolveEnd:

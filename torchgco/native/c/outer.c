@@ -302,37 +302,50 @@ static inline V from_segment(const V *a, const V *along) {
 }
 
 /* The smallest distance of the straight lines between knots from spheres whose radii are scaled by `gain`, into `merit`;
-   infinite without one. */
+   infinite without one. Here the lanes are knots: a problem alone takes as long as one of many. */
 int tgco_chords(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        V least = SET(__builtin_inf());
-        for (int l = 0; l < LANES; l++) enter_iterate(s, l, e + l < last ? e + l : e);
+    int64_t N = p->N, blocks = (N + LANES - 1) / LANES;
+    V *points = aligned_alloc(sizeof(V), 2 * DIM * blocks * sizeof(V)); /* the first and the last one of each line */
+    if (!points) return 0;
+    for (int64_t e = first; e < last; e++) {
+        V least = SET(__builtin_inf()), knot;
+        for (int64_t i = 0; i < 2 * DIM * blocks; i++)
+            for (int l = 0; l < LANES; l++) {
+                int64_t k = i / (2 * DIM) * LANES + l, end = i / DIM % 2;
+                points[i][l] = p->X[(e * (N + 1) + (k < N ? k : N - 1) + end) * NX + POSITION + i % DIM];
+            }
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
-            const Rows *rows = s->rows + i;
             if (con->kind != SPHERES) continue;
-            for (int j = 0; j < con->rows; j++) {
-                V radius = SET(p->gain) * tgco_sqrt(rows->squares[j]), a[DIM], b[DIM], along[DIM], nearest = least;
-                I here = rows->squares[j] >= SET(0.0);
-                for (int64_t k = 0; k <= p->N; k++) {
-                    sphere(con, rows, j, k, s->X + k * NX, b);
-                    for (int d = 0; k > 0 && d < DIM; d++) along[d] = b[d] - a[d];
-                    if (k > 0) {
-                        V gap = tgco_sqrt(from_segment(a, along)) - radius;
-                        I closer = (gap < nearest) | (gap != gap); /* NaN stays */
-                        if (con->stops.data) closer &= SET(k) <= rows->stops[0];
-                        nearest = tgco_choose(closer, gap, nearest);
+            const double *o = con->bound.data + e * con->bound.element;
+            const double *squares = con->squares.data + e * con->squares.element;
+            const double *v = con->velocities.data ? con->velocities.data + e * con->velocities.element : NULL;
+            double stop = con->stops.data ? con->stops.data[e * con->stops.element] : __builtin_inf();
+            for (int64_t j = 0; j < con->rows; j++, o += DIM, v += v ? DIM : 0) {
+                if (!(squares[j] >= 0)) continue;
+                V radius = SET(p->gain * __builtin_sqrt(squares[j])), a[DIM], along[DIM];
+                for (int64_t block = 0; block < blocks; block++) {
+                    const V *from = points + 2 * DIM * block, *to = from + DIM;
+                    for (int l = 0; l < LANES; l++) knot[l] = block * LANES + l < N ? block * LANES + l : N - 1;
+                    for (int d = 0; d < DIM; d++) {
+                        V b = to[d] - SET(o[d]);
+                        a[d] = from[d] - SET(o[d]);
+                        if (v) {
+                            SUBTRACT(a[d], knot * SET(con->dt), SET(v[d]));
+                            SUBTRACT(b, (knot + SET(1.0)) * SET(con->dt), SET(v[d]));
+                        }
+                        along[d] = b - a[d];
                     }
-                    memcpy(a, b, sizeof a);
+                    V gap = tgco_sqrt(from_segment(a, along)) - radius;
+                    I closer = ((gap < least) | (gap != gap)) & (knot + SET(1.0) <= SET(stop)); /* NaN stays */
+                    least = tgco_choose(closer, gap, least);
                 }
-                least = tgco_choose(here, nearest, least);
             }
         }
-        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = least[l];
+        p->merit[e] = least[0];
+        for (int l = 1; l < LANES; l++) if (least[l] < p->merit[e] || least[l] != least[l]) p->merit[e] = least[l];
     }
-    finish(s);
+    free(points);
     return 1;
 }
 #endif
