@@ -304,7 +304,7 @@ def guessed(*parts: Any) -> Tensor:
 
 
 def test_the_default_guess_of_controls_is_within_norms_and_cones() -> None:
-    """At rest, (0, 0, 0.5), all hold but the bounds: then the size moves, then the direction; what holds keeps its bits."""
+    """At rest, (0, 0, 0.5): what holds keeps its bits; elsewhere sizes move, then directions."""
     assert torch.equal(guessed(), guessed(NormBounds("u", 0.4, 1.0), Cone([0.0, 0.0, 1.0], 0.3, "u")))
     assert torch.allclose(
         guessed(NormBounds("u", [0.6, 0.4, 0.6], [1.0, 1.0, torch.inf]))[:, 0, 2], each(0.8, 0.5, 1.2)
