@@ -24,7 +24,7 @@ from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.in_time import at_times, guessing_times
+from torchgco.problem.in_time import at_times, guessing_times, paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
@@ -262,6 +262,7 @@ def touches(problem: Problem, solution: Solution) -> Tensor:
     rows = found.nonzero().flatten()
     if rows.numel() == 0:
         return found
+    problem = paced(problem, solution.times)
     nearest = torch.full_like(solution.cost[rows], torch.inf)
     for part in problem.constraints:
         if isinstance(part, tuple(CLEARANCES)):
