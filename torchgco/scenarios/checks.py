@@ -266,7 +266,7 @@ def gates(centers: Any, radii: Any, like: np.ndarray) -> tuple[np.ndarray | None
 
 
 def free_time(value: Any, velocities: np.ndarray | None) -> np.ndarray | None:
-    """(least, most, weight): factors of the stages' length, and the cost of a second; of layouts where nothing moves."""
+    """(least, most, weight): factors of the stages' length, and the cost of a second; only where nothing moves."""
     if value is None:
         return None
     given = array(value, "layouts.free_time")
