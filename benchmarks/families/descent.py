@@ -1,12 +1,12 @@
-"""python -m benchmarks.families.descent: powered descents with least fuel, beside their convex relaxation.
+"""python -m benchmarks.families.descent: powered descents with least fuel, and their convex relaxation.
 
 The lander of Acikmese and Ploen ("Convex programming approach to powered descent guidance for Mars landing", 2007): a
 point whose mass is a state and whose thrust has a least and a largest size, here also a largest angle from the vertical
 (Acikmese, Carson and Blackmore, 2013), above a glide slope, with a free time and a required end at rest. Starts are
 drawn. `gco` has no guess but the nominal time that its problem names.
 
-The relaxation, of the logarithm of the mass, acceleration and slack as these papers say, is convex for a time that is
-held; the least fuel over times is found by a search along a line. The largest thrust, which the papers replace by a
+The relaxation, of the logarithm of the mass, acceleration and slack as these papers say, is convex for a fixed
+time; the least fuel over times is found by a search along a line. The largest thrust, which the papers replace by a
 tangent that forbids some of it, is replaced by a chord that allows more: the value is a lower bound, but for stages
 along which the acceleration is constant there, the thrust here.
 """

@@ -1,8 +1,8 @@
-"""python -m benchmarks.families.moving: least times through lanes of moving discs, beside fixed times on a grid.
+"""python -m benchmarks.families.moving: least times through lanes of moving discs, and at fixed times on a grid.
 
 A point with bounded acceleration and speed crosses five lanes in each of which five discs move the same way, within
-walls. Time and a little effort are the cost, the end at rest is required. Besides `gco` with `FreeTime`, each layout is
-solved by `gco` at fixed times, shares of the duration that was found, without any code of free times: stages of a model
+walls. Time and a little effort are the cost, the end at rest is required. Each layout is solved by `gco` with
+`FreeTime`, and at fixed times, shares of the duration that was found, without any code of free times: stages of a model
 that is so much faster or slower, among discs that are, too.
 """
 
@@ -40,7 +40,7 @@ TIMES = 2.0, 20.0  # s
 EFFORT = 0.2  # per second, of half the square of the acceleration
 NOMINAL = 6.0, 12.0  # s
 SHARES = 0.7, 0.76, 0.82, 0.88, 0.94, 1.0  # of the duration found, at which time is fixed
-DEARER = 5e-3  # share of the cost
+NEAR = 5e-3  # share of the cost
 BALL = 0.2  # m, of the vehicle
 
 
@@ -87,10 +87,10 @@ def fixed(count: int, seed: int, durations: Tensor) -> Tensor:
     best = torch.full_like(durations, math.inf)
     for part in SHARES:
         pace = part * durations / NOMINAL[0]
-        held = problem(count, seed, NOMINAL[0], pace)
-        found = torchgco.solve(held, verbose=False)
+        stated = problem(count, seed, NOMINAL[0], pace)
+        found = torchgco.solve(stated, verbose=False)
         cost = part * durations + pace * found.cost
-        best = torch.where(torchgco.judge(held, found.U).sound & (cost < best), cost, best)
+        best = torch.where(torchgco.judge(stated, found.U).sound & (cost < best), cost, best)
     return best
 
 
@@ -113,11 +113,11 @@ def text(count: int, seed: int) -> str:
                      f"{np.median(counts):.0f} ({counts.max()})", f"{spent:.2f}"])  # fmt: skip
     grid = fixed(count, seed, durations[0])
     for row, cost, other in zip(rows, costs, reversed(costs), strict=True):
-        row += [share(int((cost > (1.0 + DEARER) * rival).sum()), count) for rival in (grid, other)]
+        row += [share(int((cost > (1.0 + NEAR) * rival).sum()), count) for rival in (grid, other)]
         known = torch.isfinite(grid) & torch.isfinite(cost)
         row.append(f"{float((cost / grid)[known].median()):.4f} ({float((cost / grid)[known].max()):.4f})")
     head = ["nominal time, s", "sound", "CONVERGED", "duration, s (most)", "iterations (most)", "s a layout",
-            "dearer by over 0.5 % than at fixed times", "than from the other nominal time",
+            "costs over 0.5 % more than at fixed times", "than from the other nominal time",
             "cost / that at fixed times (most)"]  # fmt: skip
     return markdown(head, rows)
 
