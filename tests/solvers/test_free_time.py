@@ -335,21 +335,22 @@ def test_a_moving_disc_is_passed_at_the_time_that_is_found() -> None:
     verdict = judge(problem, found.U, times=found.t)
     assert bool(verdict.sound.all()) and float(verdict.clearance[1]) < 0.1
     proof = torchgco.certify(problem, found.X, found.U, times=found.t)
-    for b, spheres in enumerate(problem.take([i]).obstacles[0] for i in range(3)):  # by plain differences
-        middle = spheres.centers[0, 0] + (found.t[b] * spheres.velocities[0, 0, 1])[:, None] * torch.eye(2, dtype=D)[1]
+    spheres: Any = problem.obstacles[0]
+    for b in range(3):  # by plain differences
+        middle = spheres.centers[b, 0] + found.t[b, :, None] * spheres.velocities[b, 0]
         gaps = (found.X[b, :, :2] - middle).norm(dim=-1)
         assert float(verdict.clearance_knots[b]) == pytest.approx(float(gaps.min()) - 0.95 * 0.6, abs=1e-9)
         assert float(proof.clearance[b]) <= float(gaps.min()) - 0.6 + 1e-9
     again = torchgco.solve(problem, warm=found)
     torch.testing.assert_close(again.duration, found.duration, rtol=1e-3, atol=0)
-    alone = torchgco.solve(problem.take([1]), ids=torch.tensor([1]))
+    alone = torchgco.solve(problem.take(torch.tensor([1])), ids=torch.tensor([1]))
     assert torch.equal(alone.X[0], found.X[1]) and torch.equal(alone.duration[0], found.duration[1])
 
 
 @pytest.mark.slow
 def test_a_moving_disc_in_other_hands() -> None:
     """IPOPT and the interior point alone find clear ways at their own times; the figure draws the disc where it is."""
-    problem = before_or_behind().take([1])
+    problem = before_or_behind().take(torch.tensor([1]))
     for solver in ("ipopt", "interior_point"):
         found = torchgco.solve(problem, solver=solver)
         assert bool(judge(problem, found.U, times=found.t).sound.all())
