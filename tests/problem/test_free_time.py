@@ -218,7 +218,8 @@ def test_rows_of_moving_spheres_follow_the_time() -> None:
     """Depths and derivatives by each factor, and those of spheres that move that much faster."""
     user, draws = among_moving(), torch.Generator().manual_seed(3)
     whole, factor = in_time(user), torch.tensor([0.6, 2.3], dtype=D)
-    part, spheres = whole.constraints[0], user.constraints[0]
+    part: Any = whole.constraints[0]
+    spheres: Any = user.constraints[0]
     X = 2.0 * torch.rand(2, N + 1, whole.n, generator=draws, dtype=D)
     X[..., 4] = factor.unsqueeze(-1)
     U = torch.zeros(2, N, 2, dtype=D)
