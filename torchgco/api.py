@@ -16,6 +16,7 @@ from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
+from torchgco.constraints.norms import within_norms
 from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.worst import NO_PLACE, kind_of
@@ -23,7 +24,7 @@ from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.in_time import at_times, guessing_times
+from torchgco.problem.in_time import at_times, guessing_times, paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
@@ -64,7 +65,7 @@ def solve(
     Args:
         problem: B problems.
         U0: initial controls (B, N, m). Default: those of `warm`, else the cost's reference, else zero; the middle of
-            the bounds where that breaks these, or where the rollout overflows.
+            the bounds where that breaks these, or where the rollout overflows; within `NormBounds` and cones.
         solver: a solver, or the name of a preset (`torchgco.presets`). Default: "gco".
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
@@ -261,6 +262,7 @@ def touches(problem: Problem, solution: Solution) -> Tensor:
     rows = found.nonzero().flatten()
     if rows.numel() == 0:
         return found
+    problem = paced(problem, solution.times)
     nearest = torch.full_like(solution.cost[rows], torch.inf)
     for part in problem.constraints:
         if isinstance(part, tuple(CLEARANCES)):
@@ -303,16 +305,18 @@ def show(problem: Problem, solution: Solution) -> HtmlPage:
 def _guess(problem: Problem, whole: Problem) -> Tensor:
     """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these or overflows.
 
-    A bound at infinity has no middle: there the other bound, or rest.
+    A bound at infinity has no middle: there the other bound, or rest. Bounds on norms and cones move both inside.
     """
     with computing_on(problem.x0.device):
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+        rest = within_norms(rest, problem.constraints)
         middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
         for bounds in problem.constraints:
             if isinstance(bounds, ControlBounds):
                 held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
                 outside[:, bounds.knots] |= (held < lower) | (held > upper)
                 middle[:, bounds.knots] = bounds.middle(held)
+        middle = within_norms(middle, problem.constraints)
         next_factors = rest.new_ones(*rest.shape[:2], whole.m - problem.m)  # where the time is free
         lost = ~torch.isfinite(open_loop(whole, torch.cat((rest, next_factors), dim=-1))).flatten(1).all(-1)
         return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)

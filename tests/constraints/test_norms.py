@@ -26,6 +26,7 @@ from torchgco import (
     Status,
     certify,
 )
+from torchgco.api import _guess
 from torchgco.baselines import CasADiSolver
 from torchgco.kernels import EagerWarning, measured
 
@@ -296,3 +297,29 @@ def test_an_own_violation_is_the_one_that_is_measured() -> None:
         float(measured(Problem(model, cost, [kind("u", upper=0.5)], x0, 5), X, U)) for kind in (NormBounds, Lenient)
     ]
     assert abs(worst[0] - (2**0.5 - 0.5)) < 1e-12 and abs(worst[1] - 0.5 * worst[0]) < 1e-12
+
+
+def guessed(*parts: Any) -> Tensor:
+    return _guess(problem := lander(*parts), problem)
+
+
+def test_the_default_guess_of_controls_is_within_norms_and_cones() -> None:
+    """At rest, (0, 0, 0.5): what holds keeps its bits; elsewhere sizes move, then directions."""
+    assert torch.equal(guessed(), guessed(NormBounds("u", 0.4, 1.0), Cone([0.0, 0.0, 1.0], 0.3, "u")))
+    assert torch.allclose(
+        guessed(NormBounds("u", [0.6, 0.4, 0.6], [1.0, 1.0, torch.inf]))[:, 0, 2], each(0.8, 0.5, 1.2)
+    )
+    assert torch.allclose(guessed(NormBounds("u", upper=0.4))[..., 2], each(0.2))
+    both = NormBounds("u", 0.6, 1.0, knots=FIVE), Cone([3.0, 0.0, 4.0], 0.3, "u", apex=[0.0, 0.0, 0.1])
+    found = guessed(*both)
+    assert torch.allclose(found[0, 4], each(0.24, 0.0, 0.42)) and torch.allclose(found[0, 3], each(0.42, 0.0, 0.66))
+    around = guessed(
+        NormBounds(("u", [0, 1]), 0.2, 0.6), Cone([0.0, -1.0], 0.3, ("u", [0, 1]))
+    )  # at rest in the centre
+    assert torch.allclose(around, each(0.0, -0.4, 0.5))
+    alone = guessed(NormBounds(("u", [0, 1]), 0.2, 0.6))
+    assert torch.allclose(alone[..., :2].norm(dim=-1), each(0.4)) and torch.equal(alone[..., 2], each(0.5).expand(B, N))
+
+
+def each(*numbers: float) -> Tensor:
+    return torch.tensor(numbers, dtype=D)

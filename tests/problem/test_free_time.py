@@ -8,12 +8,15 @@ import pytest
 import torch
 
 from torchgco import (
+    Body,
+    Boxes,
     ControlBounds,
     FreeTime,
     FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
     InputError,
+    OscillatingBoxes,
     Problem,
     QuadraticCost,
     RateBounds,
@@ -170,10 +173,6 @@ UNSERVED = [
         {"cost": QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4, x_ref=torch.arange(36, dtype=D).view(1, 9, 4))},
         "cost: expected the same cost at all stages",
     ),
-    (
-        {"constraints": [Spheres([[3.0, 0.0]], [0.2], vehicle_radius=0.1, velocities=[[0.1, 0.0]])]},
-        "constraints[0]: expected obstacles that stand still",
-    ),
 ]
 
 
@@ -201,3 +200,59 @@ def test_parts_of_a_batch_keep_their_own_times() -> None:
     assert (float(part.time.least), float(part.time.weight)) == (0.7, 3.0)
     assert user.cast(torch.float32).time.least.dtype == torch.float32  # type: ignore[union-attr]
     assert in_time(part).constraints[-1].lower[0, 3] == 0.7  # type: ignore[attr-defined]
+
+
+def among_moving(**parts: Any) -> Problem:
+    x0 = torch.tensor([[0.0, 0.0, 0.5, 0.0], [0.1, 0.2, 0.0, 0.3]], dtype=D)
+    velocities = [[[0.1, -0.4], [0.3, 0.2], [0.0, 0.0]], [[-0.2, 0.1], [0.5, 0.0], [0.0, 0.0]]]
+    centers = [[[2.0, 1.0], [1.0, -1.0], [3.0, 3.0]], [[1.5, 0.5], [2.0, 2.0], [np.nan, np.nan]]]
+    radii = [[0.2, 0.3, 0.4], [0.3, 0.2, np.nan]]
+    given: dict[str, Any] = {"time": FreeTime(), "constraints": [Spheres(centers, radii, 0.1, velocities)], **parts}
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, DT, "rk4", slice(0, 2))
+    return Problem(
+        model, QuadraticCost([0.0] * 4, [1.0] * 2, [0.0] * 4), given["constraints"], x0, N, time=given["time"]
+    )
+
+
+def test_rows_of_moving_spheres_follow_the_time() -> None:
+    """Depths and derivatives by each factor, and those of spheres that move that much faster."""
+    user, draws = among_moving(), torch.Generator().manual_seed(3)
+    whole, factor = in_time(user), torch.tensor([0.6, 2.3], dtype=D)
+    part: Any = whole.constraints[0]
+    spheres: Any = user.constraints[0]
+    X = 2.0 * torch.rand(2, N + 1, whole.n, generator=draws, dtype=D)
+    X[..., 4] = factor.unsqueeze(-1)
+    U = torch.zeros(2, N, 2, dtype=D)
+    expected = np.zeros((2, N, 3))
+    for b in range(2):
+        for k in range(1, N + 1):
+            for j in range(3 - b):
+                there = spheres.centers[b, j] + k * DT * float(factor[b]) * spheres.velocities[b, j]
+                expected[b, k - 1, j] = float(spheres.inflated_radii[b, j] - (X[b, k, :2] - there).norm())
+    expected[1, :, 2] = -1.0
+    np.testing.assert_allclose(part.violation(X, U), expected.clip(min=0.0), atol=1e-12)
+    assert bool(((part.value(X, U) > 0) == torch.from_numpy(expected > 0)).all())
+    torch.testing.assert_close(part.at(X[:, 3:4], 3), part.value(X, U)[:, 2:3])
+    for name in ("distances", "chord_clearance"):
+        torch.testing.assert_close(getattr(part, name)(X), getattr(part.at_factor(factor), name)(X))
+    X[..., 4] += torch.rand(2, N + 1, generator=draws, dtype=D)  # on the way of a solver factors differ
+    g, h = (torch.rand(2, N, 3, generator=draws, dtype=D) for _ in range(2))
+    H = torch.zeros(2, N + 1, whole.n + 3, whole.n + 3, dtype=D)
+    part.accumulate(X, U, g, h, H)
+    (slopes,) = torch.func.jacrev(lambda x: (part.value(x, U),))(X)
+    for b in range(2):
+        for k in range(N):
+            J = slopes[b, k, :, b, k + 1]
+            torch.testing.assert_close(H[b, k + 1, : whole.n, whole.n], g[b, k] @ J)
+            torch.testing.assert_close(H[b, k + 1, : whole.n, : whole.n], J.mT @ (h[b, k].unsqueeze(-1) * J))
+
+
+def test_what_moves_otherwise_is_refused_in_a_free_time() -> None:
+    body = Body([[0.1, 0.0], [-0.1, 0.0]], 0.1, attitude=lambda x: torch.eye(2, dtype=D).expand(*x.shape[:-1], 2, 2))
+    swings = OscillatingBoxes(Boxes([[3.0, 0.0]], [[0.5, 0.5]], 0.1), [[[0.3, 0.0]]], [[[1.0, 1.0]]], [[[0.0, 0.0]]])
+    moving = [[0.1, 0.0]]
+    for part in (swings, Spheres([[3.0, 0.0]], [0.2], body, moving)):
+        with pytest.raises(InputError, match=r"constraints\[0\]: expected where the time is free, obstacles at rest"):
+            among_moving(constraints=[part])
+    with pytest.raises(InputError, match=r"time.segments: expected None among obstacles that move, got 2 segments"):
+        among_moving(time=FreeTime(segments=2))

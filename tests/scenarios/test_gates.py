@@ -88,6 +88,12 @@ def test_wrong_arrays_are_named(changes: dict, told: str) -> None:
         replace(drawn, **changes)
 
 
+def test_the_time_is_given_where_spheres_move() -> None:
+    drawn = GateForest(num_gates=(3, 3)).draw([0], 0)
+    with pytest.raises(InputError, match="free_time: expected None where spheres move"):
+        replace(drawn, velocities=np.where(np.isnan(drawn.centers), np.nan, 0.1))
+
+
 def test_missions_refuse_them() -> None:
     with pytest.raises(InputError, match="scenario: expected one in space for a mission"):
         compose(["experiment=mission", "scenario=gates"])

@@ -307,3 +307,52 @@ def test_state_bounds_are_certified_too() -> None:
         found = torchgco.solve(problem, solver="interior_point")
         proof = torchgco.certify(problem, found.X, found.U, times=found.t)
         assert float(proof.bound_violation.max()) < 1e-6
+
+
+def before_or_behind(**time: Any) -> Problem:
+    """A disc crosses the way of a ball, which gets to the other side in the least time before it, or behind it."""
+    there = torch.tensor([4.0, 0.0, 0.0, 0.0], dtype=D)
+    x0 = torch.zeros(3, 4, dtype=D)
+    cost = QuadraticCost([0.0] * 4, [1e-3] * 2, [0.0] * 4, x_ref=there)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4", slice(0, 2))
+    lane = StateBounds([-INF, -0.2, -INF, -INF], [INF, 0.2, INF, INF])
+    heights = torch.tensor([[[2.0, -5.0]], [[2.0, -1.6]], [[2.0, 0.4]]], dtype=D)
+    crossing = Spheres(heights, [0.5], 0.1, [[0.0, 1.0]])
+    goal = Goal(state=there, required=True)
+    return Problem(
+        model, cost, [ControlBounds(-2.0, 2.0), lane, crossing], x0, 30, goal, time=FreeTime(0.5, 4.0, **time)
+    )
+
+
+def test_a_moving_disc_is_passed_at_the_time_that_is_found() -> None:
+    """It comes too late to matter; it is waited for; it was there before. Judge, certificate and files see the same."""
+    problem = before_or_behind()
+    found = torchgco.solve(problem)
+    free = 2.0 * (4.0 / 2.0) ** 0.5
+    assert bool((found.violation <= 1e-6).all())
+    torch.testing.assert_close(found.duration[[0, 2]], torch.full((2,), free, dtype=D), rtol=1e-2, atol=0)
+    assert float(found.duration[1]) > 1.05 * free
+    verdict = judge(problem, found.U, times=found.t)
+    assert bool(verdict.sound.all()) and float(verdict.clearance[1]) < 0.1
+    proof = torchgco.certify(problem, found.X, found.U, times=found.t)
+    spheres: Any = problem.obstacles[0]
+    for b in range(3):  # by plain differences
+        middle = spheres.centers[b, 0] + found.t[b, :, None] * spheres.velocities[b, 0]
+        gaps = (found.X[b, :, :2] - middle).norm(dim=-1)
+        assert float(verdict.clearance_knots[b]) == pytest.approx(float(gaps.min()) - 0.95 * 0.6, abs=1e-9)
+        assert float(proof.clearance[b]) <= float(gaps.min()) - 0.6 + 1e-9
+    again = torchgco.solve(problem, warm=found)
+    torch.testing.assert_close(again.duration, found.duration, rtol=1e-3, atol=0)
+    alone = torchgco.solve(problem.take(torch.tensor([1])), ids=torch.tensor([1]))
+    assert torch.equal(alone.X[0], found.X[1]) and torch.equal(alone.duration[0], found.duration[1])
+
+
+@pytest.mark.slow
+def test_a_moving_disc_in_other_hands() -> None:
+    """IPOPT and the interior point alone find clear ways at their own times; the figure draws the disc where it is."""
+    problem = before_or_behind().take(torch.tensor([1]))
+    for solver in ("ipopt", "interior_point"):
+        found = torchgco.solve(problem, solver=solver)
+        assert bool(judge(problem, found.U, times=found.t).sound.all())
+    figure = torchgco.plot(problem, found)
+    assert figure.axes and torchgco.show(problem, found).save

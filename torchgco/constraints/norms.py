@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, tensor
@@ -140,6 +142,20 @@ class NormBounds(_Vectors):
         rows = [there * (sign * (size - bound)).clamp(min=0.0) for sign, bound, there in self._sides()]
         return torch.stack(rows, dim=-1)
 
+    def moved_inside(self, U: Tensor) -> Tensor:
+        """The vectors (B, K, c) of controls U, those beyond a bound with the size in the middle of both.
+
+        One in the centre goes along the diagonal; where there is one bound alone, its double or its half is the size.
+        """
+        away, center = self._away(U, U), 0.0 if self.center is None else self.center
+        size = away.norm(dim=-1, keepdim=True)
+        direction = torch.where(size > 0, normalize(away, dim=-1), away.shape[-1] ** -0.5)
+        least = size.new_zeros(1, 1) if self.lower is None else self.lower
+        most = size.new_full((1, 1), torch.inf) if self.upper is None else self.upper
+        middle = torch.where(torch.isfinite(most), 0.5 * (least + most), 2.0 * least).unsqueeze(-1)
+        beyond = (size < least.unsqueeze(-1)) | (size > most.unsqueeze(-1))
+        return torch.where(beyond, center + middle * direction, self._vectors(U, U))
+
     def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
         away = self._away(X, U)
         return torch.stack([(sign * there / bound).unsqueeze(-1) * away for sign, bound, there in self._sides()], -2)
@@ -244,6 +260,12 @@ class Cone(_Vectors):
         outside = torch.where(behind, v.norm(dim=-1), outside)
         return outside.clamp(min=0.0).unsqueeze(-1)
 
+    def moved_inside(self, U: Tensor, turned: Tensor) -> Tensor:
+        """The vectors (B, K, c) of controls U; those outside, and `turned` (B, K, 1) bool, along the axis."""
+        v, apex = self._directed(U, U), 0.0 if self.apex is None else self.apex
+        turned = turned | (self.violation(U, U) > 0)
+        return torch.where(turned, apex + v.norm(dim=-1, keepdim=True) * self._direction, self._vectors(U, U))
+
     def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
         z, v = self._vectors(X, U), self._directed(X, U)
         cosine, sine = self.angle.cos().unsqueeze(-1), self.angle.sin().unsqueeze(-1)
@@ -259,6 +281,27 @@ class Cone(_Vectors):
         )
         along = sum(self._direction[..., i : i + 1] * part for i, part in enumerate(by_axis))
         return (2.0 * (cosine * z - along) / sine).unsqueeze(-2)
+
+
+def within_norms(U: Tensor, constraints: Iterable[Constraint]) -> Tensor:
+    """Controls (B, N, m) moved to where the bounds on their norms and their cones hold; itself where all do.
+
+    Sizes move first, then directions: what had none, as a norm's lower bound has no slope there, takes the cone's.
+    """
+    parts = [part for part in constraints if isinstance(part, _Vectors) and part.of == "u"]  # type: ignore[attr-defined]
+    found = U.clone()
+    for part in (part for part in parts if isinstance(part, NormBounds)):
+        _put(found, part, part.moved_inside(found))
+    for part in (part for part in parts if isinstance(part, Cone)):
+        began = part._vectors(U, U).abs().amax(-1, keepdim=True)
+        _put(found, part, part.moved_inside(found, began == 0))
+    return found
+
+
+def _put(U: Tensor, part: _Vectors, vectors: Tensor) -> None:
+    some = U[:, part.knots]  # type: ignore[attr-defined]
+    some[..., part.components] = vectors
+    U[:, part.knots] = some  # type: ignore[attr-defined]
 
 
 def _chosen(

@@ -30,6 +30,7 @@ from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.horizons import within_horizons
@@ -239,6 +240,7 @@ def _ball_chords(body: BoundBody, X: Tensor, bulge: Tensor) -> Tensor:
 # bounds of them, which are close where they are below 0.
 CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
+    SpheresInFreeTime: lambda part, X: _sphere_chords(part.along(X.unsqueeze(0)), X),
     BoundBoxes: _box_chords,
     BoundOscillatingBoxes: _oscillating_chords,
     BoundField: _field_chords,

@@ -26,6 +26,7 @@ from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.goal import Goal
@@ -354,6 +355,7 @@ def body_clearance(body: BoundBody, X: Tensor) -> tuple[Tensor, Tensor]:
 # By kind of obstacles: smallest distances (B,) from X (B, N+1, n) to where bodies touch, at the knots and between them.
 CLEARANCES: dict[type[Constraint], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
     BoundSpheres: sphere_clearance,
+    SpheresInFreeTime: lambda part, X: sphere_clearance(part.along(X), X),
     BoundBoxes: box_clearance,
     BoundOscillatingBoxes: oscillating_clearance,
     BoundField: field_clearance,

@@ -40,6 +40,7 @@ from torchgco.native.packing import (
 )
 from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import STRUCTURES, Kind, array
+from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
@@ -354,7 +355,7 @@ os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child has none of 
 def _measured(part: Constraint) -> bool:
     """Whether violations are what the base class says of rows, or C finds them from these."""
     if part.row_radii is not None:
-        return type(innermost(part)).violation is NormBounds.violation
+        return type(innermost(part)).violation in (NormBounds.violation, SpheresInFreeTime.violation)
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
 
 

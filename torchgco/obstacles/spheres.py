@@ -202,6 +202,16 @@ class BoundSpheres(Obstacles):
         )  # fmt: skip
         return replace(moved, stops=self.stops)
 
+    def paced(self, factor: Tensor) -> BoundSpheres:
+        """The same spheres, which move `factor` (B,) times as far from knot to knot."""
+        if self.velocities is None:
+            return self
+        faster = self.prepare(
+            self.centers, self.inflated_radii, factor.view(-1, 1, 1) * self.velocities, self.absent,
+            self.vehicle_radius, self.knots, self.position, self.dt,
+        )  # fmt: skip
+        return replace(faster, stops=self.stops)
+
     def chosen(self, at: Tensor) -> BoundSpheres:
         absent = (at < 0) | picked(self.absent, at)
         centers = torch.where(absent.unsqueeze(-1), 0.0, picked(self.centers, at))

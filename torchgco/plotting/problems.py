@@ -38,6 +38,7 @@ from torchgco.plotting.silhouettes import draw_body, extent
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.trajectory import LIMIT
 from torchgco.plotting.world import World, distances, world_of
+from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
@@ -70,6 +71,7 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
     check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
     courses, unit = _courses(problem, solution, _places(b, problem.B))
+    problem = paced(problem, solution.times)
     at = problem.dynamics.position
     planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if at is None else at.stop - at.start, ())
     shared = [courses] if _is_shared(problem, courses) else [[course] for course in courses]

@@ -14,6 +14,7 @@ from torchgco.base.shapes import MISTAKES, Dimensions, tensor
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import resolve_knots
 from torchgco.costs.base import Cost
+from torchgco.obstacles.spheres import BoundSpheres
 
 A_CLOCK = "time as a state of the model's own, whose derivative is 1, says what it is"
 ALIKE = 1e-9  # difference of a stage cost from that of another stage, as a share, that is no dependence on the stage
@@ -137,7 +138,13 @@ def check_served(problem: Any) -> None:
         raise InputError("cost", f"the same cost at all stages where the time is free; {A_CLOCK}", "one per stage")
     for i, part in enumerate(problem.constraints):
         if getattr(part, "moving", False):
-            raise InputError(f"constraints[{i}]", "obstacles that stand still where the time is free", "moving ones")
+            if not isinstance(part, BoundSpheres):
+                expected = "where the time is free, obstacles at rest, or Spheres that a ball is clear of"
+                raise InputError(
+                    f"constraints[{i}]", expected, f"{type(part).__name__.removeprefix('Bound')} that move"
+                )
+            if problem.time.count > 1:
+                raise InputError("time.segments", "None among obstacles that move", f"{problem.time.count} segments")
 
 
 def _depends_on_stage(problem: Any) -> bool:

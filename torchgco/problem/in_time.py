@@ -23,11 +23,14 @@ from torchgco.costs.base import Cost, WrappedCost
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.in_free_time import SpheresInFreeTime
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.problem import Problem
 from torchgco.problem.rates import IN_PLACE
 
 FREE_TIME_FORM = "in free time"  # what is kept with the form of the problem for this one
+HELD_FORM = "at held times"  # the same, where obstacles move
 PIN = 1e-3  # cost of a next tau that nobody reads, per unit squared, as a share of that of the nominal stages' time
 EQUAL = 1e-6  # difference of two stages of a segment, as a share of the duration: that of times in single precision
 
@@ -134,6 +137,34 @@ def guessing_times(problem: Problem, times: Any) -> Problem:
     assert problem.time is not None
     guess = factors_of(problem, times).clamp(problem.time.least, problem.time.most)
     return problem._with({"time": replace(problem.time, guess=guess)}, problem.known)
+
+
+def paced(problem: Problem, times: Tensor | None) -> Problem:
+    """The user's problem with obstacles that move in a stage of dt as they do in one at the times (B, N+1), s.
+
+    Itself where none moves, or the time isn't free.
+    """
+    if problem.time is None or times is None or not any(part.moving for part in problem.obstacles):
+        return problem
+    factor = factors_of(problem, times)[:, 0]
+    parts = (part.paced(factor) if isinstance(part, BoundSpheres) else part for part in problem.constraints)
+    return problem._with({"constraints": tuple(parts)})
+
+
+def at_held_times(problem: Problem, n: int) -> Problem:
+    """Problems `in_time` whose factor, their state n, is held at x0, and whose own starts stay as free as they are."""
+    free = problem.free_start
+    assert free is not None
+    own, known = free.clone(), problem.known
+    own[:, n] = False
+    parts: tuple[Constraint, ...] = tuple(
+        part.at_factor(problem.x0[:, n]) if isinstance(part, SpheresInFreeTime) else part
+        for part in problem.constraints
+    )
+    if any(a is not b for a, b in zip(parts, problem.constraints, strict=True)):
+        known = known.of_lifted(HELD_FORM)
+    held = problem._with({"free_start": own, "constraints": parts}, known)
+    return held if bool(own.any()) else held.held_at(problem.x0)
 
 
 def at_times(problem: Problem, X: Tensor, U: Tensor, times: Any) -> tuple[Problem, Tensor, Tensor]:
@@ -274,6 +305,8 @@ def _constraint(constraint: Constraint, problem: Problem) -> Constraint:
     if isinstance(constraint, ControlBounds) and problem.time is not None and problem.time.count > 1:
         return replace(constraint, lower=pad(constraint.lower, (0, 1), value=-torch.inf),
                        upper=pad(constraint.upper, (0, 1), value=torch.inf))  # fmt: skip
+    if isinstance(constraint, BoundSpheres) and constraint.moving:
+        return SpheresInFreeTime(constraint, n)
     if isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE:
         return constraint
     return _Rows(constraint, n, m)

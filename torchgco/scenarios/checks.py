@@ -265,8 +265,8 @@ def gates(centers: Any, radii: Any, like: np.ndarray) -> tuple[np.ndarray | None
     return middle, sizes
 
 
-def free_time(value: Any) -> np.ndarray | None:
-    """(least, most, weight): factors of the stages' length, and the cost of a second."""
+def free_time(value: Any, velocities: np.ndarray | None) -> np.ndarray | None:
+    """(least, most, weight): factors of the stages' length, and the cost of a second; only where nothing moves."""
     if value is None:
         return None
     given = array(value, "layouts.free_time")
@@ -275,6 +275,8 @@ def free_time(value: Any) -> np.ndarray | None:
     least, most, weight = given.tolist()
     if not 0 < least <= most or weight < 0:
         raise InputError("layouts.free_time", "0 < least <= most, and a weight of at least 0", given.tolist())
+    if velocities is not None and bool(np.nan_to_num(velocities).any()):
+        raise InputError("layouts.free_time", "None where spheres move: a study's pictures show given times", "a time")
     return given
 
 

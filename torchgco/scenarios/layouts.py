@@ -129,7 +129,7 @@ class Layouts:
             put(name, value)
         for name, value in zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True):
             put(name, value)
-        put(TIME, checks.free_time(self.free_time))
+        put(TIME, checks.free_time(self.free_time, self.velocities))
         put(BINDS, checks.required(self.goal_required))
         for name in ("start", "goal"):
             put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))

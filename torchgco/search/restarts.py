@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 PASSES = Passes((Solve(), PathProposals(), FromProposal(), FromSamples("unproposed"), IntoGoal(), ClearChords()))
 
 TIME_PACES = 0.7, 1.0, 1.4  # of the times found, where the time is free: each is a search of its own
+MOVING_PACES = 0.6, 0.7, 0.8, 0.9, 1.0, 1.2  # the same among obstacles that move: each gap opens at a time of its own
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,8 @@ class Restarts(Solver):
         bodies = (part.absent.shape[1] > 0 if isinstance(part, Obstacles) else True for part in problem.geometric)
         if not any(bodies):
             return self.interior.choosing_time(problem)
-        return Chooser(self, self.interior, self.local.violation_tolerance, paces=TIME_PACES)
+        paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
+        return Chooser(self, self.interior, self.local.violation_tolerance, paces=paces)
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""

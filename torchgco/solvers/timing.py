@@ -22,7 +22,7 @@ from torchgco.base.tree import put, spread, take
 from torchgco.costs.base import WrappedCost
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
-from torchgco.problem.in_time import factors_in, in_time, states_in_time, times_of
+from torchgco.problem.in_time import at_held_times, factors_in, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.history import appended, in_units
@@ -145,7 +145,7 @@ class Timed:
 
     def _held(self, rows: Tensor, call: Any) -> None:
         """Find trajectories at the time of the call's starts, and free it."""
-        held = replace(call, problem=_at_held_times(call.problem, self.problem.n), warm=None)
+        held = replace(call, problem=at_held_times(call.problem, self.problem.n), warm=None)
         solver = self.chooser.held
         first = solver.run(held if solver.take_states(held.problem) else replace(held, X0=None))
         does = first.violation <= self.chooser.limit
@@ -233,15 +233,6 @@ def _to_the_farthest(problem: Problem, line: Tensor, legs: Legs) -> Tensor:
     line = line.clone()
     line[:, -1, problem.position] = legs.farthest
     return line
-
-
-def _at_held_times(problem: Problem, n: int) -> Problem:
-    """Problems `in_time` whose factor, their state n, is held at x0, and whose own starts stay as free as they are."""
-    free = problem.free_start
-    assert free is not None
-    own = free.clone()
-    own[:, n] = False
-    return problem._with({"free_start": own}, problem.known) if bool(own.any()) else problem.held_at(problem.x0)
 
 
 def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | None) -> Solution:

@@ -8,6 +8,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
 from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
@@ -34,7 +35,9 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         raise InputError("problem", "at least one problem to show", "an empty batch")
     shape = shape_of(problem)
     look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
-    flights = flights_of(problem, look, solution.X, solution.U, name, results, rows, ADMITTED, touching)
+    flights = flights_of(
+        paced(problem, solution.times), look, solution.X, solution.U, name, results, rows, ADMITTED, touching
+    )
     t_of, dt = _times(problem, solution)
     N, radius = problem.N, max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
     document = Document(
