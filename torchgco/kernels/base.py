@@ -75,6 +75,11 @@ class Kernels(Protocol):
     name: str
     compiled: bool
 
+    @property
+    def affine(self) -> bool:
+        """Whether the dynamics are known to be affine in states and controls."""
+        ...
+
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X from the problem's start and controls U."""
         ...
