@@ -27,7 +27,7 @@ class InteriorKernels(Protocol):
 
     def kkt(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
-        right: RightSides, give: Tensor | None = None,
+        right: RightSides, give: Tensor | None = None, K: Tensor | None = None,
     ) -> KktSolve:  # fmt: skip
         """See `InteriorEngine.kkt`."""
         ...

@@ -21,7 +21,7 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
 from torchgco.sensitivity.form import for_systems, for_user
 from torchgco.sensitivity.function import Solved, System
-from torchgco.sensitivity.points import Points, points_of
+from torchgco.sensitivity.points import Points, gains_of, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
@@ -149,7 +149,7 @@ def _system(at: Points) -> System:
     if type(problem.cost) is BoundQuadratic:
         # Its numbers may be the user's own tensors, which a step of an optimizer changes before `backward`.
         problem = problem._with({"cost": copied(problem.cost)}, problem.known)
-    return System(problem, found.X, found.U, found.multipliers.lam, at.active, at.give)
+    return System(problem, found.X, found.U, found.multipliers.lam, at.active, at.give, gains_of(problem, found))
 
 
 def _values(live: Problem, at: Points, of: Residual) -> tuple[Tensor, ...]:

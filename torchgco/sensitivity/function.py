@@ -34,6 +34,7 @@ class System:
     multipliers: tuple[Tensor, ...]
     active: Tensor  # (B, R) bool
     give: Tensor | None = None  # (B, R)
+    K: Tensor | None = None  # (B, N, m, n)
 
     def once(self, x: Tensor, u: Tensor, gaps: Tensor | None, rows: Tensor) -> tuple[Tensor, ...]:
         """`solve` of one right hand side, or of all those that `is_grads_batched` and `vectorize` hide in one."""
@@ -59,7 +60,7 @@ class System:
             a = torch.cat((x, torch.nn.functional.pad(u, (0, 0, 0, 1))), dim=-1)
             right = RightSides(a, gaps, rows)
             point = self.X, self.U, self.multipliers, self.active
-            found = interior_of(self.problem).kkt(self.problem, *point, right, self.give)
+            found = interior_of(self.problem).kkt(self.problem, *point, right, self.give, self.K)
         return found.z[..., :n], found.z[:, :, :-1, n:], found.y, found.v
 
 
