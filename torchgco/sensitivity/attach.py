@@ -26,6 +26,7 @@ from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
 EXACT_STEP = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
+EXACT_COSTATES = 1e-5  # share of the largest costate by which that step may change one
 SERVED = "a problem in float64"
 
 
@@ -108,7 +109,7 @@ def attached(
             if rows.numel() > 0:
                 raise
             return for_user(problem, _constant(found), solution.K)  # a user's function that takes no empty batch
-        near = _step_left(at, found_at) <= EXACT_STEP
+        near = _are_exact(at, found_at)
         if not bool(near.all()):
             points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
             rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)
@@ -132,15 +133,15 @@ def _live(problem: Problem, at: Points, rows: Tensor) -> Problem:
     return live.grown(at.growth) if bool((at.growth > 0).any()) else live
 
 
-def _step_left(at: Points, of: Residual) -> Tensor:
-    """The step (B,) from the points to where the conditions hold to first order, as a share of 1 + the largest state or
-    control; infinite where it isn't a number."""
+def _are_exact(at: Points, of: Residual) -> Tensor:
+    """Whether the step (B,) from the points to where the conditions hold to first order is small, and a number."""
     with not_recording():
         c = of.rows if at.gap is None else of.rows + at.gap
-        x, u, _, _ = _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None])
+        x, u, y, _ = (part[0].abs() for part in _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None]))
         size = 1.0 + torch.maximum(at.solution.X.abs().flatten(1).amax(-1), at.solution.U.abs().flatten(1).amax(-1))
-        step = torch.maximum(x[0].abs().flatten(1).amax(-1), u[0].abs().flatten(1).amax(-1)) / size
-        return torch.where(torch.isfinite(step), step, torch.inf)
+        step = torch.maximum(x.flatten(1).amax(-1), u.flatten(1).amax(-1))
+        largest = at.costates.abs().flatten(1).amax(-1)
+        return (step <= EXACT_STEP * size) & (y.flatten(1).amax(-1) <= EXACT_COSTATES * largest)
 
 
 def _system(at: Points) -> System:
