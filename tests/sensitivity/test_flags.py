@@ -148,7 +148,6 @@ def test_functions_that_take_no_empty_batch() -> None:
     """Gradients of their problems are those of tensors that a loss doesn't depend on."""
     ends, x0 = FunctionConstraint(lambda x: x[..., :1] - 0.2, "equality", knots=[N]), start((1.0, 0.0))
 
-
     def field(x: Tensor, u: Tensor) -> Tensor:
         if x.numel() == 0:
             raise ValueError("nothing to do")

@@ -89,7 +89,9 @@ class Converge(Row):
         held = call.problem.cost.total(X, U)
         rows = (open_ & torch.isfinite(held) & ~(best.cost <= held)).nonzero().flatten()
         if rows.numel() > 0:
-            keep_tight(search, rows, search.interior.solved(replace(call.take(rows), U0=U[rows], callback=None), X[rows]))
+            keep_tight(
+                search, rows, search.interior.solved(replace(call.take(rows), U0=U[rows], callback=None), X[rows])
+            )
 
     @staticmethod
     def worth(problem: Problem) -> bool:
