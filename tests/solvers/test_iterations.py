@@ -120,7 +120,7 @@ def test_steps_of_a_polish_count_without_an_improvement_too(made: list[int], mon
 
 @pytest.mark.parametrize("bend", [0.0, 0.3])
 def test_convex_problems_are_solved_once(bend: float) -> None:
-    """`gco` begins once more where the start held costs less, though no step holds it; not where it found the minimum."""
+    """`gco` begins once more where the start held costs less; not where what it found is known to be the least."""
     drift = lambda x, u: x + 0.1 * u + 0.2 + bend * x.sin()
     model = FunctionDynamics(drift, 1, 1, 0.1, "none")
     problem = Problem(model, QuadraticCost([1.0], [0.1], [1.0]), [ControlBounds(-1, 1)], torch.zeros(2, 1).double(), 20)
