@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 
 import torchgco
+from benchmarks.families import gradient_families
+from benchmarks.families.gradient_families import STEPS, TIGHT
 from benchmarks.families.gradient_peers import Found, table
 from benchmarks.lib import DATA
 from benchmarks.lib.command import Command
@@ -25,7 +27,6 @@ from torchgco import (
     ControlBounds,
     FunctionDynamics,
     Goal,
-    InteriorPoint,
     Layouts,
     Problem,
     QuadraticCost,
@@ -37,7 +38,6 @@ from torchgco.base.differentiability import Differentiability
 from torchgco.experiments.config.build import compose
 
 D = torch.float64
-STEPS = 1e-3, 1e-4, 1e-5, 1e-6
 RELATIVE = (
     "Q",
     "R",
@@ -48,7 +48,6 @@ RELATIVE = (
     "thrust constant",
     "goal radius",
 )  # moved by a share of themselves
-TIGHT = InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9, warm_barrier=1e-8)
 
 ERRORS = ("problems", "by", "median error", "largest", "below 1e-6", "below 1e-4", "of")
 
@@ -226,6 +225,7 @@ def text(count: int, seed: int) -> str:
     return "\n\n".join([
         markdown(["problems", "differentiable", "others"], shares),
         filed("gradients", markdown(ERRORS, kinds), summary(kinds)),
+        gradient_families.table(seed),
         markdown(["problems", "solve, ms", "more, ms", "backward, ms", "backward / solve", "all / solve"], costs),
         table(differentiated, lq.numbers, 20, 4),
     ])  # fmt: skip

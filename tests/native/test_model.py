@@ -15,6 +15,8 @@ from torchgco import (
     FunctionDynamics,
     InputError,
     Planar,
+    Problem,
+    QuadraticCost,
     QuadrotorPlanning,
     QuadrotorPlant,
     RotorTracking,
@@ -230,3 +232,22 @@ def test_parameters_of_a_batch_of_which_one_problem_was_traced() -> None:
     source = trace_dynamics(whole.take(torch.tensor([1])))
     assert source.parameters(torch.arange(3), whole).flatten().tolist() == [1.0, 2.0, 3.0]
     assert source.parameters(torch.arange(2), whole.take(torch.tensor([2, 0]))).flatten().tolist() == [3.0, 1.0]
+
+
+A = torch.linspace(0.5, 1.5, B, **DOUBLE)
+AFFINE = {
+    "a sine": (lambda x, u, a: a.unsqueeze(-1) * x + u.sin(), False),
+    "affine": (lambda x, u, a: a.unsqueeze(-1).square() * x - u / a.unsqueeze(-1) + 1.0, True),
+    "bilinear": (lambda x, u, a: a.unsqueeze(-1) * x * u, False),
+    "a jump": (lambda x, u, a: a.unsqueeze(-1) * x + u.floor(), False),
+    "a bend": (lambda x, u, a: a.unsqueeze(-1) * x + u.abs(), False),
+}
+
+
+@pytest.mark.parametrize("name", AFFINE)
+def test_affine_steps_are_known(name: str) -> None:
+    function, affine = AFFINE[name]
+    start = torch.zeros(B, 1, **DOUBLE)
+    model = FunctionDynamics(function, 1, 1, 0.1, "none", values={"a": A})
+    bound = Problem(model, QuadraticCost([1.0], [1.0], [1.0]), [], start, 2).dynamics
+    assert trace_dynamics(bound).affine is affine

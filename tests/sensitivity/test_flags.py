@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
 import torchgco
+from tests.sensitivity.problems import asking, box_numbers, boxed, discs, numbers
+from tests.sensitivity.test_forms import FORMS
 from torchgco import ControlBounds, FunctionConstraint, FunctionDynamics, Goal, Problem, QuadraticCost, Spheres, Status
 from torchgco.base.differentiability import Differentiability as Why
 from torchgco.kernels import current
 from torchgco.sensitivity import attached
+from torchgco.sensitivity.points import Points, points_of
 
 D = torch.float64
 N = 10
@@ -107,12 +113,51 @@ def test_gradients_of_others_are_those_without_them() -> None:
     assert torch.equal(slope[[0, 3]], want) and not slope[1:3].any()
 
 
-def test_where_nothing_has_derivatives_a_loss_can_be_differentiated() -> None:
+def test_gradients_of_a_batch_without_derivatives_are_zero() -> None:
+    """With respect to all that it is made of, captured tensors too; upstream gradients that are NaN change nothing."""
     ends, x0 = FunctionConstraint(lambda x: x[..., :1] - 0.2, "equality", knots=[N]), start((1.0, 0.0))
-    solution = torchgco.solve(Problem(MODEL, COST, [ends, ends], x0, N), verbose=False)
+    spring, Q = (torch.tensor(part, dtype=D, requires_grad=True) for part in (0.3, [1.0, 0.1]))
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u - spring * x[..., :1]), -1), 2, 1, 0.1, "rk4")
+    problem = Problem(model, QuadraticCost(Q, [0.1], [5.0, 1.0]), [ends, ends], x0, N)
+    solution = torchgco.solve(problem, verbose=False)
+    assert not solution.differentiable.any()
+    for part in (solution.X, solution.U, solution.cost, solution.multipliers.lam[0]):
+        slopes = torch.autograd.grad(torch.nan * part.sum(), (x0, spring, Q), retain_graph=True)
+        assert all(torch.equal(slope, torch.zeros_like(slope)) for slope in slopes)
+    (solution.X.sum() + solution.cost.sum()).backward()
+    assert x0.grad is not None and not x0.grad.any()
+
+
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
+@pytest.mark.parametrize("form", [*FORMS, "discs", "boxed"])
+def test_no_gradient_is_missing_where_there_is_none(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    make, given = FORMS.get(form) or {"discs": (discs, numbers()), "boxed": (boxed, box_numbers())}[form]
+
+    def none_of(*arguments: Any) -> Points:
+        points = points_of(*arguments)
+        return replace(points, reason=torch.full_like(points.reason, int(Why.MOVED)))
+
+    monkeypatch.setattr("torchgco.sensitivity.attach.points_of", none_of)
+    leaves = asking(given)
+    found = torchgco.solve(make(leaves), solver="interior_point", verbose=False)
+    slopes = torch.autograd.grad(found.X.sum() + found.U.sum() + found.cost.sum(), list(leaves.values()))
+    assert all(torch.equal(slope, torch.zeros_like(slope)) for slope in slopes)
+
+
+def test_functions_that_take_no_empty_batch() -> None:
+    """Gradients of their problems are those of tensors that a loss doesn't depend on."""
+    ends, x0 = FunctionConstraint(lambda x: x[..., :1] - 0.2, "equality", knots=[N]), start((1.0, 0.0))
+
+    def field(x: Tensor, u: Tensor) -> Tensor:
+        if x.numel() == 0:
+            raise ValueError("nothing to do")
+        return torch.cat((x[..., 1:], u), -1)
+
+    model = FunctionDynamics(field, 2, 1, 0.1, "rk4")
+    solution = torchgco.solve(Problem(model, COST, [ends, ends], x0, N), verbose=False)
     assert not solution.differentiable.any()
     (solution.X.sum() + solution.U.sum() + solution.cost.sum() + solution.multipliers.lam[0].sum()).backward()
-    assert x0.grad is None  # as of any tensor that a loss doesn't depend on: an optimiser leaves it alone
+    assert x0.grad is None
 
 
 def test_solved_without_gradients() -> None:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from torchgco import ControlBounds, FunctionDynamics, Problem, QuadraticCost
+from torchgco.base.differentiability import Differentiability as Why
+from torchgco.kernels import current, use_native
+from torchgco.sensitivity import attached
 
 D = torch.float64
 Array = np.ndarray
@@ -99,3 +106,39 @@ def test_gradients_are_those_of_a_dense_system() -> None:
                 want, slope = want + want.T, slope + slope.T
             np.testing.assert_allclose(slope, want, rtol=0, atol=1e-11 * max(1.0, np.abs(want).max()), err_msg=name)
     assert held > 20 * B
+
+
+STAGES = 170  # over which the fall of an upright pendulum grows by 1e15
+
+
+def upright(x0: Tensor) -> Problem:
+    step = lambda x, u: x + 0.05 * torch.cat((x[..., 1:], 20.0 * x[..., :1] + u), -1)
+    cost = QuadraticCost([1.0, 0.1], [0.1], [5.0, 1.0], x_ref=[0.2, 0.0])
+    return Problem(FunctionDynamics(step, 2, 1, 0.05, "none"), cost, [ControlBounds(-99, 99)], x0, STAGES)
+
+
+def slopes_of_cost(x0: Array) -> Array:
+    """P [x - x_ref, 1] of the least cost, by the recursion of Riccati."""
+    A, M = np.array([[1.0, 0.05, 0.0], [1.0, 1.0, 0.2], [0.0, 0.0, 1.0]]), np.array([[0.0], [0.05], [0.0]])
+    P = np.diag([5.0, 1.0, 0.0])
+    for _ in range(STAGES):
+        K = np.linalg.solve(0.1 + M.T @ P @ M, M.T @ P @ A)
+        P = np.diag([1.0, 0.1, 0.0]) + A.T @ P @ (A - M @ K)
+    return np.hstack((x0 - [0.2, 0.0], np.ones((len(x0), 1)))) @ P[:, :2]
+
+
+@pytest.mark.parametrize("in_c", [pytest.param(True, marks=compiled), pytest.param(False, marks=pytest.mark.slow)])
+def test_unstable_dynamics_magnify_no_rounding(in_c: bool) -> None:
+    """Costates that are passed from stage to stage without feedback are off by a share of 1e15 roundings."""
+    x0 = torch.tensor([[0.3, -0.2], [-0.1, 0.4]], dtype=D, requires_grad=True)
+    use_native(in_c)
+    try:
+        found = torchgco.solve(upright(x0), solver="interior_point", verbose=False)
+        assert bool(found.differentiable.all())
+        (slope,) = torch.autograd.grad(found.cost.sum(), x0)
+        np.testing.assert_allclose(slope.numpy(), slopes_of_cost(x0.detach().numpy()), rtol=1e-9)
+        blind = replace(found.detach(), K=torch.zeros_like(found.K))
+        reason = attached(upright(x0), current(upright(x0)), blind).reason
+        assert reason is not None and reason.tolist() == [Why.NOT_STATIONARY] * 2
+    finally:
+        use_native(True)

@@ -102,28 +102,52 @@ def test_smoothed_solutions_have_tangents() -> None:
 
 @compiled
 def test_a_second_derivative_is_refused() -> None:
+    """By both modes in any order, and of tangents after their level, too; the error says what to write instead."""
     x0 = torch.tensor([[1.0, 0.0]], dtype=D, requires_grad=True)
-    found = small(x0)
+    v, functional = torch.ones_like(x0), torch.autograd.functional
+    found, loss = small(x0), lambda x: small(x).X.square().sum()
+    refused = pytest.raises(RuntimeError, match=r"no second derivatives: take differences of gradients")
     for value in (found.U.sum(), found.cost.sum()):
         (slope,) = torch.autograd.grad(value, x0, create_graph=True)
-        with pytest.raises(RuntimeError, match="no second derivatives"):
+        with refused:
             torch.autograd.grad(slope.sum(), x0)
-    with pytest.raises(RuntimeError, match="no second derivatives"):
-        torch.autograd.functional.hessian(lambda x: small(x).cost.sum(), x0.detach())
-    with forward_ad.dual_level(), pytest.raises(RuntimeError, match="forward mode AD"):
-        dual = forward_ad.make_dual(x0, torch.ones_like(x0))
-        torch.autograd.grad(small(dual).cost.sum(), x0)
+    for call in (functional.hvp, functional.vhp):
+        with refused:
+            call(loss, x0.detach(), v)
+    for outer in ("reverse-mode", "forward-mode"):
+        with refused:
+            functional.hessian(loss, x0.detach(), vectorize=True, outer_jacobian_strategy=outer)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(x0, v)
+        tangents = [forward_ad.unpack_dual(part).tangent for part in (loss(dual), small(dual).U.sum())]
+        with refused:
+            torch.autograd.grad(loss(dual), x0)
+        with refused:
+            torch.autograd.grad(tangents[0], x0, retain_graph=True)
+    for tangent in tangents:
+        with refused:
+            torch.autograd.grad(tangent, x0)
 
 
-def test_transforms_of_torch_func_are_refused_in_one_line() -> None:
-    for call in (
-        lambda: torch.func.jvp(ends, (X0,), (V,)),
-        lambda: torch.func.jacrev(ends)(X0),
-        lambda: torch.func.vmap(ends)(X0.unsqueeze(1)),
-    ):
-        with pytest.raises(InputError, match=r"torch\.autograd") as caught:
-            call()
-        assert "\n" not in str(caught.value)
+TRANSFORMS = {
+    "grad": (lambda: torch.func.grad(lambda x: ends(x).sum())(X0), "torch.autograd.grad"),
+    "vjp": (lambda: torch.func.vjp(ends, X0), "torch.autograd.grad"),
+    "jacrev": (lambda: torch.func.jacrev(ends)(X0), "torch.autograd.functional.jacobian"),
+    "hessian": (lambda: torch.func.hessian(lambda x: ends(x).sum())(X0), "torch.autograd.functional.jacobian"),
+    "jvp": (lambda: torch.func.jvp(ends, (X0,), (V,)), "torch.autograd.functional.jvp"),
+    "jacfwd": (lambda: torch.func.jacfwd(ends)(X0), "torch.autograd.functional.jvp"),
+    "linearize": (lambda: torch.func.linearize(ends, X0), "torch.autograd.functional.jvp"),
+    "vmap": (lambda: torch.func.vmap(ends)(X0.unsqueeze(1)), "one call takes a whole batch"),
+    "a captured number": (lambda: torch.func.grad(lambda by: small(X0, by).U.sum())(V[:, :1]), "torch.autograd.grad"),
+}
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_transforms_of_torch_func_are_refused_in_one_line(name: str) -> None:
+    call, instead = TRANSFORMS[name]
+    with pytest.raises(InputError, match=r"Problem: expected a call outside of torch\.func") as caught:
+        call()
+    assert "\n" not in str(caught.value) and instead in str(caught.value)
 
 
 def test_tangents_that_cannot_be_followed_are_refused() -> None:

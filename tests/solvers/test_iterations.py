@@ -5,9 +5,22 @@ from dataclasses import replace
 import pytest
 import torch
 
+import torchgco
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from tests.search.rows import varied
-from torchgco import ILQR, MPPI, AugmentedLagrangian, MultiStart, PathProposals, Polish, Problem, Restarts
+from torchgco import (
+    ILQR,
+    MPPI,
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionDynamics,
+    MultiStart,
+    PathProposals,
+    Polish,
+    Problem,
+    QuadraticCost,
+    Restarts,
+)
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.outer import NativeOuter
 from torchgco.native.interior import InteriorEngine
@@ -103,3 +116,14 @@ def test_steps_of_a_polish_count_without_an_improvement_too(made: list[int], mon
     made.clear()
     after = Polish(iterations=2, reach=10.0).refine(problem, before)
     assert torch.equal(after.U, before.U) and int((after.iterations - before.iterations).sum()) == sum(made) > 0
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.3])
+def test_convex_problems_are_solved_once(bend: float) -> None:
+    """`gco` begins once more where the start held costs less; not where what it found is known to be the least."""
+    drift = lambda x, u: x + 0.1 * u + 0.2 + bend * x.sin()
+    model = FunctionDynamics(drift, 1, 1, 0.1, "none")
+    problem = Problem(model, QuadraticCost([1.0], [0.1], [1.0]), [ControlBounds(-1, 1)], torch.zeros(2, 1).double(), 20)
+    found, once = (torchgco.solve(problem, solver=name, verbose=False) for name in ("gco", "interior_point"))
+    assert bool((found.iterations > once.iterations).all()) is (bend > 0)
+    torch.testing.assert_close(found.U, once.U, rtol=0, atol=1e-6)

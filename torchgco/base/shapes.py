@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch._C._dynamo.eval_frame import get_eval_frame_callback  # type: ignore[import]
-from torch._C._functorch import peek_interpreter_stack  # type: ignore[import]
+from torch._C._functorch import TransformType, peek_interpreter_stack  # type: ignore[import]
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.gradients import asks, is_recording, not_recording
@@ -86,14 +86,25 @@ def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
     return value
 
 
+# What to write instead of a transform of torch.func over a solve.
+INSTEAD = {
+    TransformType.Vmap: "one call takes a whole batch",
+    TransformType.Grad: "torch.autograd.grad and torch.autograd.functional.jacobian serve",
+    TransformType.Jvp: "torch.autograd.functional.jvp and jacobian serve",
+}
+
+
 def check_untransformed(what: str) -> None:
     """Raise InputError inside torch.compile, and inside transforms of torch.func such as vmap and grad.
 
     Kernels in C read memory, which tensors there don't have; and a batch is solved at once anyway.
     """
-    if peek_interpreter_stack() is not None:
-        expected = "a call outside of torch.func: it takes a batch itself, and torch.autograd serves for derivatives"
-        raise InputError(what, expected, "one inside")
+    innermost = peek_interpreter_stack()
+    traced = torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY) is not None  # as by torch.func.linearize
+    if innermost is not None or traced:
+        kind = TransformType.Jvp if innermost is None else innermost.key()
+        instead = INSTEAD.get(kind, "it reads and writes memory")
+        raise InputError(what, f"a call outside of torch.func: {instead}", f"one inside ({kind.name.lower()})")
     if get_eval_frame_callback():
         raise InputError(what, "a call outside of torch.compile: it makes kernels of its own", "one inside")
 

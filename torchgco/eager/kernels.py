@@ -57,10 +57,10 @@ class EagerInterior:
 
     def kkt(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
-        right: RightSides, give: Tensor | None = None,
+        right: RightSides, give: Tensor | None = None, K: Tensor | None = None,
     ) -> KktSolve:  # fmt: skip
         """As `native.interior.InteriorEngine.kkt`, in float64."""
-        return kkt(self.model.among(problem), X, U, multipliers, active, right, give)
+        return kkt(self.model.among(problem), X, U, multipliers, active, right, give, K)
 
 
 def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:

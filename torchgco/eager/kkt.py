@@ -13,13 +13,13 @@ from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, 
 
 def kkt(
     model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, right: RightSides,
-    give: Tensor | None = None,
+    give: Tensor | None = None, K: Tensor | None = None,
 ) -> KktSolve:  # fmt: skip
     """As `native.interior.InteriorEngine.kkt`."""
     lam = torch.cat([X.new_zeros(X.shape[0], 0), *(part.flatten(1) for part in multipliers)], dim=1)
     lam = torch.where(active, lam, 0.0)
     slopes = model.slopes(X, U)
-    y = _costates(slopes, lam)
+    y = _costates(slopes, lam, K)
     found = model.expand(X, U, torch.ones_like(X[:, 0, 0]), y, lam)
     sigma = STIFF * found.H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1, keepdim=True)
     curvature = slopes.H.diagonal(dim1=-2, dim2=-1).abs()
@@ -34,13 +34,15 @@ def kkt(
     return KktSolve(z, v_of_gaps, v, left, y, factors.good)
 
 
-def _costates(slopes: Derivatives, lam: Tensor) -> Tensor:
-    """y (b, N+1, n) that makes the Lagrangian stationary in the states; 0 at knot 0."""
+def _costates(slopes: Derivatives, lam: Tensor, K: Tensor | None) -> Tensor:
+    """y (b, N+1, n) that makes the Lagrangian stationary in the states, along the feedback K; 0 at knot 0."""
     n = slopes.F.shape[-2]
-    g = (slopes.cost + slopes.pull(lam.unsqueeze(1)).squeeze(1))[..., :n]
-    y = [g[:, -1]]
+    g = slopes.cost + slopes.pull(lam.unsqueeze(1)).squeeze(1)
+    y = [g[:, -1, :n]]
     for k in range(slopes.F.shape[1] - 1, 0, -1):
-        y.append(g[:, k] + (slopes.F[:, k, :, :n].mT @ y[-1].unsqueeze(-1)).squeeze(-1))
+        slope = g[:, k] + (slopes.F[:, k].mT @ y[-1].unsqueeze(-1)).squeeze(-1)
+        fed_back = 0.0 if K is None else (K[:, k].mT @ slope[:, n:].unsqueeze(-1)).squeeze(-1)
+        y.append(slope[:, :n] + fed_back)
     return torch.stack([torch.zeros_like(y[0]), *y[::-1]], dim=1)
 
 

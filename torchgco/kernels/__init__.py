@@ -11,6 +11,7 @@ from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_unit as cost_unit
 from torchgco.kernels.verbs import followed as followed
 from torchgco.kernels.verbs import interior_of as interior_of
+from torchgco.kernels.verbs import is_convex as is_convex
 from torchgco.kernels.verbs import measured as measured
 from torchgco.kernels.verbs import open_loop as open_loop
 from torchgco.kernels.verbs import reproducible as reproducible

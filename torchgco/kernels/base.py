@@ -27,7 +27,7 @@ class InteriorKernels(Protocol):
 
     def kkt(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
-        right: RightSides, give: Tensor | None = None,
+        right: RightSides, give: Tensor | None = None, K: Tensor | None = None,
     ) -> KktSolve:  # fmt: skip
         """See `InteriorEngine.kkt`."""
         ...
@@ -74,6 +74,11 @@ class Kernels(Protocol):
 
     name: str
     compiled: bool
+
+    @property
+    def affine(self) -> bool:
+        """Whether the dynamics are known to be affine in states and controls."""
+        ...
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X from the problem's start and controls U."""

@@ -50,6 +50,10 @@ class NativeKernels:
         self.engine, self.B, self._warn = engine, B, warn
         self._samplers: dict[Hashable, Sampler] = {}
 
+    @property
+    def affine(self) -> bool:
+        return self.engine.model.affine
+
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         return self.engine.open_loop(problem, U)
 

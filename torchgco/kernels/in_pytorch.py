@@ -29,6 +29,7 @@ class TorchKernels:
 
     name = "pytorch"
     compiled = False
+    affine = False
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         return rollout.open_loop(problem.dynamics, problem.x0, U)

@@ -7,6 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.costs.base import ShiftedCost
+from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics import rollout
 from torchgco.kernels.base import InteriorKernels
 from torchgco.kernels.choice import kernels_of
@@ -63,6 +66,13 @@ def cost_unit(problem: Problem) -> Tensor:
     """`problem.cost_unit` (B,), computed without autodiff where compiled code can; the problem keeps its scale."""
     kernels_of(problem).scale(problem)
     return problem.cost_unit
+
+
+def is_convex(problem: Problem) -> bool:
+    """Whether a problem is known to be convex: affine dynamics, a quadratic cost, and bounds."""
+    cost = problem.cost.cost if isinstance(problem.cost, ShiftedCost) else problem.cost
+    bounded = all(isinstance(part, ControlBounds | StateBounds) for part in problem.constraints)
+    return bounded and isinstance(cost, BoundQuadratic) and kernels_of(problem).affine
 
 
 def chord_clearance(problem: Problem, X: Tensor, share: float = TOUCH) -> Tensor:

@@ -272,12 +272,15 @@ class Engine:
         return vars(problem)["packed"]
 
     def _model(self, problem: Problem) -> c.Problem:
-        """The model's part of it; kept with the problem."""
+        """The model's part of it; that of the last problem where this one has the same dynamics."""
         if "model_packed" not in vars(problem):
-            packed = c.Problem(N=problem.N, **shared_fields(self.shared))
-            if self.model.count > 0 and problem.B > 0:
-                numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
-                packed.parameters = array(numbers, knots=True)
+            known, B, packed = problem.known.model
+            if known is not problem.dynamics or B != problem.B:  # what problems share stays the same object in a subset
+                packed = c.Problem(N=problem.N, **shared_fields(self.shared))
+                if self.model.count > 0 and problem.B > 0:
+                    numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
+                    packed.parameters = array(numbers, knots=True)
+                problem.known.model = problem.dynamics, problem.B, packed
             object.__setattr__(problem, "model_packed", packed)
         return vars(problem)["model_packed"]
 

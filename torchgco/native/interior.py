@@ -74,7 +74,7 @@ class InteriorEngine:
 
     def kkt(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
-        right: RightSides, give: Tensor | None = None,
+        right: RightSides, give: Tensor | None = None, K: Tensor | None = None,
     ) -> KktSolve:  # fmt: skip
         """Solutions of linear systems with the matrix of the KKT conditions.
 
@@ -84,6 +84,7 @@ class InteriorEngine:
             active: which rows hold, (B, R) bool; all of equalities do.
             right: the right hand sides.
             give: D (B, R) of the rows that hold; None: 0.
+            K: gains (B, N, m, n), with which unstable dynamics don't magnify the rounding of costates; None: 0.
         """
         B, n, free = problem.B, problem.n, problem.free_start
         out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
@@ -98,7 +99,8 @@ class InteriorEngine:
         run(
             self.library.tgco_kkt, B, self.lanes,
             Kkt.complete(
-                of=packed, active=active.double().contiguous(), give=give, y=costates, left=left, **sides, problems=B,
+                of=packed, active=active.double().contiguous(), give=give, K=None if K is None else K.contiguous(),
+                y=costates, left=left, **sides, problems=B,
                 free_start=None if free is None else free.double().contiguous(), count=right.a.shape[0],
                 rounds=CLOSING_ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=LEAST_PIVOT,
             ),

@@ -188,6 +188,7 @@ class Kkt(Structure):
         ("const Problem *", "of"),
         ("const double *", "free_start active"),  # as in Interior; (E, R): 1 where a row holds
         ("const double *", "give"),  # (E, R): by which rows that hold give way to their multipliers; NULL: 0
+        ("const double *", "K"),  # (E, N, NU, NX): gains; NULL: 0
         ("double *", "a b c"),  # (C, E, N+1, NX+NU), (C, E, N, NX), (C, E, R): right hand sides in, z, y, v out
         ("double *", "y left"),  # (E, N+1, NX): costates; (C, E): largest of what active rows leave open
         ("int64_t", "problems count rounds"),  # E, C

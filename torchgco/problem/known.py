@@ -19,6 +19,7 @@ class Known:
         expects_interior: the interior point will be asked for.
         warned: reasons for PyTorch's kernels that a warning has named.
         packed: the constraints that were packed for C last, and their structures.
+        model: the dynamics that were packed last, of how many problems, and their structure.
         lifted: what is known of problems with further states, by their kind: see `horizons` and `rates`.
     """
 
@@ -31,6 +32,7 @@ class Known:
     expects_interior: bool = False
     warned: set[str] = field(default_factory=set)
     packed: tuple[Any, Any] = (None, None)
+    model: tuple[Any, int, Any] = (None, 0, None)
     lifted: dict[str, Known] = field(default_factory=dict)
 
     def of_lifted(self, kind: str) -> Known:

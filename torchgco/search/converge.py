@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status, is_over
 from torchgco.base.tree import put, take
-from torchgco.kernels import chord_clearance
+from torchgco.kernels import chord_clearance, is_convex
 from torchgco.lagrangian.quality import is_preferred, leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.maps.field import BoundField
@@ -74,20 +74,24 @@ class Converge(Row):
     def _from_rest(search: Search) -> None:
         """Solve again from the start held, where that costs less, though no step may hold it, than what was found.
 
-        The rollout of a guess may fall far away from an upright pendulum, and the solve stay there.
+        The rollout of a guess may fall far away from an upright pendulum, and the solve stay there. What was found of a
+        convex problem is the least.
         """
-        call, best = search.call, search.best.end.best
+        call, best, status = search.call, search.best.end.best, search.best.end.status
         if call.warm is not None or call.X0 is not None:  # a guess that was chosen
+            return
+        open_ = status != Status.INVALID_START
+        if is_convex(call.problem):
+            open_ &= ~is_over(status)
+        if not bool(open_.any()):
             return
         X, U = call.problem.at_rest
         held = call.problem.cost.total(X, U)
-        rows = (
-            torch.isfinite(held) & ~(best.cost <= held) & (search.best.end.status != Status.INVALID_START)
-        ).nonzero()
-        rows = rows.flatten()
+        rows = (open_ & torch.isfinite(held) & ~(best.cost <= held)).nonzero().flatten()
         if rows.numel() > 0:
-            again = search.interior.solved(replace(call.take(rows), U0=U[rows], callback=None), X[rows])
-            keep_tight(search, rows, again)
+            keep_tight(
+                search, rows, search.interior.solved(replace(call.take(rows), U0=U[rows], callback=None), X[rows])
+            )
 
     @staticmethod
     def worth(problem: Problem) -> bool:

@@ -13,7 +13,7 @@ from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
-from torchgco.base.shapes import computing_on
+from torchgco.base.shapes import MISTAKES, computing_on
 from torchgco.base.tree import copied, is_users
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -21,11 +21,12 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
 from torchgco.sensitivity.form import for_systems, for_user
 from torchgco.sensitivity.function import Solved, System
-from torchgco.sensitivity.points import Points, points_of
+from torchgco.sensitivity.points import Points, gains_of, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
 EXACT_STEP = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
+EXACT_COSTATES = 1e-5  # share of the largest costate by which that step may change one
 SERVED = "a problem in float64"
 
 
@@ -97,25 +98,29 @@ def attached(
     known = {"trace": solution.trace, "search": solution.search, "account": account, "reason": points.reason}
     found = replace(points.solution, **known)
     rows = (points.reason == Why.DIFFERENTIABLE).nonzero().flatten()
-    if rows.numel() == 0 or not checks:
-        return for_user(problem, _constant(found) if records else found, solution.K)
+    if not checks or (rows.numel() == 0 and not records):
+        return for_user(problem, found, solution.K)
     with recording():
         at = points.take(rows)
-        live = _live(asked, at, rows)
-        found_at = residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
-        near = _step_left(at, found_at) <= EXACT_STEP
+        try:  # where no problem is left, gradients are those of none: 0
+            live = _live(asked, at, rows)
+            found_at = residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
+        except MISTAKES:
+            if rows.numel() > 0:
+                raise
+            return for_user(problem, _constant(found), solution.K)  # a user's function that takes no empty batch
+        near = _are_exact(at, found_at)
         if not bool(near.all()):
             points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
             rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)
             live = live.take(near.nonzero().flatten())
         if records:
-            live_at = rows.numel() > 0
-            found = _with_values(found, rows, _values(live, at, found_at)) if live_at else _constant(found)
+            found = _with_values(found, rows, _values(live, at, found_at))
         return for_user(problem, found, solution.K)
 
 
 def _constant(found: Solution) -> Solution:
-    """The solution where nothing has derivatives: losses of it can be differentiated, and depend on no other tensor."""
+    """The solution of functions that take no empty batch: losses of it can be differentiated, by no other tensor."""
     lam = tuple(part.requires_grad_() for part in found.multipliers.lam)
     for part in (found.X, found.U, found.cost):
         part.requires_grad_()
@@ -124,19 +129,19 @@ def _constant(found: Solution) -> Solution:
 
 def _live(problem: Problem, at: Points, rows: Tensor) -> Problem:
     """The problems `rows` with gradients recorded, and obstacles grown as at their points."""
-    live = for_solvers(problem.recorded().take(rows))
+    live = for_solvers(problem.recorded()).take(rows)
     return live.grown(at.growth) if bool((at.growth > 0).any()) else live
 
 
-def _step_left(at: Points, of: Residual) -> Tensor:
-    """The step (B,) from the points to where the conditions hold to first order, as a share of 1 + the largest state or
-    control; infinite where it isn't a number."""
+def _are_exact(at: Points, of: Residual) -> Tensor:
+    """Whether the step (B,) from the points to where the conditions hold to first order is small, and a number."""
     with not_recording():
         c = of.rows if at.gap is None else of.rows + at.gap
-        x, u, _, _ = _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None])
+        x, u, y, _ = (part[0].abs() for part in _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None]))
         size = 1.0 + torch.maximum(at.solution.X.abs().flatten(1).amax(-1), at.solution.U.abs().flatten(1).amax(-1))
-        step = torch.maximum(x[0].abs().flatten(1).amax(-1), u[0].abs().flatten(1).amax(-1)) / size
-        return torch.where(torch.isfinite(step), step, torch.inf)
+        step = torch.maximum(x.flatten(1).amax(-1), u.flatten(1).amax(-1))
+        largest = at.costates.abs().flatten(1).amax(-1)
+        return (step <= EXACT_STEP * size) & (y.flatten(1).amax(-1) <= EXACT_COSTATES * largest)
 
 
 def _system(at: Points) -> System:
@@ -145,7 +150,7 @@ def _system(at: Points) -> System:
     if type(problem.cost) is BoundQuadratic:
         # Its numbers may be the user's own tensors, which a step of an optimizer changes before `backward`.
         problem = problem._with({"cost": copied(problem.cost)}, problem.known)
-    return System(problem, found.X, found.U, found.multipliers.lam, at.active, at.give)
+    return System(problem, found.X, found.U, found.multipliers.lam, at.active, at.give, gains_of(problem, found))
 
 
 def _values(live: Problem, at: Points, of: Residual) -> tuple[Tensor, ...]:
@@ -156,7 +161,9 @@ def _values(live: Problem, at: Points, of: Residual) -> tuple[Tensor, ...]:
     X, U, lam, cost = Solved.apply(_system(at), values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
     start = of.start if live.free_start is None else torch.where(live.free_start, X[:, 0], of.start)
     X = torch.cat((start.unsqueeze(1), X[:, 1:]), dim=1)
-    return X, U, lam, cost if at.give is None else live.cost.total(X, U)  # no minimum of the cost, so no envelope
+    if at.give is not None and len(found) > 0:
+        cost = live.cost.total(X, U)  # no minimum of the cost, so no envelope
+    return X, U, lam, cost
 
 
 def _with_values(found: Solution, rows: Tensor, values: tuple[Tensor, ...]) -> Solution:

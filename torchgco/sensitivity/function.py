@@ -19,6 +19,10 @@ from torchgco.kernels import interior_of
 from torchgco.lagrangian.kkt import RightSides
 from torchgco.problem.problem import Problem
 
+NO_SECOND = (
+    "solutions have no second derivatives: take differences of gradients, or, for a sum of squares, J'J of the Jacobian"
+)
+
 
 @dataclass(frozen=True)
 class System:
@@ -30,6 +34,7 @@ class System:
     multipliers: tuple[Tensor, ...]
     active: Tensor  # (B, R) bool
     give: Tensor | None = None  # (B, R)
+    K: Tensor | None = None  # (B, N, m, n)
 
     def once(self, x: Tensor, u: Tensor, gaps: Tensor | None, rows: Tensor) -> tuple[Tensor, ...]:
         """`solve` of one right hand side, or of all those that `is_grads_batched` and `vectorize` hide in one."""
@@ -47,12 +52,15 @@ class System:
 
     def solve(self, x: Tensor, u: Tensor, gaps: Tensor | None, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """-K^-1 of right hand sides x (C, B, N+1, n), u (C, B, N, m), gaps (C, B, N, n), rows (C, B, R); as these."""
+        gaps = torch.zeros_like(x[:, :, 1:]) if gaps is None else gaps
+        if self.problem.B == 0:
+            return x, u, gaps, rows
         with not_recording():
-            n, gaps = self.problem.n, torch.zeros_like(x[:, :, 1:]) if gaps is None else gaps
+            n = self.problem.n
             a = torch.cat((x, torch.nn.functional.pad(u, (0, 0, 0, 1))), dim=-1)
             right = RightSides(a, gaps, rows)
             point = self.X, self.U, self.multipliers, self.active
-            found = interior_of(self.problem).kkt(self.problem, *point, right, self.give)
+            found = interior_of(self.problem).kkt(self.problem, *point, right, self.give, self.K)
         return found.z[..., :n], found.z[:, :, :-1, n:], found.y, found.v
 
 
@@ -69,6 +77,7 @@ class Solved(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.system = inputs[0]
         ctx.save_for_backward(*inputs[2:])
+        ctx.save_for_forward(*inputs[2:])
 
     @staticmethod
     def backward(ctx: Any, X: Tensor, U: Tensor, lam: Tensor, cost: Tensor) -> tuple[Any, ...]:
@@ -76,9 +85,26 @@ class Solved(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> tuple[Tensor, ...]:
-        x, u, gaps, rows, lagrangian = tangents[2:]
-        X, U, _, lam = ctx.system.once(x, u, gaps, rows)
+        return Forward.apply(ctx.system, *tangents[2:], *ctx.saved_tensors)  # type: ignore[return-value]
+
+
+class Forward(torch.autograd.Function):
+    """Tangents of X, U, multipliers and costs from those of the residual's parts; of the parts, too, as `Adjoint`."""
+
+    @staticmethod
+    def forward(
+        system: System, x: Tensor, u: Tensor, gaps: Tensor, rows: Tensor, lagrangian: Tensor, *parts: Tensor
+    ) -> tuple[Tensor, ...]:
+        X, U, _, lam = system.once(x, u, gaps, rows)
         return X, U, lam, lagrangian.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> NoReturn:
+        raise RuntimeError(NO_SECOND)
 
 
 class Adjoint(torch.autograd.Function):
@@ -101,6 +127,10 @@ class Adjoint(torch.autograd.Function):
     def backward(ctx: Any, x: Tensor, u: Tensor, gaps: Tensor, rows: Tensor, cost: Tensor) -> tuple[Any, ...]:
         X, U, _, lam = ctx.system.once(x, u, gaps, rows)
         return None, X, U, lam, cost.clone(), *(torch.zeros_like(part, device=x.device) for part in ctx.parts)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> NoReturn:
+        raise RuntimeError(NO_SECOND)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], system: System, *given: Tensor) -> tuple[Any, Any]:
@@ -126,4 +156,8 @@ class Fixed(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> NoReturn:
-        raise RuntimeError("solutions have no second derivatives: their gradients can't be differentiated again")
+        raise RuntimeError(NO_SECOND)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> NoReturn:
+        raise RuntimeError(NO_SECOND)

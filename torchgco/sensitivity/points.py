@@ -181,7 +181,14 @@ def solve_at(
     problem: Problem, solution: Solution, active: Tensor, right: RightSides, give: Tensor | None = None
 ) -> KktSolve:
     """The systems at solutions."""
-    return interior_of(problem).kkt(problem, solution.X, solution.U, solution.multipliers.lam, active, right, give)
+    point = solution.X, solution.U, solution.multipliers.lam
+    return interior_of(problem).kkt(problem, *point, active, right, give, gains_of(problem, solution))
+
+
+def gains_of(problem: Problem, solution: Solution) -> Tensor:
+    """The gains (B, N, m, n) of solutions; 0 for states and controls that the user's problem doesn't have."""
+    K = solution.K.nan_to_num(0.0, 0.0, 0.0)
+    return torch.nn.functional.pad(K, (0, problem.n - K.shape[-1], 0, problem.m - K.shape[-2]))
 
 
 def probe(problem: Problem, active: Tensor) -> RightSides:

@@ -19,7 +19,7 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.sensitivity.attach import refuse_forms
 from torchgco.sensitivity.function import System
-from torchgco.sensitivity.points import Points, points_of
+from torchgco.sensitivity.points import Points, gains_of, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
 
@@ -90,7 +90,7 @@ def _check_same(before: Problem, changed: Problem) -> None:
 def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:
     """The points one step further."""
     old, holds = at.solution, at.reason == Why.DIFFERENTIABLE
-    system = System(at.problem, old.X, old.U, old.multipliers.lam, at.active)
+    system = System(at.problem, old.X, old.U, old.multipliers.lam, at.active, K=gains_of(at.problem, old))
     x, u, _, v = (
         part[0].detach() for part in system.solve(*(z.detach()[None] for z in (of.x, of.u, of.gaps, of.rows)))
     )

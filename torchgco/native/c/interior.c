@@ -133,7 +133,7 @@ static void begin(Barrier *t, Track *k, I of) {
         })
         ROWS(t, 1, t->z[q] = tgco_choose(of, t->scale * t->z[q], t->z[q]))
         expand(t);
-        adjoin(t, of);
+        adjoin(t, of, 0);
     } else {
         renew(t, of);
     }

@@ -47,7 +47,7 @@ static void add_all_rows(Barrier *t) {
 }
 
 /* Costates, then curvatures of all knots with their sigma, and the factors; where these don't exist the answer is false. */
-static I factor_kkt(Barrier *t, System *of, double stiff, double slight) {
+static I factor_kkt(Barrier *t, System *of, const Kkt *how) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N;
     V largest = SET(0.0);
@@ -58,13 +58,13 @@ static I factor_kkt(Barrier *t, System *of, double stiff, double slight) {
     of->sigma = SET(0.0);
     stiffen(t, of); /* infinite slacks: rows have no weight yet */
     expand(t);
-    adjoin(t, all);
+    adjoin(t, all, how->K ? t->lanes.G : 0);
     expand(t);
     memcpy(of->H, t->H, (N + 1) * S * S * sizeof(V));
     for (int64_t k = 0; k <= N; k++)
         for (int i = 0; i < (k < N ? S : NX); i++) largest = most(tgco_fabs(t->H[k * S * S + i * S + i]), largest);
-    of->sigma = SET(stiff) * largest;
-    soften_rows(t, all, SET(slight) * largest, of->active);
+    of->sigma = SET(how->stiff) * largest;
+    soften_rows(t, all, SET(how->slight) * largest, of->active);
     stiffen(t, of);
     add_all_rows(t);
     return factor(t, ~all);
@@ -153,10 +153,12 @@ static void leave_column(Barrier *t, const System *of, const Kkt *how, int64_t c
     how->left[column * how->problems + e] = left[lane];
 }
 
-/* A problem's point, its multipliers, 0 of rows that aren't active, and which these are. */
+/* A problem's point, its gains, its multipliers, 0 of rows that aren't active, and which these are. */
 static void enter_system(Barrier *t, System *of, const Kkt *how, int lane, int64_t e) {
     const Problem *p = t->lanes.of;
     enter_barrier(t, lane, e);
+    for (int64_t i = 0; how->K && i < p->N * NU; i++)
+        for (int j = 0; j < NX; j++) t->lanes.G[i * NZ + j][lane] = how->K[(e * p->N * NU + i) * NX + j];
     for (int64_t i = 0, q = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         int64_t count = con->knots * con->rows;
@@ -191,7 +193,7 @@ int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
     for (int64_t at = first; at < last; at += LANES) {
         int own = last - at < LANES ? last - at : LANES; /* lanes without a problem repeat the first one */
         for (int l = 0; l < LANES; l++) enter_system(t, of, how, l, l < own ? at + l : at);
-        I good = factor_kkt(t, of, how->stiff, how->slight);
+        I good = factor_kkt(t, of, how);
         for (int l = 0; l < own; l++) {
             p->status[at + l] = good[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
             for (int64_t i = 0; i < (p->N + 1) * NX; i++) how->y[(at + l) * (p->N + 1) * NX + i] = t->y[i][l];

@@ -94,8 +94,10 @@ static V size_of(const Barrier *t, const V *gap, const V *r) {
 
 /* Multipliers ---------------------------------------------------------------------------------------------------- */
 
-/* Costates of the lanes `of` that make the Lagrangian stationary in the states; none where they are too large. */
-static void adjoin(Barrier *t, I of) {
+/* Costates of the lanes `of` that make the Lagrangian stationary in the states; none where they are too large. With
+   `gains` stationary along the feedback u + G (x - X): where it is stationary in the controls these are the same, but
+   unstable dynamics don't magnify rounding from stage to stage. */
+static void adjoin(Barrier *t, I of, const V *gains) {
     const Problem *p = t->lanes.of;
     V largest = SET(0.0), q[S];
     memset(t->yn, 0, (p->N + 1) * NX * sizeof(V));
@@ -105,6 +107,8 @@ static void adjoin(Barrier *t, I of) {
         if (k < p->N) model_pull_back(y + NX, t->f + k * NJ, q);
         for (int i = 0; i < NX; i++) {
             y[i] = q[i] + t->g[0][k * S + i];
+            if (gains && k < p->N)
+                for (int j = 0; j < NU; j++) ADD(y[i], gains[(k * NU + j) * NZ + i], q[NX + j] + t->g[0][k * S + NX + j]);
             largest = most(tgco_fabs(y[i]), largest);
         }
     }
@@ -119,7 +123,7 @@ static void renew(Barrier *t, I of) {
     V objective = t->objective;
     t->objective = tgco_choose(of, SET(1.0), objective);
     expand(t);
-    adjoin(t, of);
+    adjoin(t, of, 0);
     t->objective = objective;
 }
 

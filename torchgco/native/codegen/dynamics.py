@@ -20,6 +20,7 @@ from torchgco.native.codegen import calls, emit, layers
 from torchgco.tracing import Traced, arrays, dtypes, nets, operations, own_tensors
 from torchgco.tracing.nets import Call
 
+RATIONAL = "INPUT", "OUTPUT", "CONST", "PARAMETER", "ASSIGN", "ADD", "SUB", "MUL", "DIV", "INV", "NEG", "TWICE", "SQ"
 STEP_FUNCTION, JACOBIAN = "tgco_step", "tgco_jacobian"
 
 
@@ -44,6 +45,7 @@ class DynamicsSource:
     columns: tuple[int, ...]
     places: tuple[int, ...]
     values: tuple[float, ...]  # 0.0 where the entry is computed
+    affine: bool  # in x and u
     key: str  # says what `code` computes, the same in every process
     traced: Traced = field(repr=False, compare=False)
 
@@ -97,8 +99,8 @@ def trace_dynamics(
     key = "model", traced.fingerprint(), *makers()
     parts = store.made(key, lambda _: _made(traced, n, m), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
-    code = emit.checked(traced.field, parts.content["code"])
-    return DynamicsSource(n, m, traced.count, code, **lists, key=parts.key, traced=traced)
+    code, affine = emit.checked(traced.field, parts.content["code"]), parts.content["affine"]
+    return DynamicsSource(n, m, traced.count, code, **lists, affine=affine, key=parts.key, traced=traced)
 
 
 def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
@@ -143,7 +145,18 @@ def step_parts(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> dict
         "columns": list(columns),
         "places": places.tolist(),
         "values": [float(entry) if is_fixed else 0.0 for entry, is_fixed in zip(entries, fixed, strict=True)],
+        "affine": not found and _is_affine(inputs, step, changing),
     }
+
+
+def _is_affine(inputs: Sequence[Any], step: Any, changing: Any) -> bool:
+    """Whether a step is affine in x and u: it has no jumps, and none of its slopes `changing` depends on them."""
+    import casadi as ca
+
+    function = ca.Function("step", list(inputs), [step])
+    rational = {getattr(ca, f"OP_{name}") for name in RATIONAL}
+    smooth = all(function.instruction_id(i) in rational for i in range(function.n_instructions()))
+    return smooth and not ca.depends_on(changing, ca.vertcat(*inputs[:2]))
 
 
 def computed_entries(jacobian: Any) -> Any:

@@ -44,7 +44,7 @@ def trace_model(problem: Problem) -> DynamicsSource:
     lists["places"] = lists.pop("places_of_entries")
     count = source.places.shape[1]
     return StagesSource(
-        model.n, model.m, count, source.code, **lists, key=source.key, traced=span.traced,
+        model.n, model.m, count, source.code, **lists, affine=parts["affine"], key=source.key, traced=span.traced,
         stage=source,
     )  # fmt: skip
 
