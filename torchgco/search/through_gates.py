@@ -36,15 +36,9 @@ ALONG_PATHS = InteriorPoint(tolerance=1e-4, max_iterations=150)
 COMBINED = InteriorPoint(tolerance=1e-4, max_iterations=100, initial_barrier=1e-3)
 COMBINATIONS = 4  # rounds, at most
 GAINED = 1e-4  # share of the cost: a round that saves less is the last
-SWITCHES = (
-    0.0,
-    0.01,
-    0.03,
-    0.1,
-    0.3,
-)  # costs of another trajectory's next leg, in those of a mean leg: a combination each
+SWITCHES = 0.0, 0.01, 0.03, 0.1, 0.3  # what going on with another trajectory costs, in mean legs: a combination each
 ALIKE_LEGS = 1e-3  # difference of their costs, as a share of a mean one, by which trajectories are told apart
-GROWTH = 2.0  # of obstacles that are touched between two knots, in the clearance that lacks there
+GROWN_BY = 2.0  # of obstacles that are touched between two knots, in the clearance that lacks there
 TOUCHED = 0.02  # share of an obstacle's size: nearer ones are passed on their other side, too
 
 
@@ -172,12 +166,14 @@ class ThroughGates:
     def _others(self, b: int) -> list[tuple[Tensor, Tensor, Tensor]]:
         """States, controls and growth of obstacles of further solves of problem b."""
         tried = self.tried[b]
-        least = tried.cost.amin() if len(tried.X) > 0 else tried.cost.sum()
+        if len(tried.X) == 0:
+            return []
+        least = tried.cost.amin()
         touching = (tried.clearance < 0.0) & (tried.legs.sum(-1) < least)
-        larger = tried.grown - GROWTH * tried.clearance
+        larger = tried.grown - GROWN_BY * tried.clearance
         new = (c for c in touching.nonzero().flatten().tolist() if tried.is_new(c))
         found = [(tried.X[c], tried.U[c], larger[c]) for c in {tried.key(tried.legs[c]): c for c in new}.values()]
-        if len(tried.X) == 0 or not bool(torch.isfinite(least)):
+        if not bool(torch.isfinite(least)):
             return found
         tried.begun.update(map(tried.key, tried.legs))
         each = torch.arange(tried.legs.shape[1], device=tried.legs.device)
