@@ -89,7 +89,7 @@ def test_chords_are_clear_where_stages_are_long() -> None:
 
 def test_a_course_has_the_same_bits_in_any_batch() -> None:
     problem = course(DISCS, B=3)
-    found, alone = torchgco.solve(problem), torchgco.solve(problem.take([1]), ids=torch.tensor([1]))
+    found, alone = torchgco.solve(problem), torchgco.solve(problem.take(torch.tensor([1])), ids=torch.tensor([1]))
     assert torch.equal(found.U[1], alone.U[0]) and torch.equal(found.t[1], alone.t[0])
 
 
@@ -121,5 +121,5 @@ def test_far_obstacles_are_left_out() -> None:
 
 
 def test_a_problem_that_is_repeated_has_as_many_gates() -> None:
-    gates = gates_of(course(DISCS).take([0, 0]))
+    gates = gates_of(course(DISCS).take(torch.tensor([0, 0])))
     assert gates is not None and gates.centers.shape == (2, 2, 2) and gates.sizes.shape == (2, 2)

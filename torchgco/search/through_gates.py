@@ -33,7 +33,8 @@ from torchgco.solvers.interior import InteriorPoint
 
 LEG_PATHS = 7  # of each leg: the first ones follow each other, the second ones, and so on
 ALONG_PATHS = InteriorPoint(tolerance=1e-4, max_iterations=150)
-COMBINED = InteriorPoint(tolerance=1e-4, max_iterations=100, initial_barrier=1e-3)
+# With this barrier the best trajectory, begun from once more, leaves optima that a small step from it leaves.
+COMBINED = InteriorPoint(tolerance=1e-4, max_iterations=100, initial_barrier=1e-2)
 COMBINATIONS = 4  # rounds, at most
 GAINED = 1e-4  # share of the cost: a round that saves less is the last
 SWITCHES = 0.0, 0.01, 0.03, 0.1, 0.3  # what going on with another trajectory costs, in mean legs: a combination each
@@ -62,6 +63,11 @@ class Tried:
     def best(self) -> int:
         """The cheapest."""
         return int(self.cost.argmin())
+
+    def joined(self, new: Tried) -> Tried:
+        """These and further ones."""
+        names = "X", "U", "legs", "clearance", "grown"
+        return replace(self, **{name: torch.cat((getattr(self, name), getattr(new, name))) for name in names})
 
     def is_new(self, key: Any) -> bool:
         """Whether nothing with this key was begun from; now it is."""
@@ -92,7 +98,7 @@ class ThroughGates:
         self.scene = scene_of(problem, problem.cost.rest_controls(call.U0))
         empty = call.U0.new_zeros(0, self.knots.shape[1] - 1)
         assert call.X0 is not None
-        self.tried = [Tried(call.X0[:0], call.U0[:0], empty, *2 * [empty[:, 0]]) for _ in range(problem.B)]
+        self.tried = [Tried(call.X0[:0], call.U0[:0], empty, empty[:, 0], empty[:, 0]) for _ in range(problem.B)]
         self.best = SolveEnd.blank(problem, call.U0)
         self.best.best.X[:] = call.X0  # where nothing is found
         self.rank = [(True, True, True, torch.inf)] * problem.B
@@ -157,11 +163,8 @@ class ThroughGates:
         legs[:, -1] += problem.cost.terminal(found.X[:, -1])
         for b in rows.unique().tolist():
             own, old = (fits & (rows == b)).nonzero().flatten(), self.tried[b]
-            both = zip(
-                (old.X, old.U, old.legs, old.clearance, old.grown), (found.X, found.U, legs, clearance, grown),
-                strict=True,
-            )  # fmt: skip
-            self.tried[b] = Tried(*(torch.cat((before, new[own])) for before, new in both), old.begun)
+            new = Tried(found.X[own], found.U[own], legs[own], clearance[own], grown[own])
+            self.tried[b] = old.joined(new)
 
     def _others(self, b: int) -> list[tuple[Tensor, Tensor, Tensor]]:
         """States, controls and growth of obstacles of further solves of problem b."""
@@ -180,7 +183,9 @@ class ThroughGates:
         for chosen in (_cheapest(tried, share) for share in SWITCHES):
             if tried.is_new(tried.key(tried.legs[chosen, each])):
                 found.append((*self._joined(b, chosen), tried.grown[chosen].amax()))
-        return found + [(X, tried.U[tried.best], tried.grown[tried.best]) for X in self._past_the_other_side(b)]
+        best, grown = tried.best, tried.grown[tried.best]
+        again = [tried.X[best]] if tried.is_new(("again", tried.key(tried.legs[best]))) else []
+        return found + [(X, tried.U[best], grown) for X in again + self._past_the_other_side(b)]
 
     def _joined(self, b: int, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """States and controls whose legs are those of trajectories `chosen` (G+1,)."""
