@@ -39,7 +39,7 @@ COMBINATIONS = 4  # rounds, at most
 GAINED = 1e-4  # share of the cost: a round that saves less is the last
 SWITCHES = 0.0, 0.01, 0.03, 0.1, 0.3  # what going on with another trajectory costs, in mean legs: a combination each
 ALIKE_LEGS = 1e-3  # difference of their costs, as a share of a mean one, by which trajectories are told apart
-GROWN_BY = 2.0  # of obstacles that are touched between two knots, in the clearance that lacks there
+GROWN_BY = 1.5  # of obstacles that are touched between two knots, in the clearance that lacks there
 TOUCHED = 0.02  # share of an obstacle's size: nearer ones are passed on their other side, too
 
 
