@@ -83,7 +83,9 @@ class GateBalls(NormBounds):
 
     places: Tensor | None = field(default=None, kw_only=True)  # (B, G) int64: their knots
 
-    per_element: ClassVar[tuple[str, ...]] = ("lower", "upper", "center", "places")
+    # Never shared by all problems: a batch of one that is repeated has as many rows of each as any other.
+    batched: ClassVar[tuple[str, ...]] = ("upper", "center", "places")
+    per_element: ClassVar[tuple[str, ...]] = ()
     name: ClassVar[str] = "gates"
     label: ClassVar[str] = "gates"
 

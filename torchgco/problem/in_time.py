@@ -102,6 +102,13 @@ def factor_controls(whole: Problem) -> slice:
     return slice(whole.m - 1, whole.m) if chosen else slice(0, 0)
 
 
+def factor_state(whole: Problem) -> int:
+    """Which state of a problem `in_time` is the factor of time."""
+    model = whole.dynamics
+    assert isinstance(model, _Dynamics)
+    return model.model.n
+
+
 def times_of(problem: Problem, factors: Tensor) -> Tensor:
     """The times (B, N+1) of the knots, s."""
     assert problem.time is not None

@@ -100,6 +100,16 @@ class Nearby:
         return (deeper | cut).nonzero().flatten()
 
 
+def among_nearby(call: Call, solve: Callable[[Call], Solution]) -> Solution:
+    """Solve a call: with the obstacles nearby where many are far, then with all where that won't do."""
+    near = Nearby.of(call)
+    if near is None:
+        return solve(call)
+    found = near.solution(solve(near.call))
+    rows = near.wrong(found)
+    return found if rows.numel() == 0 else merged(found, rows, solve(call.take(rows)))
+
+
 def without_obstacles(problem: Problem) -> Problem | None:
     """The problems with one absent obstacle of each kind, in the same native form; None for kinds that can't say."""
     if any(type(part.inscribed).chosen is Obstacles.chosen for part in problem.obstacles):

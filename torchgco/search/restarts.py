@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from torchgco.base.errors import InputError
@@ -17,12 +18,13 @@ from torchgco.roadmap.scene import has_paths
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
 from torchgco.search.converge import Converge, mapped
-from torchgco.search.nearby import Nearby, merged
+from torchgco.search.nearby import among_nearby
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.proposals import PathProposals
 from torchgco.search.row import Passes, Row, passes_of
 from torchgco.search.suitability import suited_paths
 from torchgco.search.table import rows_of
+from torchgco.search.through_gates import solved_through_gates
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
@@ -104,8 +106,10 @@ class Restarts(Solver):
         bodies = (part.absent.shape[1] > 0 if isinstance(part, Obstacles) else True for part in problem.geometric)
         if not any(bodies):
             return self.interior.choosing_time(problem)
+        limit = self.local.violation_tolerance
         paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
-        return Chooser(self, self.interior, self.local.violation_tolerance, paces=paces)
+        through = partial(solved_through_gates, self.interior, limit)
+        return Chooser(self, self.interior, limit, paces=paces, through=through)
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""
@@ -116,13 +120,8 @@ class Restarts(Solver):
         return replace(self, local=self.local.in_slots(slots))
 
     def run(self, call: Call) -> Solution:
-        """Solve a checked call: with the obstacles nearby where many are far, then with all where that won't do."""
-        near = Nearby.of(call)
-        if near is None:
-            return self._solved(call)
-        found = near.solution(self._solved(near.call))
-        rows = near.wrong(found)
-        return found if rows.numel() == 0 else merged(found, rows, self._solved(call.take(rows)))
+        """Solve a checked call, with the obstacles nearby where these will do."""
+        return among_nearby(call, self._solved)
 
     def _solved(self, call: Call) -> Solution:
         solver = self.local

@@ -10,6 +10,7 @@ obstacles, a trajectory at a held time is sought first; where there is none, at 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -53,6 +54,7 @@ class Chooser:
         limit: violation up to which a trajectory is feasible.
         first: takes the time as a variable at once, in few iterations; None: it is held first.
         paces: shares of the times found at which it is searched again, as another way may be the better one there.
+        through: takes the time of problems with gates as a variable at once; None: as of others.
     """
 
     held: Runs
@@ -60,6 +62,7 @@ class Chooser:
     limit: float
     first: Runs | None = None
     paces: tuple[float, ...] = ()
+    through: Callable[[Any], Solution] | None = None
 
 
 class Timed:
@@ -132,16 +135,23 @@ class Timed:
         if given and self.call.warm is not None:
             self._keep(rows, self.chooser.free.run(call))
             return
-        if self.chooser.first is not None:
-            # States that were chosen, and those through gates, are worth the while.
-            at_once = self.chooser.free if given or self.through_gates else self.chooser.first
-            found = at_once.run(replace(call, warm=None))
+        found = self._at_once(replace(call, warm=None), given)
+        if found is not None:
             self._keep(rows, found)
             left = (found.status != Status.CONVERGED) | self._is_short(rows, found)
             left = left.nonzero().flatten()
             rows, call = rows[left], call.take(left)
         if rows.numel() > 0:
             self._held(rows, call)
+
+    def _at_once(self, call: Any, given: bool) -> Solution | None:
+        """Solve a call with the time free from its start; None where it is held first."""
+        if self.through_gates and self.chooser.through is not None:
+            return self.chooser.through(call)
+        if self.chooser.first is None:
+            return None
+        # States that were chosen, and those through gates, are worth the while.
+        return (self.chooser.free if given or self.through_gates else self.chooser.first).run(call)
 
     def _held(self, rows: Tensor, call: Any) -> None:
         """Find trajectories at the time of the call's starts, and free it."""
@@ -188,12 +198,10 @@ class Timed:
         These are the estimate, where a guess was far from it, and shares of the times found so far: what is found then
         depends little on the guess.
         """
-        if not self.chooser.paces:
+        if not self.chooser.paces or self.through_gates:  # whose legs were searched with the time free
             return
         far = ((self.first / self.own - 1.0).abs() > SAME_TIME).any(-1)
-        # Where legs between gates have times of their own, other paces of all of them have found nothing better.
-        alone = self.through_gates and self.time.count > 1
-        for pace in (None, *(() if alone else self.chooser.paces)):
+        for pace in (None, *self.chooser.paces):
             found = self._found.violation <= self.chooser.limit
             rows = (found & far if pace is None else found).nonzero().flatten()
             factors = self.own if pace is None else pace * factors_in(self.problem, self._found.X)
