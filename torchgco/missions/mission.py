@@ -142,7 +142,11 @@ class Mission:
             x = hovering(airframe_of(problem.dynamics), problem.x0[:, :3])
             period = float(problem.dynamics.dt)
             _, noise = self.disturbance.draw(seed, ids.tolist(), self.periods(period), period)
-            return self._planner.first(problem, measured(x, noise[:, 0]), seed, ids)
+            return self._first(problem, measured(x, noise[:, 0]), seed, ids)
+
+    def _first(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
+        """The problems of the first plans from plants x (B, 17), and the solutions."""
+        return self._planner.first(problem, x, seed, ids)
 
     def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
         """Who plans for vehicles at plants x (B, 17): the planner, which knows all obstacles."""

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Meters, NonNegative, Within, check_options
-from torchgco.base.shapes import CPU, computing_on
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.gates import GateBalls, Gates, gates_of
@@ -25,24 +24,21 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import rk4
 from torchgco.dynamics.quadrotor import with_unit_quaternion
 from torchgco.dynamics.rotors import QuadrotorThrusts
-from torchgco.missions.disturbance import measured
 from torchgco.missions.log import SeenLog
-from torchgco.missions.mission import Duration, Mission, check_flown
+from torchgco.missions.mission import Duration, Mission
 from torchgco.missions.passing import Passing
 from torchgco.missions.pilot import SEED_STEP, Pilot
 from torchgco.missions.planner import Plan
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.plant import hovering
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.free_time import FreeTime
-from torchgco.problem.goal import Goal
 from torchgco.problem.in_time import guessing_times
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.interior import InteriorPoint
 
-SHOWN = 40  # control periods of a plan that are logged
+LOGGED = 40  # control periods of a plan that are logged
 FOLLOWED = 1e-3  # violation, m for lengths, up to which a plan is flown
 
 
@@ -142,14 +138,9 @@ class RaceMission(Mission):
                 expected = "bounds and gates alone in a race, whose plans know nothing else"
                 raise InputError(f"constraints[{i}]", expected, type(part).__name__)
 
-    def first_plans(self, problem: Problem, seed: int = 0, ids: Tensor | None = None) -> tuple[Problem, Solution]:
+    def _first(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
         """See `Mission`."""
-        problem, seed, ids = check_flown(self, problem, seed, ids)
-        with computing_on(CPU):
-            x = hovering(airframe_of(problem.dynamics), problem.x0[:, :3])
-            period = float(problem.dynamics.dt)
-            _, noise = self.disturbance.draw(seed, ids.tolist(), self.periods(period), period)
-            return Racer(self.planner, problem, self.plant.dt, seed, ids).first(measured(x, noise[:, 0]))
+        return Racer(self.planner, problem, self.plant.dt, seed, ids).first(x)
 
     def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
         """Who plans for vehicles at plants x (B, 17)."""
@@ -163,7 +154,7 @@ class Racer:
         spacing: of the states that a tracker follows, s.
     """
 
-    knots, seen = SHOWN + 1, list[SeenLog]()
+    knots, seen = LOGGED + 1, list[SeenLog]()
 
     def __init__(self, planner: RacePlanner, problem: Problem, spacing: float, seed: int, ids: Tensor) -> None:
         self.planner, self.problem, self.spacing, self.seed, self.ids = planner, problem, spacing, seed, ids
@@ -193,7 +184,7 @@ class Racer:
                 if some.numel() == 0:
                     continue
                 found = self._solved(some, passed, x[some], now, step, fresh)
-                flown = found.violation <= FOLLOWED
+                flown = (found.violation <= FOLLOWED) | (self.t[some, -1] == -torch.inf)  # there is no other plan
                 self._keep(some[flown], passed, found.take(flown.nonzero().flatten()), now)
                 violation[some], iterations[some], kept[some] = found.violation, found.iterations, ~flown
         plan = Plan.of_states(self._ahead(now), x, self.problem.dynamics, step)
@@ -260,8 +251,8 @@ class Racer:
         return with_unit_quaternion(rk4(rates, X, 1.0)), U
 
     def _ahead(self, now: float) -> Tensor:
-        """The next states (B, K, 14) of the plans, `spacing` apart; where a plan has ended, the vehicle hovers there."""
-        count = round(SHOWN * self.period / self.spacing)
+        """The next states (B, K, 14) of the plans, `spacing` apart; after the end of a plan the vehicle hovers there."""
+        count = round(LOGGED * self.period / self.spacing)
         times = (now + self.spacing * torch.arange(count + 1, dtype=self.t.dtype)).expand(len(self.t), -1)
         X, U = self._at(torch.arange(len(self.t)), times)
         airframe = airframe_of(self.problem.dynamics)

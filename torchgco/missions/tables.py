@@ -154,10 +154,15 @@ def mission_row(arrays: Arrays, b: int, period: float, end: Ending, airframe: Ai
         "flight_time": end.flight_time,
         "clearance": end.clearance,
         "goal_distance": end.goal_distance,
-        **({} if end.gates_passed is None else {
-            "gates_passed": end.gates_passed, "gate_distance": end.gate_distance,
-            "duration": end.flight_time if raced else math.nan,
-        }),
+        **(
+            {}
+            if end.gates_passed is None
+            else {
+                "gates_passed": end.gates_passed,
+                "gate_distance": end.gate_distance,
+                "duration": end.flight_time if raced else math.nan,
+            }
+        ),
         "energy": energy(t[until], x[until], airframe),
         "iterations": int(steps["iterations"].sum()),
         **step_columns(steps, period),
