@@ -31,8 +31,8 @@ def test_a_study_keeps_the_times(run, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_a_race_in_closed_loop_is_logged_drawn_and_kept(run, tmp_path) -> None:
-    words = ["experiment=race", "scenario.gates=[[-1.1,-1.6,3.6],[9.2,6.6,1.0]]", "scenario.stages=6",
-             "study.layouts=2", "study.shard_size=1", "study.view=true", "study.workers=1", "hydra.run.dir=out"]  # fmt: skip
+    words = ["experiment=race", "scenario.gates=[[-1.1,-1.6,3.6],[9.2,6.6,1.0]]", "scenario.stages=6"]
+    words += ["study.layouts=2", "study.shard_size=1", "study.view=true", "study.workers=1", "hydra.run.dir=out"]
     code, out, err = run(*words)
     assert code == 0, err
     assert "race 1, gco: REACHED after" in out and "2 gates passed, at most 0.2" in out

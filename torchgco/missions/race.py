@@ -251,7 +251,7 @@ class Racer:
         return with_unit_quaternion(rk4(rates, X, 1.0)), U
 
     def _ahead(self, now: float) -> Tensor:
-        """The next states (B, K, 14) of the plans, `spacing` apart; after the end of a plan the vehicle hovers there."""
+        """The next states (B, K, 14) of the plans, `spacing` apart; after its end a vehicle hovers there."""
         count = round(LOGGED * self.period / self.spacing)
         times = (now + self.spacing * torch.arange(count + 1, dtype=self.t.dtype)).expand(len(self.t), -1)
         X, U = self._at(torch.arange(len(self.t)), times)

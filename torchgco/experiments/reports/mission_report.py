@@ -95,7 +95,8 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
         if not rows:  # a start in contact
             continue
         add(f"{number}-compute", partial(draw.compute_figure, rows, period))
-        add(f"{number}-distance", partial(draw.distance_figure, fine, course))
+        if len(course.reaches):
+            add(f"{number}-distance", partial(draw.distance_figure, fine, course))
         for name, frame in rows.items():
             plan, label = flown.plans[name][i][: len(frame)], f"{number}-{name}"
             steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
