@@ -44,8 +44,8 @@ _parse_once()
 # Without a C compiler PyTorch's kernels solve, many times slower: these folders and files, whose tests are of native
 # kernels or of many solves, are skipped then.
 COMPILED = (
-    "native", "compiled", "search", "missions", "benchmarks", "experiments", "notebooks", "golden", "fuzz", "solvers",
-    "view", "cluster", "test_horizons.py", "test_scale.py", "test_presets.py", "roadmap",
+    "native", "compiled", "search", "missions", "exploration", "benchmarks", "experiments", "notebooks", "golden",
+    "fuzz", "solvers", "view", "cluster", "test_horizons.py", "test_scale.py", "test_presets.py", "roadmap",
 )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.engines import engine_of
+from tests.engines import compiled, engine_of
 from torchgco import ILQR, AugmentedLagrangian, ControlBounds, Problem, QuadraticCost, QuadrotorPlanning
 from torchgco.base.errors import InputError
 from torchgco.constraints.half_spaces import HalfSpaces, stacked
@@ -63,6 +63,7 @@ def _with(X: torch.Tensor, b: int, k: int, p: torch.Tensor) -> torch.Tensor:
     return torch.stack([torch.stack(row) for row in rows])
 
 
+@compiled
 def test_native_kernels_know_them() -> None:
     problem, X, U = drawn()
     engine = engine_of(problem)

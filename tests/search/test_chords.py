@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.families.general_problems import FAMILIES
 from tests.search.rows import without
 from torchgco import (
     Boxes,
@@ -92,6 +93,14 @@ def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
     old = judge(problem, solve(problem, solver=without(solver, ClearChords)).U)
     assert bool(old.feasible) and bool(old.clearance < 0)
     assert bool(judge(problem, solve(problem, solver=solver).U).sound.all())
+
+
+def test_a_way_along_thin_walls_is_cleared_by_the_interior_point() -> None:
+    """Out of a spiral: at the speed of its way, AL-iLQR's relaxed solve steps over walls of 0.2 m."""
+    problem = FAMILIES["spiral"].problem(0).take([0])
+    solution = solve(problem, verbose=False)
+    assert chord_clearance(problem, solution.X).item() >= 0.0
+    assert solution.violation.item() <= 1e-6 and solution.cost.item() < 18.0, "26.3 where it gave up"
 
 
 @pytest.mark.slow

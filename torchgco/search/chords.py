@@ -36,9 +36,10 @@ class ClearChords(Row):
     """Replaces feasible trajectories that touch an obstacle between two knots by ones that keep clear of it.
 
     Obstacles grow by 1.1 times the clearance that the last solve missed, or a little more, and the solve continues from
-    the best trajectory. A trajectory is replaced where the new one is feasible for the obstacles as they are, has
-    arrived if the old one had, and keeps more clearance between the knots. Openings may leave no room for it: there a
-    more expensive trajectory of the passes before that is clear is taken back.
+    the best trajectory: by AL-iLQR, and where that finds nothing by the interior point alone. A trajectory is replaced
+    where the new one is feasible for the obstacles as they are, has arrived if the old one had, and keeps clearer of
+    them between the knots. Openings may leave no room for it: there a more expensive trajectory of the passes before
+    that is clear is taken back.
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before; in maps, by the interior point alone,
@@ -70,18 +71,36 @@ class ClearChords(Row):
         def once(rows: Tensor, call: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
             best.next_attempt()
             if mapped(call.problem):  # along whose one row per knot AL-iLQR takes many short steps
-                grown = replace(search.interior, warm_barrier=GROWN_BARRIER)
-                return self._kept(search, rows, continued(grown, replace(call, callback=None), old), least)
-            new = best.attempt(call)
-            serves, now = self._kept(search, rows, new, least)
-            tight = continued(search.interior, replace(call, callback=None), new.best)
-            least = torch.where(serves & is_over(tight.status), now.clamp(max=0.0), torch.inf)
-            too, clear = self._kept(search, rows, tight, least)
-            return serves, torch.where(too, clear, now)
+                return self._continued(search, rows, call, old, least)
+            serves, now = self._relaxed(search, rows, call, least)
+            left = (~serves).nonzero().flatten()  # a relaxed solve may leave through a wall that is thin
+            if left.numel() > 0:
+                part = rows[left], call.take(left), take(old, left), least[left]
+                serves[left], now[left] = self._continued(search, *part)
+            return serves, now
 
         limit = search.solver.violation_tolerance
         rounds = self.rounds * (IN_MAPS if mapped(search.call.problem) else 1)
         best.restore(*cleared(search.call, best.end.best, rounds, limit, once))
+
+    def _continued(
+        self, search: Search, rows: Tensor, call: Call, old: Iterate, least: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The interior point goes on from the best; as `_kept`."""
+        grown = replace(search.interior, warm_barrier=GROWN_BARRIER)
+        return self._kept(search, rows, continued(grown, replace(call, callback=None), old), least)
+
+    def _relaxed(self, search: Search, rows: Tensor, call: Call, least: Tensor) -> tuple[Tensor, Tensor]:
+        """AL-iLQR, and from where it serves the interior point; as `_kept`."""
+        new = search.best.attempt(call)
+        serves, now = self._kept(search, rows, new, least)
+        some = serves.nonzero().flatten()
+        if some.numel() > 0:
+            tight = continued(search.interior, replace(call.take(some), callback=None), take(new.best, some))
+            wanted = torch.where(is_over(tight.status), now[some].clamp(max=0.0), torch.inf)
+            too, clear = self._kept(search, rows[some], tight, wanted)
+            now[some] = torch.where(too, clear, now[some])
+        return serves, now
 
     def _kept(self, search: Search, rows: Tensor, new: SolveEnd, least: Tensor) -> tuple[Tensor, Tensor]:
         """Where new trajectories of `rows` serve, with more clearance than `least`, they replace the best.

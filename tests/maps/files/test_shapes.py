@@ -106,6 +106,34 @@ def test_worlds_that_are_refused(old: str, new: str, said: str, tmp_path: Path) 
     assert error.value.field == "map.path"
 
 
+def test_rooms_between_walls_of_a_closed_mesh_stay_free(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    box = lambda size, at=(0, 0, 0): trimesh.creation.box(
+        extents=size, transform=trimesh.transformations.translation_matrix(at)
+    )
+    outer, room = box([4.1, 3.1, 2.1]), box([2.9, 1.9, 0.9])
+    filled = trimesh.util.concatenate([outer, room])
+    room.invert()
+    hollow = trimesh.util.concatenate([outer, room])
+    turned = hollow.copy()
+    turned.invert()
+    mixed = hollow.copy()
+    mixed.faces[::3] = mixed.faces[::3, ::-1]
+    sides = [box([0.2, 3.1, 2.1], (x, 0, 0)) for x in (-1.9, 0, 1.9)] + [
+        box([4.1, 0.2, 2.1], (0, y, 0)) for y in (-1.4, 1.4)
+    ]
+    walls = trimesh.util.concatenate([*sides, box([4.1, 3.1, 0.2], (0, 0, -0.9)), box([4.1, 3.1, 0.2], (0, 0, 0.9))])
+    for name, mesh, is_solid, in_room in (
+        ("hollow", hollow, True, False), ("turned", turned, True, False), ("mixed", mixed, True, False),
+        ("filled", filled, True, True), ("walls", walls, False, False),
+    ):  # fmt: skip
+        mesh.export(tmp_path / f"{name}.stl")
+        grid = read(tmp_path / f"{name}.stl", resolution=0.1)
+        assert isinstance(grid, OccupancyGrid)
+        at = lambda *point, grid=grid: bool(grid.occupied[tuple(grid.cell(np.array([point]))[0])])
+        assert at(1.65, 0.0, 0.65) == is_solid and at(1.0, 0.5, 0.1) == in_room, name
+
+
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply"])
 def test_a_closed_mesh_is_solid(ending: str, tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")

@@ -13,10 +13,11 @@ from torchgco.maps.grid import OccupancyGrid
 MESH_FILE = "a mesh of triangles, stl, obj or ply"
 LONGEST_EDGE = 0.5  # of a cell: triangles are divided until no edge is longer
 MOST_PIECES = 2**25  # triangles after this
+MOST_ASKED = 2**26  # angles of triangles
 
 
 def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> OccupancyGrid:
-    """The cells that a surface passes through are occupied, and what it encloses.
+    """The cells that a surface passes through are occupied, and its inside: rooms between closed walls stay free.
 
     Args:
         resolution: side of a cell, m.
@@ -36,9 +37,7 @@ def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> O
     cells = np.zeros(tuple(shape), bool)
     cells[tuple((_pieces(source, vertices, faces, resolution) - low).T)] = True
     if solid or (solid is None and closed):
-        from scipy.ndimage import binary_fill_holes
-
-        cells = binary_fill_holes(cells)
+        cells |= _enclosed(source, cells, vertices[faces] / resolution - low)
     return made(source, cells, low * resolution, resolution)
 
 
@@ -54,10 +53,44 @@ def _loaded(source: Source) -> tuple[np.ndarray, np.ndarray, bool]:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and normals cut surfaces along their seams
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         closed = bool(mesh.is_watertight)
+        if closed and not mesh.is_winding_consistent:
+            trimesh.repair.fix_winding(mesh)
+            faces = np.asarray(mesh.faces)
+    if vertices.shape[-1] != 3:
+        source.refuse(MESH_FILE, f"vertices of {vertices.shape[-1]} coordinates")
     if not len(faces) or not np.isfinite(vertices).all():
         source.refuse(MESH_FILE, f"{len(faces):,} faces" if not len(faces) else "vertices that aren't finite")
     check_far(source, vertices)
     return vertices, faces, closed
+
+
+def _enclosed(source: Source, cells: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Free cells inside of a closed surface whose triangles (F, 3, 3), in cells, turn the same way.
+
+    Cells that are connected lie on the same side, so one of each region is asked.
+    """
+    from scipy.ndimage import label
+
+    regions, count = label(~cells)
+    source.limit(
+        count * len(corners), MOST_ASKED, "free regions times triangles: larger cells, or solid=False, take fewer"
+    )
+    _, first = np.unique(regions, return_index=True)
+    inside = np.zeros(count + 1, bool)
+    inside[regions.ravel()[first]] = [
+        bool(cell) and abs(_turns(corners - (np.array(np.unravel_index(place, cells.shape)) + 0.5))) > 0.5
+        for cell, place in zip(regions.ravel()[first], first, strict=True)
+    ]
+    return inside[regions]
+
+
+def _turns(corners: np.ndarray) -> float:
+    """How often triangles (F, 3, 3) wind around the origin: solid angles (van Oosterom, Strackee 1983) by 4 pi."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    na, nb, nc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+    dot = lambda v, w: (v * w).sum(-1)
+    below = na * nb * nc + dot(a, b) * nc + dot(b, c) * na + dot(c, a) * nb
+    return float(np.arctan2(dot(a, np.cross(b, c)), below).sum() / (2.0 * np.pi))
 
 
 def _pieces(source: Source, vertices: np.ndarray, faces: np.ndarray, resolution: float) -> np.ndarray:

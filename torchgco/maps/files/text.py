@@ -12,14 +12,19 @@ from torchgco.maps.files.source import MOST_POINTS, MOST_TEXT, Source, finite_po
 
 XYZ = "points as text, a line of 2 or 3 numbers or more each"
 SEPARATORS = re.compile(rb"[,; \t]+")
+COMMENT = re.compile(rb"#[^\n]*")
+NOT_BY_COMMA = re.compile(rb"[0-9.][; \t]+[-+.0-9]")  # between two numbers of a line
 
 
 def read_xyz(source: Source) -> np.ndarray:
     """The first three numbers of each line, or both where lines have two; `#` begins a comment.
 
-    Numbers are separated by spaces, tabs, commas or semicolons. Further columns, such as colours, aren't read.
+    Numbers are separated by spaces, tabs, commas or semicolons. Commas beside other separators are refused, as they may
+    stand for decimal points. Further columns, such as colours, aren't read.
     """
-    text = source.bytes(XYZ, MOST_TEXT)
+    text = COMMENT.sub(b"", source.bytes(XYZ, MOST_TEXT))
+    if b"," in text and NOT_BY_COMMA.search(text):
+        source.refuse(XYZ, "commas beside other separators; for decimal commas: sed 's/,/./g' FILE > POINTS.xyz")
     first = next((line for line in map(_bare, BytesIO(text)) if line), None)
     if first is None:
         source.refuse(XYZ, "no line of numbers")
