@@ -14,7 +14,7 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.model import Model
 
 ORDINARY = 1e-2  # sizes from here on are those of ordinary units
-FAINT = 1e-6  # sizes below may be rounding of larger numbers
+LEAST_SIZE = 1e-6  # sizes below may be rounding of larger numbers
 
 
 def steepest(model: Model, X: Tensor, U: Tensor, slopes: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
@@ -33,7 +33,7 @@ def steepest(model: Model, X: Tensor, U: Tensor, slopes: Tensor, H: Tensor) -> t
     size = torch.maximum(size, torch.cat((X.abs().amax(1), U.abs().amax(1)), dim=-1))
     _measure_bounds(model, size)
     _infer(model, X, U, size)
-    by = torch.where((size > 0.0) & (size < ORDINARY), size.clamp(min=FAINT), 1.0)
+    by = torch.where((size > 0.0) & (size < ORDINARY), size.clamp(min=LEAST_SIZE), 1.0)
     slopes, curvature = slopes.amax(1), curvature.amax(1)
     largest = lambda by: torch.maximum(slopes * by, curvature * by * by).amax(-1)
     return largest(by), largest(torch.ones_like(by))

@@ -81,7 +81,7 @@ static V steepest(const Barrier *t, V *plain) {
     infer_sizes(t, size);
     *plain = zero;
     for (int v = 0; v < S; v++) {
-        V by = most(size[v], SET(FAINT));
+        V by = most(size[v], SET(LEAST_SIZE));
         by = tgco_choose((size[v] > zero) & (by < SET(ORDINARY)), by, one);
         largest = most(most(slope[v] * by, bend[v] * by * by), largest);
         *plain = most(most(slope[v], bend[v]), *plain);
