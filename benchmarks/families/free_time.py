@@ -37,6 +37,10 @@ from torchgco import (
 D, INF = torch.float64, math.inf
 EXACT = 1e-3  # share of the least time, of equal stages of which one holds the switch
 RACE, FINER = InteriorPoint(max_iterations=1000), 1e-2  # the barrier from a solution with fewer stages
+# The barrier of a plan that is aimed. Many trajectories take as long, to 0.1 ms: from a larger one a solve ends at one
+# whose thrusts differ by newtons, and whose flight misses by as much as before, but elsewhere.
+AIMED = 1e-4
+AIMS = 3  # plans that are aimed at most, until a flight passes all gates
 
 
 @dataclass(frozen=True)
@@ -290,12 +294,14 @@ def races(stages: Sequence[int], margin: float, tracks: int, seed: int) -> str:
 
 
 def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> list[list[object]]:
-    """A row for each number of stages a leg, and one for the last aimed at where its flight shall be.
+    """A row for each number of stages a leg, and those for the last aimed at where its flight shall be.
 
     All but the first begin with the solution before. Batches: the worst.
     """
-    rows, before, spent = list[list[object]](), None, 0.0
-    for size in (*stages, stages[-1]):
+    rows, before, spent, passes = list[list[object]](), None, 0.0, False
+    for size in (*stages, *[stages[-1]] * AIMS):
+        if passes:
+            break
         problem, X0, U0 = race(size, gates, 0.3)
         solver, label = RACE, f"{problem.N}"
         if before is not None and size > before[0]:
@@ -305,7 +311,7 @@ def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> li
             began = time.process_time()
             problem, X0, U0 = aimed(before[1], size, gates, 0.3 - margin)
             spent += time.process_time() - began
-            solver, label = replace(RACE, initial_barrier=FINER), f"{problem.N}, aimed"
+            solver, label = replace(RACE, initial_barrier=AIMED), f"{problem.N}, aimed"
         solver.solve(problem, U0, X0=X0, max_seconds=1e-3)
         began = time.process_time()
         found = solver.solve(problem, U0, X0=X0)
@@ -317,7 +323,7 @@ def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> li
             f"{int(found.iterations.median())} ({int(found.iterations.max())})", f"{spent / problem.B:.2f}",
             *(f"{float(there[key].max()):.4f}" for key in ("gate", "end", "rate")),
         ])  # fmt: skip
-        before = size, found
+        before, passes = (size, found), "aimed" in label and float(there["gate"].max()) <= 0.3
     return rows
 
 

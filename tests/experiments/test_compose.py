@@ -78,17 +78,22 @@ def test_every_experiment_composes_with_every_scenario_model_and_solver(experime
         solver = next(turns) if name in ("forest", *FILES) else "hold"  # whose configuration is quick to compose
         given = [f"experiment={experiment}", *words, f"solver={solver}"]
         given += [f"model={model}"] if next(named) and f"model={model}" not in words else []
-        if experiment in MISSIONS and model != "quadrotor":
+        if experiment == "race" and name != "race":
+            assert refused(*given).startswith(("scenario: expected", "model: expected rotors"))
+        elif experiment in MISSIONS and model != "quadrotor":
             assert "scenario: expected one in space for a mission: crossing, cylinders, forest" in refused(*given)
         else:
             setup = checked(*given)
-            assert setup.vehicle.name == model and (setup.mission is not None) == (experiment in MISSIONS)
+            assert setup.vehicle.name == model and (setup.mission is not None) == (experiment in (*MISSIONS, "race"))
 
 
 @pytest.mark.parametrize("experiment", MISSIONS)
 def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment: str) -> None:
     for mission in options_of("mission"):
-        setup = checked(f"experiment={experiment}", f"mission={mission}", "scenario=walls", "solver=al_ilqr")
+        words = f"experiment={experiment}", f"mission={mission}", "solver=al_ilqr"
+        if mission == "race":
+            assert refused(*words, "scenario=walls").startswith("scenario: expected race, or a layout file with gates")
+        setup = checked(*words, "scenario=race" if mission == "race" else "scenario=walls")
         assert setup.mission is not None and setup.mission.planner.solver == presets.al_ilqr(3)
     for plant in ("drone_models", "mujoco", "rotorpy"):
         if find_spec(plant) is None:

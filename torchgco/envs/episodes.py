@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.tree import put
+from torchgco.constraints.gates import has_gates
 from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance, measured
 from torchgco.missions.mission import Mission, check_flown
@@ -40,9 +41,9 @@ class Episodes:
 
     def __init__(self, mission: Mission, problem: Problem, count: int, control: Control) -> None:
         problem, _, _ = check_flown(mission, problem, 0, None)
-        if not mission.sees_all or mission.latency:
-            given = "a latency" if mission.sees_all else "a sensor"
-            raise InputError("mission", "neither a sensor nor a latency in an environment", given)
+        if not mission.sees_all or mission.latency or has_gates(problem):
+            given = "a sensor" if not mission.sees_all else "a latency" if mission.latency else "a race"
+            raise InputError("mission", "no sensor, latency or race in an environment", given)
         self.mission, self.problem, self.control = mission, problem, control
         self.contacts = Contact.among(problem)
         if self.contacts.moving:

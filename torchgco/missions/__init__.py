@@ -11,6 +11,8 @@ from torchgco.missions.pilot import Pilot as Pilot
 from torchgco.missions.planner import Planner as Planner
 from torchgco.missions.plant import Plant as Plant
 from torchgco.missions.plant import RotorPlant as RotorPlant
+from torchgco.missions.race import RaceMission as RaceMission
+from torchgco.missions.race import RacePlanner as RacePlanner
 from torchgco.missions.remote import RemotePlant as RemotePlant
 from torchgco.missions.tables import endings as endings
 from torchgco.missions.tracker import Tracker as Tracker

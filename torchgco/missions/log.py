@@ -80,7 +80,8 @@ class MissionLog:
     def add_plan(self, rows: Tensor, step: int, x: Tensor, plan: Plan, seconds: float) -> None:
         """The start of a control period: states x (b, 17) of the missions `rows`, and their plans."""
         self.x[rows, step, 0] = x
-        knots = torch.arange(self.plan.shape[2]).clamp(max=plan.X.shape[1] - 1)  # a plan may be another pilot's
+        every = 1 if plan.spacing is None else round(self.period / plan.spacing)  # of the knots are logged
+        knots = (every * torch.arange(self.plan.shape[2])).clamp(max=plan.X.shape[1] - 1)  # or of another pilot's plan
         self.plan[rows, step] = plan.X[:, knots, :3]
         for name in ("cost", "violation", "shifted", "guided", "iterations"):
             getattr(self, name)[rows, step] = getattr(plan, name).to(x.dtype)

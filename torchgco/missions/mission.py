@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,11 +21,12 @@ from torchgco.base.shapes import CPU, check_tensor, computing_on
 from torchgco.base.tree import take
 from torchgco.constraints.gates import has_gates
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.quadrotor import Airframe
+from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance, measured
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import FARTHEST
+from torchgco.missions.passing import Passing
 from torchgco.missions.pilot import KnownMap, Pilot
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import airframe_of
@@ -37,6 +38,7 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
+Duration = Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")]
 Begin = Callable[[Problem, Tensor, int, Tensor], Pilot]
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
 
@@ -64,9 +66,12 @@ class Mission:
     tracker: Tracker = field(default_factory=Tracker)
     plant: Plant = field(default_factory=RotorPlant)
     disturbance: Disturbance = field(default_factory=Disturbance)
-    duration: Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")] = 15.0
+    duration: Duration = 15.0
     goal_radius: Meters | None = 0.5
     latency: Annotated[int, Within(0, 1, "control periods")] = 0
+
+    model: ClassVar[type[Dynamics]] = QuadrotorPlanning  # that plans are made with
+    model_name: ClassVar[str] = "quadrotor"  # as commands name it
 
     def __post_init__(self) -> None:
         check_options(self, "mission")
@@ -80,6 +85,8 @@ class Mission:
 
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
+        if not isinstance(dynamics, self.model):
+            raise InputError("model", f"{self.model_name}, which this mission plans with", type(dynamics).__name__)
         frame, other = airframe_of(dynamics), getattr(self.plant, "airframe", None)
         if isinstance(other, Airframe) and other != frame:
             named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(other, f.name)]
@@ -87,6 +94,15 @@ class Mission:
             raise InputError("plant.airframe", f"that of the planning model, {planned}", given)
         if self.substeps(float(dynamics.dt)) is None:
             raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
+
+    def check_stated(self, problem: Problem) -> None:
+        """Raise InputError unless this mission flies problems that are stated like this one."""
+        if problem.time is not None:
+            raise InputError("time", "None for a mission, whose control periods are fixed", "a free time")
+        if problem.goal is not None and problem.goal.required:
+            raise InputError("goal.required", "False for a mission, whose plans may end before the goal", True)
+        if has_gates(problem):
+            raise InputError("constraints", "no Gates in a mission, whose plans begin again at their knot 0", "Gates")
 
     def substeps(self, period: float) -> int | None:
         """Time steps of the plant in a control period, s; None where they don't fit."""
@@ -126,7 +142,11 @@ class Mission:
             x = hovering(airframe_of(problem.dynamics), problem.x0[:, :3])
             period = float(problem.dynamics.dt)
             _, noise = self.disturbance.draw(seed, ids.tolist(), self.periods(period), period)
-            return self._planner.first(problem, measured(x, noise[:, 0]), seed, ids)
+            return self._first(problem, measured(x, noise[:, 0]), seed, ids)
+
+    def _first(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
+        """The problems of the first plans from plants x (B, 17), and the solutions."""
+        return self._planner.first(problem, x, seed, ids)
 
     def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
         """Who plans for vehicles at plants x (B, 17): the planner, which knows all obstacles."""
@@ -146,12 +166,7 @@ def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | Non
         check_ids(ids, problem)
     if problem.goal is None:
         raise InputError("goal", "a Goal in the problem", None)
-    if problem.time is not None:
-        raise InputError("time", "None for a mission, whose control periods are fixed", "a free time")
-    if problem.goal.required:
-        raise InputError("goal.required", "False for a mission, whose plans may end before the goal", True)
-    if has_gates(problem):
-        raise InputError("constraints", "no Gates in a mission, whose plans begin again at their knot 0", "Gates")
+    mission.check_stated(problem)
     check_no_body(problem, "vehicle_radius", "a number for a mission, whose vehicle is a ball")
     if problem.horizon is not None:
         raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
@@ -219,7 +234,7 @@ class Flight:
     def _begin(self, problem: Problem, ids: Tensor, begin: Begin) -> None:
         mission, goal = self.mission, problem.goal
         assert goal is not None
-        self.contact, self.model = Contact.among(problem), problem.dynamics
+        self.contact, self.passing, self.model = Contact.among(problem), Passing.among(problem), problem.dynamics
         self.measured_at, self.clearance = problem.x0[:, :3], torch.full_like(problem.x0[:, 0], -torch.inf)
         radius = mission.goal_radius
         self.goal = goal.position
@@ -306,7 +321,7 @@ class Flight:
 
     def _fly_period(self, step: int, plan: Plan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
         """One control period along a plan; and which vehicles have ended in it, (B,) bool."""
-        reference = Reference(plan.X, self.period, self.airframe)
+        reference = Reference(plan.X, plan.spacing or self.period, self.airframe)
         ended = torch.zeros_like(self.rows, dtype=torch.bool)
         for j in range(self.substeps):
             seen = measured(self.x, self.noise[self.rows, step])
@@ -314,7 +329,10 @@ class Flight:
             tracking = self.mission.tracker.track(seen, reference, j * self.plant.dt, tracking)
             seconds = (time.perf_counter() - began) / self.rows.numel()
             flew, x = ~ended, self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
-            self.x = torch.where(ended.unsqueeze(-1), self.x, x)
+            before, self.x = self.x, torch.where(ended.unsqueeze(-1), self.x, x)
+            if self.passing is not None:
+                passed = self.passing.after(before[:, :3], self.x[:, :3])
+                self.passing = replace(self.passing, passed=passed)
             ended |= self._ends((step * self.substeps + j + 1) * self.plant.dt)
             self.log.add_sample(self.rows, step, j, self.x, tracking, seconds, flew)
         assert tracking is not None
@@ -325,6 +343,7 @@ class Flight:
         p = self.x[:, :3]
         finite = torch.isfinite(self.x).all(-1) & ((p - self.start[self.rows]).norm(dim=-1) <= FARTHEST)
         there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
+        there = there if self.passing is None else there & self.passing.done
         return ~finite | there | self._touches(p, t)
 
     def _touches(self, p: Tensor, t: float) -> Tensor:
@@ -340,6 +359,7 @@ class Flight:
         if stay.numel() == left.numel():
             return
         self.plant, self.contact = self.plant.take(stay), self.contact.take(stay)
+        self.passing = None if self.passing is None else self.passing.take(stay)
         self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
         self.measured_at, self.clearance = self.measured_at[stay], self.clearance[stay]
         self.pilot.take(stay)

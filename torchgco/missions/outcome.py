@@ -1,13 +1,14 @@
 """How a flight ended, judged from the log of the plant alone.
 
 A flight ends with the first of three events: the vehicle touches an obstacle (COLLISION), its state is no longer finite
-or leaves all reason (DIVERGED), or it comes within the goal's radius (REACHED). Without any it ends with TIMEOUT.
+or leaves all reason (DIVERGED), or it comes within the goal's radius (REACHED), in a race once all gates are passed.
+Without any it ends with TIMEOUT.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -17,6 +18,7 @@ import torch
 from torchgco.base.errors import InputError
 from torchgco.base.options import Meters, Seconds, check_value
 from torchgco.missions.contact import Contact
+from torchgco.missions.passing import Passing
 
 FARTHEST = 1e3  # m from the start: a vehicle beyond has diverged
 
@@ -50,14 +52,18 @@ class Ending:
     flight_time: float  # s, until the event, or of the whole log
     clearance: float  # m, smallest distance to where bodies touch, between samples too; infinite without obstacles
     goal_distance: float  # m, at the end
+    gates_passed: int | None = None  # in their order, between samples too; None without gates
+    gate_distance: float | None = None  # m, largest of the least distances from the middles of these and the next one
 
 
-def judge_flight(position: Any, dt: float, contact: Contact, goal: Any, goal_radius: float) -> Ending:
+def judge_flight(
+    position: Any, dt: float, contact: Contact, goal: Any, goal_radius: float, gates: Passing | None = None
+) -> Ending:
     """Judge one flight.
 
     Args:
         position: samples (T, 3), m, of the plant, one every dt, s; after the flight's end NaN.
-        contact: of a single problem.
+        contact, gates: of a single problem.
         goal, goal_radius: (3,) and a number above 0, m.
 
     Raises:
@@ -72,6 +78,9 @@ def judge_flight(position: Any, dt: float, contact: Contact, goal: Any, goal_rad
     with np.errstate(invalid="ignore"):
         lost = ~(np.linalg.norm(position - position[0], axis=-1) <= FARTHEST)
     there = np.linalg.norm(position - goal, axis=-1) < goal_radius
+    if gates is not None:
+        when, _ = gates.along(torch.from_numpy(position[~lost].astype(float)))
+        there &= np.arange(len(there)) >= int(when.max())
     last = int(np.argmax(lost | there)) if (lost | there).any() else len(position) - 1
     way = torch.from_numpy(position[None, : last + (not lost[last])].astype(float))
 
@@ -84,7 +93,11 @@ def judge_flight(position: Any, dt: float, contact: Contact, goal: Any, goal_rad
         samples = 1 + bisect_left(range(1, samples), True, key=lambda count: clearance(count) < 0)
         outcome, last = Outcome.COLLISION, samples - 1
     distance = float("nan") if outcome is Outcome.DIVERGED else float(np.linalg.norm(position[last] - goal))
-    return Ending(outcome, last * dt, clearance(samples), distance)
+    ending = Ending(outcome, last * dt, clearance(samples), distance)
+    if gates is None:
+        return ending
+    when, away = gates.along(way[0, :samples])
+    return replace(ending, gates_passed=int((when < samples).sum()), gate_distance=float(away[away.isfinite()].max()))
 
 
 def _numbers(value: Any, field: str, shape: tuple[int | None, ...]) -> np.ndarray:

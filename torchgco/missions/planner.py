@@ -51,6 +51,7 @@ class Plan:
     model: Dynamics  # that was planned with
     step: int
     arrived: Tensor  # (B,) bool: whether this plan or one before it ends at the goal
+    spacing: float | None = None  # s between the knots of X, where that isn't the control period
 
     def continued(self, problem: Problem) -> Multipliers:
         """The multipliers one stage later; where a group of obstacles ends, a knot takes those of the next group.

@@ -13,6 +13,7 @@ from torchgco.constraints import ControlBounds
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning, pose_rates
+from torchgco.dynamics.rotors import QuadrotorThrusts
 from torchgco.kernels import open_loop
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
@@ -44,8 +45,8 @@ def airframe_of(dynamics: Dynamics) -> Airframe:
     Raises:
         InputError: dynamics on which no mission can fly.
     """
-    if not isinstance(dynamics, QuadrotorPlanning):
-        raise InputError("model", "quadrotor: a mission flies its planning model", type(dynamics).__name__)
+    if not isinstance(dynamics, QuadrotorPlanning | QuadrotorThrusts):
+        raise InputError("model", "quadrotor, or rotors in a race", type(dynamics).__name__)
     return dynamics.airframe
 
 

@@ -14,7 +14,8 @@ from torchgco.base.options import Meters, check_value
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import TIMED_PARTS, MissionLog
-from torchgco.missions.outcome import Ending, judge_flight
+from torchgco.missions.outcome import Ending, Outcome, judge_flight
+from torchgco.missions.passing import Passing
 from torchgco.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -54,13 +55,27 @@ def clearances(arrays: Arrays, period: float, contact: Contact) -> np.ndarray:
     return np.where(np.isnan(arrays["planner_seconds"]), np.nan, found)
 
 
-def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances: np.ndarray) -> pd.DataFrame:
+def gates_passed(arrays: Arrays, gates: Passing) -> np.ndarray:
+    """How many gates missions have passed by the starts of their control steps, between time steps too, (B, K)."""
+    B, K, J = arrays["commands"].shape[:3]
+    starts, found = J * np.arange(K), []
+    for b in range(B):
+        _, x = samples(arrays, b, 1.0)
+        when, _ = gates.take(slice(b, b + 1)).along(torch.from_numpy(x[np.isfinite(x).all(-1), :3]))
+        found.append((when.numpy() <= starts[:, None]).sum(-1))
+    return np.stack(found)
+
+
+def mission_frame(
+    arrays: Arrays, ids: Sequence[int], period: float, clearances: np.ndarray, passed: np.ndarray | None = None
+) -> pd.DataFrame:
     """A row per mission and control step.
 
     Args:
         arrays: see `MissionLog.arrays`.
         ids: numbers of the missions; period: of a control step, s.
         clearances: (B, K), at the starts of control steps, m.
+        passed: see `gates_passed`; None: missions without gates.
 
     Commands `u1` to `u4` are the first of a control step; `u1_low` and `u1_high` the least and the largest of it.
     """
@@ -76,6 +91,7 @@ def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances:
         columns |= {f"f{i + 1}": x[:, 13 + i] for i in range(4)}
         columns |= _commands(arrays["commands"][b, :K])
         columns |= {"clearance": clearances[b][:K]}
+        columns |= {} if passed is None else {"gates_passed": passed[b][:K]}
         columns |= {name: arrays[name][b, :K] for name in ("planner_seconds", "tracker_seconds", "tracking_violation")}
         columns |= {"guided": arrays["guided"][b, :K].astype(int)}
         columns |= {name: arrays[name][b, :K] for name in SENSED if name in arrays}
@@ -132,11 +148,21 @@ def mission_row(arrays: Arrays, b: int, period: float, end: Ending, airframe: Ai
     t, x = samples(arrays, b, period)
     until = t <= end.flight_time + 1e-9
     steps = {name: arrays[name][b, : _steps(arrays, b)] for name in (*LOG_SCALARS, *SENSED) if name in arrays}
+    raced = end.outcome is Outcome.REACHED
     return {
         "outcome": end.outcome.name,
         "flight_time": end.flight_time,
         "clearance": end.clearance,
         "goal_distance": end.goal_distance,
+        **(
+            {}
+            if end.gates_passed is None
+            else {
+                "gates_passed": end.gates_passed,
+                "gate_distance": end.gate_distance,
+                "duration": end.flight_time if raced else math.nan,
+            }
+        ),
         "energy": energy(t[until], x[until], airframe),
         "iterations": int(steps["iterations"].sum()),
         **step_columns(steps, period),
@@ -168,15 +194,20 @@ def step_columns(steps: Arrays, period: float) -> dict[str, float]:
     }
 
 
-def ending(arrays: Arrays, b: int, period: float, contact: Contact, goal: np.ndarray, goal_radius: float) -> Ending:
-    """How mission b ended; `contact` is that of all missions, the goal (3,) its own. See `judge_flight`."""
+def ending(
+    arrays: Arrays, b: int, period: float, contact: Contact, goal: np.ndarray, goal_radius: float,
+    gates: Passing | None = None,
+) -> Ending:  # fmt: skip
+    """How mission b ended; `contact` and `gates` are those of all missions, the goal (3,) its own; `judge_flight`."""
     _, x = samples(arrays, b, period)
     dt, finite = period / arrays["commands"].shape[2], np.isfinite(x).all(axis=-1, keepdims=True)
-    return judge_flight(np.where(finite, x[:, :3], np.nan), dt, contact.take(slice(b, b + 1)), goal, goal_radius)
+    one = slice(b, b + 1)
+    own = None if gates is None else gates.take(one)
+    return judge_flight(np.where(finite, x[:, :3], np.nan), dt, contact.take(one), goal, goal_radius, own)
 
 
 def endings(log: MissionLog, problem: Problem, goal_radius: float | None = None) -> list[Ending]:
-    """How each mission of a log ended: outcome, flight time, clearance and distance from the goal.
+    """How each mission of a log ended: outcome, flight time, clearance, distance from the goal, and gates passed.
 
     Args:
         problem: the problems that were flown.
@@ -188,9 +219,10 @@ def endings(log: MissionLog, problem: Problem, goal_radius: float | None = None)
     check_value(goal_radius, Meters | None, "goal_radius")
     if len(log.x) != problem.B or problem.goal is None:
         raise InputError("problem", f"the {len(log.x)} problems with goals that were flown", f"{problem.B} problems")
-    contact, goal, arrays = Contact.among(problem), problem.goal.position.numpy(), log.arrays()
+    contact, gates = Contact.among(problem), Passing.among(problem)
+    goal, arrays = problem.goal.position.numpy(), log.arrays()
     radii = problem.goal.radius.tolist() if goal_radius is None else [goal_radius] * problem.B
-    return [ending(arrays, b, log.period, contact, goal[b], radii[b]) for b in range(problem.B)]
+    return [ending(arrays, b, log.period, contact, goal[b], radii[b], gates) for b in range(problem.B)]
 
 
 def _steps(arrays: Arrays, b: int) -> int:

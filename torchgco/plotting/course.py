@@ -1,4 +1,4 @@
-"""The obstacles and the goal of a mission, and one instant of it from above or from the side."""
+"""The obstacles, gates and the goal of a mission, and one instant of it from above or from the side."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import Ball, Solid
+from torchgco.plotting.gates import Outline, draw_gates
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import Scene, contacts, view
 from torchgco.plotting.style import INK, PALETTE
@@ -41,6 +42,7 @@ class Course:
         goal_radius: within which the goal counts as reached.
         vehicle_radius: r_veh.
         map: of the same space, or None.
+        gates: see `gates.outlines`.
 
     Raises:
         InputError: a goal of another shape.
@@ -51,6 +53,7 @@ class Course:
     goal_radius: float
     vehicle_radius: float = 0.36
     map: DistanceField | None = None
+    gates: tuple[Outline, ...] = ()
 
     def __post_init__(self) -> None:
         if np.shape(self.goal) != (3,):
@@ -92,7 +95,8 @@ class Course:
 
 
 def draw_still(ax: Axes, course: Course, plane: draw.Plane) -> None:
-    """The obstacles that look alike at all times: spheres at rest."""
+    """What looks alike at all times: gates, and spheres at rest."""
+    draw_gates(ax, list(course.gates), plane)
     _draw_bodies(ax, course, [body for body in course.bodies if _is_still(body)], 0.0, 0.0, plane)
 
 

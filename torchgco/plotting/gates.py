@@ -35,11 +35,22 @@ def outlines(problem: Problem, b: int) -> list[Outline]:
 
 
 def draw_gates(ax: Axes, gates: list[Outline], plane: tuple[int, int]) -> None:
-    """Draw them with their numbers."""
+    """Draw them with their numbers; gates at one place are one gate with several."""
+    numbers = dict[tuple[bytes, float], list[int]]()
     for number, (corners, radius) in enumerate(gates, start=1):
+        numbers.setdefault((corners.tobytes(), radius), []).append(number)
+    for place in numbers.values():
+        corners, radius = gates[place[0] - 1]
         seen = corners[:, list(plane)]
         if radius > 0:
             ax.add_patch(Circle((seen[0, 0], seen[0, 1]), radius, fill=False, color=INK, linewidth=1.2, zorder=3))
         else:
             ax.add_patch(Polygon(seen, closed=True, fill=False, color=INK, linewidth=1.6, zorder=3))
-        ax.annotate(str(number), seen.max(axis=0), fontsize=7, color=INK, xytext=(2, 2), textcoords="offset points")
+        ax.annotate(
+            ", ".join(map(str, place)),
+            seen.max(axis=0),
+            fontsize=7,
+            color=INK,
+            xytext=(2, 2),
+            textcoords="offset points",
+        )

@@ -18,16 +18,17 @@ from omegaconf.errors import OmegaConfBaseException
 from torchgco.base.errors import InputError
 from torchgco.base.memory import free_memory
 from torchgco.base.options import Count, Within, check_options, check_value
-from torchgco.dynamics import QuadrotorPlanning
+from torchgco.dynamics import QuadrotorPlanning, QuadrotorThrusts
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import settings_of
 from torchgco.kernels import use_native
-from torchgco.missions import Mission
+from torchgco.missions import Mission, RaceMission
 from torchgco.missions.plant import Plant, flown
 from torchgco.scenarios import GateForest, Layouts, Race, Scenario, Task, Vehicle
+from torchgco.scenarios.base import Family
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.solvers.memory import least_bytes
 
@@ -36,6 +37,7 @@ FLOWN = (
     "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, trefoils, walls, "
     "woods, or a layout file"
 )
+RACED = "race, or a layout file with gates and a free time, for mission=race"
 MAX_PROCESSES = 1024  # threads, too: PyTorch ends with an error of the system long before the system's own limit
 register()
 
@@ -220,16 +222,19 @@ def _mission(setup: Setup) -> Mission | None:
         raise InputError("plant", "the vehicle that flies the mission: plant=rotors", "none")
     if setup.device.type != "cpu" or setup.dtype != torch.float64:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
-    if setup.scenario.dimension != 3 or isinstance(setup.scenario, GateForest | Race):
-        raise InputError("scenario", FLOWN, setup.scenario.name)
-    made = _instantiate(node, "mission")
+    made, scenario = _instantiate(node, "mission"), setup.scenario
+    raced = isinstance(made, partial) and made.func is RaceMission
+    if raced and isinstance(scenario, Family) and not isinstance(scenario, Race):
+        raise InputError("scenario", RACED, scenario.name)
+    if scenario.dimension != 3 or (isinstance(scenario, GateForest | Race) and not raced):
+        raise InputError("scenario", FLOWN, scenario.name)
     mission = _closed_loop(made, _instantiate(plant, "plant"), setup.solver, setup.vehicle)
     mission.check(setup.vehicle.dynamics)
     return mission
 
 
 def _closed_loop(made: Any, plant: Any, solver: Any, vehicle: Vehicle) -> Mission:
-    if isinstance(plant, Plant) and isinstance(vehicle.dynamics, QuadrotorPlanning):
+    if isinstance(plant, Plant) and isinstance(vehicle.dynamics, QuadrotorPlanning | QuadrotorThrusts):
         plant = flown(plant, vehicle.dynamics.airframe)  # said once, in the model
     if not isinstance(made, partial) or "planner" not in made.keywords:
         raise InputError(

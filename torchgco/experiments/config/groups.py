@@ -24,7 +24,7 @@ from omegaconf import OmegaConf
 from torchgco.base.version import PACKAGE
 from torchgco.dynamics import Airframe
 from torchgco.exploration import SensorMission
-from torchgco.missions import Disturbance, Planner, RotorPlant, Tracker
+from torchgco.missions import Disturbance, Planner, RaceMission, RacePlanner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
 from torchgco.scenarios import (
     Crossing,
@@ -133,6 +133,8 @@ def register() -> None:
     planner = {"_partial_": True} | _fields_of(Planner, "solver", *SHARED_FIELDS)  # its solver is the one under study
     parts = {"planner": planner, "tracker": _fields_of(Tracker, *SHARED_FIELDS), "disturbance": _fields_of(Disturbance)}
     _store("mission", "default", {"_partial_": True} | _fields_of(SensorMission, "plant", *parts) | parts)
+    parts |= {"planner": {"_partial_": True} | _fields_of(RacePlanner, "solver")}
+    _store("mission", "race", {"_partial_": True} | _fields_of(RaceMission, "plant", "latency", *parts) | parts)
 
 
 def classes_of(group: str) -> frozenset[type]:

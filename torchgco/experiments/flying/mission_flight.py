@@ -16,6 +16,7 @@ from torchgco.experiments.flying.progress import Bar
 from torchgco.exploration.safety import safe_arrays
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
+from torchgco.missions.passing import Passing
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.tables import clearances, ending, mission_row, packed
 from torchgco.scenarios import Layouts
@@ -48,14 +49,14 @@ class MissionFlight:
         progress = partial(self._progress, float(problem.dynamics.dt), mission.duration)
         log = mission.fly(problem, seed=setup.seed, ids=ids, report=progress)
         self.bar.update(layouts.count - self.shown)
-        arrays, contact = log.arrays(self.plans), Contact.among(problem)
+        arrays, contact, gates = log.arrays(self.plans), Contact.among(problem), Passing.among(problem)
         arrays |= safe_arrays(log, problem)
         nearest = np.fmin.reduce(clearances(arrays, log.period, contact), axis=1, initial=np.inf)
         goal, radius = problem.goal.position.numpy(), problem.goal.radius.numpy()  # type: ignore[union-attr]
         rows = []
         for b in range(layouts.count):
             near = float(radius[b]) if mission.goal_radius is None else mission.goal_radius
-            end = ending(arrays, b, log.period, contact, goal[b], near)
+            end = ending(arrays, b, log.period, contact, goal[b], near, gates)
             flown = mission_row(arrays, b, log.period, end, airframe_of(problem.dynamics))
             rows.append({**self._row(b, end.outcome), "clearance_knots": float(nearest[b]), **flown})
         return pd.DataFrame(rows), packed(arrays)

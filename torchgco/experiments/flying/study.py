@@ -188,6 +188,7 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
 def check_mission(mission: Mission, task: Task) -> None:
     dynamics = task.problem.dynamics
     mission.check(dynamics)
+    mission.check_stated(task.problem)
     if mission.duration < dynamics.dt:
         raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
 

@@ -20,12 +20,14 @@ from torchgco.experiments.results.folder import LAYOUTS, MISSION, TRIALS, read_t
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.missions.contact import Contact
+from torchgco.missions.passing import Passing
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.tables import clearances, mission_frame, time_step_frame, unpacked
+from torchgco.missions.tables import clearances, gates_passed, mission_frame, time_step_frame, unpacked
 from torchgco.plotting import missions as draw
 from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course
+from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts
 
@@ -43,11 +45,12 @@ def mission_table(
     """
     assert setup.mission is not None
     problem = setup.vehicle.task(layouts).problem
-    period, contact = float(problem.dynamics.dt), Contact.among(problem)
+    period, contact, gates = float(problem.dynamics.dt), Contact.among(problem), Passing.among(problem)
     frames, plans, fine = [], [], []
     for name, rows in zip(solvers, logs, strict=True):
         arrays = unpacked(rows, setup.mission.substeps(period) or 1, not setup.mission.sees_all)
-        frame = mission_frame(arrays, layouts.ids.tolist(), period, clearances(arrays, period, contact))
+        passed = None if gates is None else gates_passed(arrays, gates)
+        frame = mission_frame(arrays, layouts.ids.tolist(), period, clearances(arrays, period, contact), passed)
         frame.insert(0, "solver", name)
         frames.append(frame)
         if "plan" in arrays:
@@ -92,7 +95,8 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
         if not rows:  # a start in contact
             continue
         add(f"{number}-compute", partial(draw.compute_figure, rows, period))
-        add(f"{number}-distance", partial(draw.distance_figure, fine, course))
+        if len(course.reaches):
+            add(f"{number}-distance", partial(draw.distance_figure, fine, course))
         for name, frame in rows.items():
             plan, label = flown.plans[name][i][: len(frame)], f"{number}-{name}"
             steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
@@ -136,12 +140,13 @@ class _Flown:
 
 
 def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
-    """The obstacles and the goal of one layout, and its control period, s."""
+    """The obstacles, the gates and the goal of one layout, and its control period, s."""
     task = setup.vehicle.task(layouts)
     assert setup.mission is not None
     near = setup.mission.goal_radius
     radius = float(task.goal_radius) if near is None else near
     held = layouts.vehicle_radius
     vehicle = setup.vehicle.radius if held is None else held
-    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map)
+    gates = tuple(outlines(task.problem, 0))
+    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map, gates)
     return course, float(task.problem.dynamics.dt)

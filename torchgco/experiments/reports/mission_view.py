@@ -122,6 +122,8 @@ def _told(row: Mapping[str, Any]) -> Rows:
     held: Rows = [("outcome", str(row["outcome"])), ("flight time", f"{row['flight_time']:.2f} s")]
     held += [("clearance", f"{row['clearance']:.3f} m"), ("from the goal", f"{row['goal_distance']:.2f} m")]
     held += [("missed deadlines", f"{row['missed_deadlines']:g}"), ("kept plans", f"{row['shifted_plans']:g}")]
+    if np.isfinite(row.get("gates_passed", np.nan)):
+        held += [("gates passed", f"{row['gates_passed']:g}"), ("farthest from one", f"{row['gate_distance']:.3f} m")]
     share = row.get("safe_share", np.nan)
     return [*held, ("periods with a safe plan", f"{100 * share:.4g} %")] if np.isfinite(share) else held
 

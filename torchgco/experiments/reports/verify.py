@@ -52,7 +52,10 @@ ROW_KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row o
 DIFFERENT = 10  # differing values that are printed per table
 # Of missions: columns that the log, which has the states at control steps alone, can't confirm; and those that are
 # compared with the outcome only.
-NOT_LOGGED = ("outcome", "flight_time", "clearance", "goal_distance", "energy", "iterations")
+NOT_LOGGED = (
+    "outcome", "flight_time", "clearance", "goal_distance", "gates_passed", "gate_distance", "duration", "energy",
+    "iterations",
+)  # fmt: skip
 BY_OUTCOME = ("status", "feasible", "reached")
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from torchgco.experiments.statistics.mission_statistics import MISSIONS_AT_ONCE
@@ -51,9 +53,17 @@ def mission_lines(trials: pd.DataFrame) -> str:
             times += f" per control period, {row.missed_deadlines} missed deadline{ending} of {row.outer_iterations}"
         lines.append(
             f"{row.scenario} {row.layout}, {row.solver}: {row.outcome} after {row.flight_time:.2f} s, clearance "
-            f"{row.clearance:.3f} m, {times}. {Outcome[str(row.outcome)].sentence}"
+            f"{row.clearance:.3f} m, {_gates(row)}{times}. {Outcome[str(row.outcome)].sentence}"
         )
     return "\n".join(lines)
+
+
+def _gates(row: Any) -> str:
+    """How a race went; nothing of missions without gates."""
+    passed = getattr(row, "gates_passed", np.nan)
+    if not np.isfinite(passed):
+        return ""
+    return f"{passed:.0f} gates passed, at most {row.gate_distance:.3f} m from their middles, "
 
 
 def format_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
