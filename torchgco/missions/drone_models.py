@@ -88,7 +88,7 @@ def parameters_of(
     return {
         "mass": frame.mass * (1.0 + mass_error),
         "L": frame.arm / math.sqrt(2.0),
-        "prop_inertia": 0.0,
+        "prop_inertia": frame.rotor_inertia,
         "gravity_vec": np.array([0.0, 0.0, -frame.gravity]),
         "J": J,
         "J_inv": np.linalg.inv(J),

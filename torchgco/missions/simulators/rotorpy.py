@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError
-from torchgco.dynamics.quadrotor import Airframe
+from torchgco.dynamics.quadrotor import RADIANS, Airframe
 from torchgco.missions.drone_models import WXYZ, XYZW
 from torchgco.missions.simulators.each import EachPlant, imported
 from torchgco.missions.simulators.mjcf import ROTOR_CORNERS
 
-RADIANS = 2.0 * math.pi / 60.0  # per second, of one rpm
 ODE_SOLVER = {"method": "RK45", "rtol": 1e-6, "atol": 1e-9}  # the package's own tolerance is 1e-3 of a step
 
 
