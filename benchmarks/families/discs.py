@@ -25,12 +25,12 @@ from benchmarks.lib.page import markdown, measured, put, share, shown
 from torchgco import ControlBounds, FunctionDynamics, Goal, Problem, QuadraticCost, Spheres
 
 OWN, PEERS = "gco", ("interior_point", "ipopt")
-LITTLE = 1e-3  # of the cost: more than this is dearer
+LITTLE = 1e-3  # share of the cost, up to which two count as equal
 LENGTH = 2.5  # wheelbase, m
 RADIUS = 0.5  # of the car, m
 D = torch.float64
 HEAD = (
-    "solver", "n", "feasible", "at the goal", "lost", "over 0.1 % dearer", "iterations, most", "s, median",
+    "solver", "n", "feasible", "at the goal", "lost", "over 0.1 % more expensive", "iterations, most", "s, median",
     f"time / `{PEERS[0]}` where that arrives, median [95 %]", "where it doesn't",
 )  # fmt: skip
 TRAP_HEAD = ("problem", "known to exist", *(f"`{name}`" for name in (OWN, *PEERS)), "iterations of `gco`")
@@ -101,24 +101,24 @@ def solved(name: str, problem: Problem) -> dict[str, Any]:
 
 
 def compared(flights: pd.DataFrame, name: str) -> list[Any]:
-    """A row: lost are goals that another solver reaches, dearer what costs more than the best of the peers."""
+    """A row: lost are goals that another solver reaches; costs are compared with those of the best of the peers."""
     by = {one: flights[flights["solver"] == one].set_index("problem") for one in (OWN, *PEERS)}
     own, n = by[name], len(by[name])
     others = [by[one] for one in PEERS if one != name]
     lost = sum(bool(any(peer["reached"][q] for peer in others) and not own["reached"][q]) for q in own.index)
     better = [peer["feasible"] & (peer["reached"] | ~own["reached"]) for peer in others]
     best = pd.concat([peer["cost"].where(rows) for peer, rows in zip(others, better, strict=True)], axis=1).min(axis=1)
-    dearer = int((own["cost"] > best * (1.0 + LITTLE)).sum())
+    above = int((own["cost"] > best * (1.0 + LITTLE)).sum())
     ratio, arrives = own["seconds"] / by[PEERS[0]]["seconds"], by[PEERS[0]]["reached"]
     times = ["1", "1"] if name == PEERS[0] else [median(ratio[rows], ".2g") for rows in (arrives, ~arrives)]
     return [
-        f"`{name}`", n, share(own["feasible"].sum(), n), share(own["reached"].sum(), n), lost, dearer,
+        f"`{name}`", n, share(own["feasible"].sum(), n), share(own["reached"].sum(), n), lost, above,
         int(own["iterations"].max()), shown(float(own["seconds"].median()), ".2g"), *times,
     ]  # fmt: skip
 
 
 def traps() -> list[list[Any]]:
-    """Problems on which solvers are known to end dearer: drifting cars, and pendulums that are nearly upright."""
+    """Problems on which solvers are known to miss the better minimum: drifting cars, nearly upright pendulums."""
     goal, disc = torch.tensor([10.0, 1.0], dtype=D), torch.tensor([[5.0, 0.2]], dtype=D)
     named = [
         (f"car with a drift of {drift:g}", known, problem_of(drifting(drift), goal, disc, torch.tensor([0.8], dtype=D)))

@@ -19,12 +19,12 @@ def test_ends_are_free_of_discs_and_draws_depend_on_the_seed_alone() -> None:
         ).all()
 
 
-def test_lost_and_dearer_are_counted_against_those_that_arrive() -> None:
-    """Problem 0: dearer than a peer; 1: cheaper, but the peer alone arrives; 2: dearer than one that doesn't arrive."""
+def test_lost_and_more_expensive_are_counted_against_those_that_arrive() -> None:
+    """Problem 0: above a peer; 1: cheaper, but the peer alone arrives; 2: above one that doesn't arrive."""
     peer = pd.DataFrame({"problem": range(3), "cost": 10.0, "feasible": True, "reached": [True, True, False],
                          "seconds": 0.1, "iterations": 5})  # fmt: skip
     own = peer.assign(solver=OWN, cost=[10.1, 9.0, 11.0], reached=[True, False, True], seconds=[0.2, 0.2, 0.9])
     flights = pd.concat([own, *(peer.assign(solver=name) for name in PEERS)])
     cells = dict(zip(HEAD, compared(flights, OWN), strict=True))
-    assert cells["lost"] == 1 and cells["over 0.1 % dearer"] == 1
+    assert cells["lost"] == 1 and cells["over 0.1 % more expensive"] == 1
     assert str(cells[HEAD[8]]).startswith("2 [") and str(cells[HEAD[9]]).startswith("9 [")

@@ -179,7 +179,7 @@ def relax(kinds: Kinds, model: Model, t: State) -> None:
     By a share of the violation tolerance, as IPOPT's bounds are, and by less where the controls change them little.
     """
     largest = torch.where(kinds.equality, 0.0, t.z).amax(-1) if t.z.shape[1] > 0 else torch.zeros_like(t.mu)
-    rows = ((largest > kinds.how.explodes) & ~t.rows_relaxed & ~t.watching).nonzero().flatten()
+    rows = ((largest > kinds.how.explodes * t.raised) & ~t.rows_relaxed & ~t.watching).nonzero().flatten()
     if rows.numel() == 0:
         return
     some, part = t.take(rows), model.take(rows)

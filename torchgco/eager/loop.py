@@ -24,6 +24,7 @@ from torchgco.eager.fixed import (
 )
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.search import Step, curvature, go_back, search, stepped
+from torchgco.eager.sizes import steepest
 from torchgco.eager.softness import gives_of
 from torchgco.eager.state import (
     How,
@@ -105,10 +106,10 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
     how = kinds.how
     t.soft = torch.full_like(t.mu, how.soft)
     slopes, H = model.cost_model(t.X, t.U)
-    curvature = H.diagonal(dim1=-2, dim2=-1).abs().flatten(1).amax(-1)
-    largest = torch.maximum(slopes.abs().flatten(1).amax(-1), curvature)
+    largest, plain = steepest(model, t.X, t.U, slopes, H)
     scale = how.steepest / largest
-    t.scale = torch.where(torch.isfinite(scale) & (largest > 0.0), scale, t.scale)
+    scaled = torch.isfinite(scale) & (largest > 0.0)
+    t.scale, t.raised = torch.where(scaled, scale, t.scale), torch.where(scaled, plain / largest, t.raised)
     t.mu = first_barrier(kinds, t)
     settle(kinds, model, t)
     sort_rows(kinds, model, t)
@@ -224,7 +225,7 @@ class _Loop:
         while t.z.shape[1] > 0:
             # Where equalities contradict each other to first order, their multipliers explode: a softer step is taken.
             largest = torch.where(kinds.fixed(t), (t.z + step.dz).abs(), 0.0).amax(-1)
-            large = moving & (largest > how.explodes) & (t.soft < how.softest)
+            large = moving & (largest > how.explodes * t.raised) & (t.soft < how.softest)
             if not bool(large.any()):
                 break
             t.soft = torch.where(large, how.soft_growth * t.soft, t.soft)

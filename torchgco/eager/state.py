@@ -43,6 +43,7 @@ class State:
     relaxed: Tensor  # by how much a row is
     mu: Tensor  # (b,), as all that follows
     scale: Tensor  # of the cost
+    raised: Tensor  # how many times larger it is than it would be in the units of the problem
     objective: Tensor  # 0 where feasibility alone is sought
     soft: Tensor  # delta_c
     shift: Tensor  # delta_w
@@ -124,11 +125,11 @@ def blank(problem: Problem, X: Tensor, U: Tensor, z: Tensor) -> State:
     }  # fmt: skip
     made = {
         **own, "out": never, "fixes": never, "gives": torch.ones_like(z), "room": torch.ones_like(z), "relaxed": none,
-        "mu": zero, "scale": one, "objective": one, "soft": zero, "shift": zero, "theta": zero, "phi": zero,
-        "highest": inf, "lowest": zero, "filter": X.new_full((b, FILTERED, 2), torch.inf), "last": zero, "forced": zero,
-        "entered": zero, "slope": zero, "alpha": zero, "least": inf, "left": inf, "idle": count, "made": count,
-        "failures": count, "shortened": count, "ahead": count, "restoring": no, "crawls": no, "rows_relaxed": no,
-        "presses": no, "watching": no, "rows": torch.arange(b, device=X.device),
+        "mu": zero, "scale": one, "raised": one, "objective": one, "soft": zero, "shift": zero, "theta": zero,
+        "phi": zero, "highest": inf, "lowest": zero, "filter": X.new_full((b, FILTERED, 2), torch.inf), "last": zero,
+        "forced": zero, "entered": zero, "slope": zero, "alpha": zero, "least": inf, "left": inf, "idle": count,
+        "made": count, "failures": count, "shortened": count, "ahead": count, "restoring": no, "crawls": no,
+        "rows_relaxed": no, "presses": no, "watching": no, "rows": torch.arange(b, device=X.device),
     }  # fmt: skip
     made = {name: value.clone() for name, value in made.items()}
     return State(**made, kept=tuple(made[name].clone() for name in STATE_FIELDS))
@@ -192,7 +193,7 @@ def adjoin(kinds: Kinds, at: Derivatives, t: State) -> None:
     for k in range(kinds.N - 1, 0, -1):
         y.append(torch.baddbmm(g[k], fx[k].mT, y[-1]))
     found = torch.stack([torch.zeros_like(g[0]), *y[::-1]]).squeeze(-1).transpose(0, 1)
-    sound = found.abs().flatten(1).amax(-1) <= kinds.how.largest_multiplier
+    sound = found.abs().flatten(1).amax(-1) <= kinds.how.largest_multiplier * t.raised
     t.y = torch.where(sound.view(-1, 1, 1), found, 0.0)
 
 
@@ -217,7 +218,7 @@ def errors(kinds: Kinds, at: Derivatives, t: State, r: Tensor, free: Tensor | No
     gap = t.gap.abs().flatten(1).amax(-1)
     if r.shape[1] > 0:
         gap = torch.maximum(gap, r.abs().amax(-1))
-    sum_y, sum_z = t.y.abs().flatten(1).sum(-1), t.z.abs().clamp(max=how.explodes).sum(-1)
+    sum_y, sum_z = t.y.abs().flatten(1).sum(-1), torch.minimum(t.z.abs(), column(how.explodes * t.raised)).sum(-1)
     mean = (sum_y + sum_z) / (kinds.N * n + t.z.shape[1])
     usual = torch.full_like(mean, how.usual_multiplier)
     dual = slope.abs().flatten(1).amax(-1) * usual / torch.maximum(mean, usual)
@@ -264,7 +265,7 @@ def find_solved(kinds: Kinds, t: State, test: Errors, running: Tensor) -> Tensor
     t.least = torch.where(running & (error < t.least), error, t.least)
     feasible = running & ~t.restoring & (test.primal <= how.violation)
     met = feasible & (error <= how.tolerance)
-    left, size = barrier_share(kinds, t)
+    left, size = left_over(kinds, t)
     counts = met & (left > how.counts * size) & (how.smoothing == 0)
     t.idle = torch.where(counts & (left <= 0.5 * t.left), 0, t.idle)
     t.left = torch.where(counts, torch.minimum(left, t.left), t.left)
@@ -275,8 +276,11 @@ def find_solved(kinds: Kinds, t: State, test: Errors, running: Tensor) -> Tensor
     return met | (feasible & rests & (error <= how.rounding))
 
 
-def barrier_share(kinds: Kinds, t: State) -> tuple[Tensor, Tensor]:
-    """The complementarity, and the size of the cost, beside which a tolerance that is met may not be small, (b,)."""
-    left = torch.where(kinds.inside(t), t.s * t.z, 0.0).sum(-1)
+def left_over(kinds: Kinds, t: State) -> tuple[Tensor, Tensor]:
+    """The complementarity and what the rows' residuals are worth, and the size of the cost, (b,).
+
+    Where the units are small, neither need be small beside the cost where its tolerance is met.
+    """
+    left = torch.where(kinds.inside(t), t.s * t.z, 0.0).sum(-1) + (t.z * residuals(kinds, t, t.c, t.s)).abs().sum(-1)
     constant, size = kinds.constant[t.rows], kinds.least_cost[t.rows]
     return left, (t.cost - t.scale * constant).abs() + t.scale * size

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchgco.base.draws import MURMUR_1, MURMUR_2, WEYL
 from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.eager.fixed import GOLDEN, NUDGE, ROUNDINGS
+from torchgco.eager.sizes import LEAST_SIZE, ORDINARY
 from torchgco.eager.state import FILTERED, LONGEST_FALL
 from torchgco.native.declarations import Structure, fields
 from torchgco.obstacles.base import ABSENT
@@ -16,7 +17,8 @@ from torchgco.obstacles.base import ABSENT
 NOWHERE = -1  # the place of a knot at which a constraint has no rows
 CONSTANTS = {
     "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": FILTERED, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
-    "NUDGE": NUDGE, "GOLDEN": GOLDEN, "ROUNDINGS": ROUNDINGS, "STOPPED": STOPPED, "STALLED": STALLED,
+    "NUDGE": NUDGE, "GOLDEN": GOLDEN, "ROUNDINGS": ROUNDINGS, "ORDINARY": ORDINARY, "LEAST_SIZE": LEAST_SIZE,
+    "STOPPED": STOPPED, "STALLED": STALLED,
     **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
         ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
     )},

@@ -24,14 +24,67 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     for (int l = 0; l < LANES; l++) if (of[l]) k->pairs[l] = 0;
 }
 
-/* The largest slope or curvature of the cost in any one variable. */
-static V steepest(const Barrier *t) {
+/* Sizes of bounds join those of their variables. */
+static void measure_bounds(const Barrier *t, V *size) {
     const Lanes *s = &t->lanes;
-    V largest = SET(0.0), g[S], H[S * S];
+    for (int64_t i = 0; i < s->of->constraints; i++) {
+        const Constraint *con = s->of->constraint + i;
+        if (con->kind != BOUNDS) continue;
+        for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
+            V limit = tgco_fabs(at(s->rows[i].bound, &con->bound, con->place[k])[j]);
+            int v = con->variable[j];
+            size[v] = most(tgco_if(finite(limit), limit), size[v]);
+        }
+    }
+}
+
+/* Sizes that no number tells, 0, follow from those of the states that these variables move within a step. */
+static void infer_sizes(const Barrier *t, V *size) {
+    const Lanes *s = &t->lanes;
+    I open = SET(0.0) != SET(0.0);
+    for (int v = 0; v < S; v++) open |= size[v] == SET(0.0);
+    if (!any(open)) return;
+    V f[NJ + 1], one[S], moved[S * NX];
+    model_jacobian(s->X, s->U, model_at(s, 0), s->of->shared, f);
+    for (int v = 0; v < S; v++) {
+        for (int w = 0; w < S; w++) one[w] = SET(w == v);
+        model_push(f, one, moved + v * NX);
+    }
+    for (int tries = 0; tries < NX; tries++) for (int v = 0; v < S; v++) {
+        V found = SET(INFINITY);
+        for (int i = 0; i < NX; i++) {
+            V by = size[i] / tgco_fabs(moved[v * NX + i]);
+            if (i != v) found = tgco_choose(by > SET(0.0), least(by, found), found);
+        }
+        size[v] = tgco_choose((size[v] == SET(0.0)) & finite(found), found, size[v]);
+    }
+}
+
+/* The largest slope or curvature of the cost in any one variable, in units in which none of these is small, and `plain`
+   in its own: eager/sizes.py says how. */
+static V steepest(const Barrier *t, V *plain) {
+    const Lanes *s = &t->lanes;
+    V largest = SET(0.0), zero = SET(0.0), one = SET(1.0), g[S], H[S * S], slope[S], bend[S], size[S];
+    for (int v = 0; v < S; v++) slope[v] = bend[v] = size[v] = zero;
     for (int64_t k = 0; k <= s->of->N; k++) {
+        const V *x = s->X + k * NX, *u = k < s->of->N ? s->U + k * NU : 0;
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-        cost_expand(s, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, g, H);
-        for (int i = 0; i < S; i++) largest = most(most(tgco_fabs(g[i]), tgco_fabs(H[i * S + i])), largest);
+        cost_expand(s, k, x, u, g, H);
+        for (int v = 0; v < (u ? S : NX); v++) {
+            V rises = tgco_fabs(g[v]), bends = tgco_fabs(H[v * S + v]);
+            slope[v] = most(rises, slope[v]); bend[v] = most(bends, bend[v]);
+            V far = most(tgco_fabs(v < NX ? x[v] : u[v - NX]), tgco_if(bends > zero, rises / bends));
+            size[v] = most(far, size[v]);
+        }
+    }
+    measure_bounds(t, size);
+    infer_sizes(t, size);
+    *plain = zero;
+    for (int v = 0; v < S; v++) {
+        V by = most(size[v], SET(LEAST_SIZE));
+        by = tgco_choose((size[v] > zero) & (by < SET(ORDINARY)), by, one);
+        largest = most(most(slope[v] * by, bend[v] * by * by), largest);
+        *plain = most(most(slope[v], bend[v]), *plain);
     }
     return largest;
 }
@@ -44,10 +97,10 @@ static double first_barrier(const Barrier *t, int l) {
 
 /* Lanes `of` have just been loaded: the scale of their cost, slacks and multipliers. */
 static void begin(Barrier *t, Track *k, I of) {
-    V one = SET(1.0), zero = SET(0.0), largest;
+    V one = SET(1.0), zero = SET(0.0), largest, plain;
     const Interior *how = t->how;
     const Problem *p = t->lanes.of;
-    t->scale = tgco_choose(of, one, t->scale);
+    t->scale = tgco_choose(of, one, t->scale); t->raised = tgco_choose(of, one, t->raised);
     t->objective = tgco_choose(of, one, t->objective);
     k->last = tgco_choose(of, zero, k->last); k->forced = tgco_choose(of, zero, k->forced);
     k->made = tgco_choose(of, zero, k->made);
@@ -65,9 +118,11 @@ static void begin(Barrier *t, Track *k, I of) {
             for (int l = 0; l < LANES; l++)
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
-    largest = steepest(t);
+    largest = steepest(t, &plain);
     V scale = SET(how->steepest) / largest;
-    t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
+    I scaled = of & finite(scale) & (largest > zero);
+    t->scale = tgco_choose(scaled, scale, t->scale);
+    t->raised = tgco_choose(scaled, plain / largest, t->raised);
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
     if (how->warm) {
@@ -135,7 +190,7 @@ static I soften(Barrier *t, const Track *k, I moving) {
         V largest = SET(0.0);
         ROWS(t, 1, largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest))
         if (t->some_out) ROWS(t, 0, largest = most(tgco_if(t->fixes[q], tgco_fabs(t->z[q] + t->dz[q])), largest))
-        I large = moving & (largest > SET(how->explodes)) & (t->soft < SET(how->softest));
+        I large = moving & (largest > SET(how->explodes) * t->raised) & (t->soft < SET(how->softest));
         if (!any(large)) return moving;
         t->soft = tgco_choose(large, SET(how->soft_growth) * t->soft, t->soft);
         expand(t);
@@ -174,14 +229,15 @@ static void resume(Barrier *t, Track *k) {
     settle(t, k, done, 0);
 }
 
-/* Lanes `of` whose barrier is a part of their cost that counts: where the units are small, so is the scaled cost, and a
-   complementarity within its tolerance, in all `left`, isn't small beside it. */
+/* Lanes `of` whose barrier, or what the rows' residuals are worth, is a part of their cost that counts: where the units
+   are small, a complementarity or a residual within its tolerance, in all `left`, isn't small beside it. */
 static I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
     if (t->how->smoothing > 0) return of & ~of; /* it is to stay */
     if (!any(of)) return of;
     V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
-    ROWS(t, 0, *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)))
+    ROWS(t, 0, *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]))
+    ROWS(t, 1, *left += tgco_fabs(t->z[q] * t->r[q]))
     for (int l = 0; l < LANES; l++) {
         int64_t e = t->lanes.element[l];
         size[l] = __builtin_fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
@@ -213,7 +269,7 @@ static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
 static void relax(Barrier *t, Track *k, I running) {
     V largest = SET(0.0);
     ROWS(t, 0, largest = most(t->z[q], largest))
-    I lacks = running & (largest > SET(t->how->explodes)) & ~k->relaxed & ~k->watching;
+    I lacks = running & (largest > SET(t->how->explodes) * t->raised) & ~k->relaxed & ~k->watching;
     if (!any(lacks)) return;
     k->relaxed |= lacks;
     visit_rows(t, lacks, 1, loosen);

@@ -18,6 +18,7 @@ typedef struct {
     double admitted; /* violation of rows outside, up to which they stay there */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
     V mu, shift, scale;
+    V raised;    /* how many times larger the scale is than it would be in the units of the problem */
     V objective; /* 0 where feasibility alone is sought */
     V *gives;    /* (rows): by how much more than `soft` says */
     V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */

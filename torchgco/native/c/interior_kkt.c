@@ -52,7 +52,7 @@ static I factor_kkt(Barrier *t, System *of, double stiff, double slight) {
     int64_t N = p->N;
     V largest = SET(0.0);
     I all = largest == largest;
-    t->scale = t->objective = SET(1.0); t->mu = t->shift = SET(0.0);
+    t->scale = t->objective = t->raised = SET(1.0); t->mu = t->shift = SET(0.0);
     memset(t->y, 0, (N + 1) * NX * sizeof(V));
     memset(t->r, 0, t->rows * sizeof(V));
     of->sigma = SET(0.0);

@@ -108,7 +108,7 @@ static void adjoin(Barrier *t, I of) {
             largest = most(tgco_fabs(y[i]), largest);
         }
     }
-    I sound = largest <= SET(t->how->largest_multiplier);
+    I sound = largest <= SET(t->how->largest_multiplier) * t->raised;
     for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->y[i] = tgco_choose(of, tgco_if(sound, t->yn[i]), t->y[i]);
 }
 
@@ -140,7 +140,7 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
     for (int64_t i = 0; i < p->N * NX; i++) gap = most(tgco_fabs(t->gap[i]), gap);
     for (int64_t q = 0; q < t->rows; q++) {
         gap = most(tgco_fabs(t->r[q]), gap);
-        sum_z += least(tgco_fabs(t->z[q]), SET(t->how->explodes)); /* one that explodes says nothing of the others */
+        sum_z += least(tgco_fabs(t->z[q]), SET(t->how->explodes) * t->raised); /* one that explodes says nothing of the others */
     }
     V usual = SET(t->how->usual_multiplier), count = SET((double)(p->N * NX + t->rows));
     V mean = (sum_y + sum_z) / count, mean_z = sum_z / SET((double)(t->rows ? t->rows : 1));
