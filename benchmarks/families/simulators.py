@@ -2,7 +2,8 @@
 
 Each simulator flies vehicles that it has itself. They are planned with an airframe that is near at hand, and with the
 one that `torchgco-identify` finds in twelve short flights. Cases are kept below outputs/simulators, so that a run that
-was stopped goes on where it was. Needs the extras mujoco and rotorpy; with --x2 FILE also flies menagerie's model.
+was stopped goes on where it was. Needs the extras mujoco and rotorpy; with --x2 FILE also flies menagerie's model, and
+--crazyflow flies that package's vehicles instead, which want SCIPY_ARRAY_API=1 in the environment.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ from torchgco import Airframe, compose, presets
 from torchgco.missions import Mission, Outcome, Planner, endings
 from torchgco.missions.identification import identify, record
 from torchgco.missions.plant import Plant
+from torchgco.missions.simulators.crazyflow import CrazyflowPlant
 from torchgco.missions.simulators.mujoco import MujocoPlant
 from torchgco.missions.simulators.rotorpy import RotorpyPlant
 from torchgco.scenarios import Forest, Vehicle
 
 HEAD = ("simulator", "its vehicle", "planned with", "reached", "collisions", "flight time", "least clearance", "CPU s")
 IDENTIFIED = "identified"
+CRAZYFLOW = ("cf2x_L250", "cf21B_500")
 SEED = 0  # of the forests and of the flights that identify
 AT_ONCE = 8  # missions that are flown together: what a stopped run loses at most
 
@@ -63,6 +66,10 @@ def cases(x2: str | None) -> list[Case]:
     ]
     given = [Case("MuJoCo", "Skydio X2 of menagerie", "paper", lambda frame: MujocoPlant(frame, model=x2))]
     return [*own[:1], *(given if x2 else []), *own[1:]]
+
+
+def crazyflow_case(name: str) -> Case:
+    return Case("crazyflow", f"its {name}", "crazyflie", lambda frame: CrazyflowPlant(frame, drone_model=name))
 
 
 def base_of(name: str) -> Airframe:
@@ -122,16 +129,18 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--x2", metavar="FILE", help="skydio_x2/x2.xml of mujoco_menagerie, with its yaw gears corrected"
     )
+    parser.add_argument("--crazyflow", action="store_true", help="that simulator alone, in a table of its own")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "simulators")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/simulators.md")
     asked = parser.parse_args(words)
     torch.set_num_threads(1)
-    rows = []
-    for case in cases(asked.x2):
+    rows, mark = [], "crazyflow" if asked.crazyflow else "simulators"
+    flying = [*map(crazyflow_case, CRAZYFLOW)] if asked.crazyflow else cases(asked.x2)
+    for case in flying:
         rows += (
             [row(case, IDENTIFIED, flown(case, True, min(asked.count, case.most), asked.outputs))] if case.both else []
         )
-    for case in cases(asked.x2):
+    for case in flying:
         count = min(asked.unidentified, case.blind) if case.both else asked.count
         if count > 0:
             missions = flown(case, False, count, asked.outputs)
@@ -139,7 +148,7 @@ def main(words: Sequence[str] | None = None) -> int:
     text = f"{origin('Flown')}, seed {SEED}, {INTERVALS}; one thread, {machine()}, shared.\n\n{markdown(HEAD, rows)}"
     print(text)
     if asked.write:
-        put(RESULTS / "simulators.md", "simulators", text)
+        put(RESULTS / "simulators.md", mark, text)
     return 0
 
 

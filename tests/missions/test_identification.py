@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from torchgco import Airframe, InputError
 from torchgco.missions import RotorPlant
 from torchgco.missions.identification import identify, record
 
-OTHER = Airframe(
+PLAIN = Airframe(
     mass=1.2, inertia=((0.02, 0.001, 0), (0.001, 0.018, 0), (0, 0, 0.03)), rotor_torque=0.02, rotational_drag=0.02,
     rotor_time_constant=0.05, thrust_min=0.2, thrust_max=8.0, hover_speed=4000.0, drag=0.3,
 )  # fmt: skip
@@ -36,14 +36,15 @@ class Late:
         return self.plant.advance(x, self.heard[max(0, len(self.heard) - 1 - self.steps)], force)
 
 
-@pytest.mark.parametrize("late", [0, 3])
-def test_another_airframe_comes_back(late: int) -> None:
-    """Measured 1e-4 of each; the search begins at the paper's."""
-    plant = Late(late, RotorPlant(OTHER))
+@pytest.mark.parametrize(("late", "rotor_inertia"), [(0, 0.0), (3, 0.0), (0, 2e-4)])
+def test_another_airframe_comes_back(late: int, rotor_inertia: float) -> None:
+    """Measured 1e-4 of each, 1e-2 of rotors that are heavy; the search begins at the paper's."""
+    other = replace(PLAIN, rotor_inertia=rotor_inertia)
+    plant = Late(late, RotorPlant(other))
     found = identify(*record(plant, Airframe(), seed=1), plant.dt, Airframe())
     assert found.delay == pytest.approx(0.01 * late) and found.limits_met == (True, True)
-    for one in fields(OTHER):
-        wanted = np.array(getattr(OTHER, one.name)) + (0.01 * late if one.name == "rotor_time_constant" else 0)
+    for one in fields(other):
+        wanted = np.array(getattr(other, one.name)) + (0.01 * late if one.name == "rotor_time_constant" else 0)
         np.testing.assert_allclose(getattr(found.airframe, one.name), wanted, rtol=2e-3, atol=1e-5, err_msg=one.name)
     assert max(found.thrust_error, found.force_error, found.torque_error) < 1e-3 and found.samples > 500
 

@@ -186,6 +186,19 @@ def test_a_force_accelerates_the_mass(make) -> None:
     assert not flown[:, 10:13].any()
 
 
+@each_plant
+def test_the_body_turns_against_rotors_that_speed_up(make) -> None:
+    """Their angular momentum about z and the body's stay 0 together, where air does nothing; measured 1e-6 of them."""
+    J, J_r = ((0.0366, 0.0, 0.0), (0.0, 0.0327, 0.0), (0.0, 0.0, 0.0187)), 1e-4
+    frame = replace(FRAME, inertia=J, rotor_torque=1e-12, rotational_drag=0.0, rotor_inertia=J_r)
+    commands = frame.hover_speed + torch.tensor([300.0, -300.0, 300.0, -300.0], dtype=DOUBLE).expand(30, 4)
+    x = fly(make(frame, 0.002), at_hover(), commands)[:, 0]
+    turning = (x[:, 13:] / frame.thrust_coefficient).sqrt() * 2 * math.pi / 60
+    own, rotors = 0.0187 * x[:, 12], J_r * (turning * torch.tensor([1.0, -1, 1, -1])).sum(-1)
+    assert own[-1] > 5e-3
+    torch.testing.assert_close(own, rotors, rtol=1e-4, atol=1e-8)
+
+
 @needs_drone_models
 def test_the_plants_agree_on_a_hover() -> None:
     """Measured 4e-16."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from tests.missions.missions import mission, varied
 from tests.missions.test_plants import random_states
 from torchgco import Airframe, InputError
 from torchgco.missions import RotorPlant
-from torchgco.missions.simulators import mujoco, rotorpy
+from torchgco.missions.simulators.crazyflow import CrazyflowPlant
 from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, mjcf
 from torchgco.missions.simulators.mujoco import MujocoPlant
 from torchgco.missions.simulators.rotorpy import RotorpyPlant, parameters_of
@@ -29,6 +30,20 @@ USERS = """<mujoco><compiler autolimits="true"/><option timestep="0.005" gravity
   <actuator><motor site="a" ctrlrange="0 9" gear="0 0 2 0 0 {0}"/><motor site="b" ctrlrange="0 9" gear="0 0 2 0 0 {1}"/>
     <motor site="c" ctrlrange="0 9" gear="0 0 2 0 0 {2}"/><motor site="d" ctrlrange="0 9" gear="0 0 2 0 0 {3}"/>
   </actuator></mujoco>"""
+
+MODULES = {
+    MujocoPlant: "mujoco",
+    RotorpyPlant: "rotorpy.vehicles.multirotor",
+    CrazyflowPlant: "crazyflow.sim.sim",
+}
+each_simulator = pytest.mark.parametrize("make", MODULES)
+
+
+def needs(make: type) -> None:
+    """Skip where the simulator can't be had."""
+    if make is CrazyflowPlant and os.environ.get("SCIPY_ARRAY_API") != "1":
+        pytest.skip("Python was started without SCIPY_ARRAY_API=1")
+    pytest.importorskip(MODULES[make])
 
 
 def numbers(element: ElementTree.Element, key: str) -> list[float]:
@@ -67,11 +82,15 @@ def test_parameters_of_rotorpy_are_the_airframes() -> None:
     assert given["k_eta"] * given["rotor_speed_max"] ** 2 == pytest.approx(OWN.thrust_max)
 
 
-@pytest.mark.parametrize("make", [MujocoPlant, RotorpyPlant])
+@each_simulator
 def test_it_moves_as_ours_does_while_thrusts_hold(make: type) -> None:
-    """A body with wind and errors; measured 1e-8. Rotors lag in their own ways; RotorPy has no drag on yaw rates."""
-    pytest.importorskip("mujoco" if make is MujocoPlant else "rotorpy.vehicles.multirotor")
-    frame = OWN if make is MujocoPlant else replace(OWN, drag=0.0, rotational_drag=0.0)
+    """A body with wind and errors; measured 1e-8, of crazyflow's float32 9e-7.
+
+    Rotors lag in their own ways. RotorPy and crazyflow have no drag on yaw rates, and RotorPy one at the rotors.
+    """
+    needs(make)
+    frame = replace(OWN, drag=0.0 if make is RotorpyPlant else OWN.drag, rotational_drag=0.0)
+    frame = OWN if make is MujocoPlant else frame
     x, _, force = random_states(5)
     errors = {"mass_error": torch.linspace(0, 0.2, 5).double(), "thrust_error": 0.1}
     x[:, 13:] *= 0.5
@@ -81,16 +100,16 @@ def test_it_moves_as_ours_does_while_thrusts_hold(make: type) -> None:
         ours = RotorPlant(frame, **errors).advance(ours, u, force)  # type: ignore[arg-type]
         theirs = make(frame, **errors).advance(theirs, u, force)
         one = make(frame, **errors).take(torch.tensor([3])).advance(one, u[3:4], force[3:4])
-    torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-6)
+    torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-5 if make is CrazyflowPlant else 1e-6)
     assert torch.equal(one, theirs[3:4])  # the batch contract
     x[1, 4], x[2, 0] = math.nan, 1e300
     lost = make(frame).advance(x, u, force).isnan().all(1)
     assert lost.tolist() == [False, True, True, False, False]
 
 
-@pytest.mark.parametrize("make", [MujocoPlant, RotorpyPlant])
+@each_simulator
 def test_a_mission_flies_there(make: type) -> None:
-    pytest.importorskip("mujoco" if make is MujocoPlant else "rotorpy.vehicles.multirotor")
+    needs(make)
     log, ours = (mission(plant=plant, duration=0.5).fly(varied(1)) for plant in (make(), RotorPlant()))
     assert (log.x[..., :3] - ours.x[..., :3]).abs().max() < 0.01 and not torch.equal(log.x, ours.x)
 
@@ -158,12 +177,42 @@ def test_vehicles_of_rotorpy_by_name() -> None:
         RotorpyPlant(parameters="none")
 
 
-@pytest.mark.parametrize(("make", "package", "found"), [
-    (MujocoPlant, "mujoco", mujoco._mujoco), (RotorpyPlant, "rotorpy.vehicles.multirotor", rotorpy._multirotor),
-])  # fmt: skip
-def test_a_simulator_that_is_not_installed(make: type, package: str, found, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, package, None)
-    found.cache_clear()
+@pytest.mark.parametrize("name", ["cf2x_L250", "cf21B_500"])
+def test_vehicles_of_crazyflow_by_name(name: str) -> None:
+    """Rotors front left, front right, rear right, rear left turn it as they do ours, at the package's numbers."""
+    needs(CrazyflowPlant)
+    plant = CrazyflowPlant(drone_model=name)
+    mass, c1, c2 = {
+        "cf2x_L250": (0.0319, -5.382196214637237e-7, 2.4582929831265485e-10),
+        "cf21B_500": (0.04338, -3.133427287299859e-7, 4.407354891648379e-10),
+    }[name]
+    x = torch.zeros(5, 17).double()
+    x[:, 6], hover = 1.0, mass * 9.81 / 4
+    F = torch.full((5, 4), hover).double()
+    F[0, [0, 3]], F[1, [2, 3]], F[2, [0, 2]] = 1.02 * hover, 1.02 * hover, 1.02 * hover
+    x[:, 13:] = F
+    u = ((c1**2 + 4 * c2 * F).sqrt() - c1) / (2 * c2)
+    u[4] = 1e6
+    end = plant.advance(x, u, torch.zeros(5, 3).double())
+    torch.testing.assert_close(end[:4, 13:], F[:4], rtol=1e-5, atol=0)
+    turning = end[:3, 10:13] / end[:3, 10:13].abs().amax(1, keepdim=True)
+    torch.testing.assert_close(turning, torch.eye(3).double(), rtol=0, atol=0.02)
+    assert end[3, 3:6].abs().max() < 1e-5 and end[4, 13:].max() < 0.2
+    with pytest.raises(InputError, match=r"plant.drone_model: expected one of cf2x_L250, .*, got none"):
+        CrazyflowPlant(drone_model="none")
+    with pytest.raises(InputError, match=r"plant.drag: expected 0 for a vehicle of plant.drone_model, got 0.1"):
+        CrazyflowPlant(drone_model=name, drag=0.1)
+
+
+@each_simulator
+def test_a_simulator_that_is_not_installed(make: type, monkeypatch) -> None:
+    monkeypatch.setenv("SCIPY_ARRAY_API", "1")
+    monkeypatch.setitem(sys.modules, MODULES[make], None)
     with pytest.raises(InputError, match=r"plant: expected .* \(`pip install torchgco\[.*\]`\)"):
         make()
-    found.cache_clear()
+
+
+def test_crazyflow_says_what_it_needs_of_the_environment(monkeypatch) -> None:
+    monkeypatch.delenv("SCIPY_ARRAY_API", raising=False)
+    with pytest.raises(InputError, match=r"plant: expected SCIPY_ARRAY_API=1 in the environment .*, got none"):
+        CrazyflowPlant()

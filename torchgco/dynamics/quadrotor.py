@@ -26,6 +26,8 @@ POSE: Texts = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "w
 POSE_UNITS: Texts = (*["m"] * 3, *["m/s"] * 3, *[""] * 4, *["rad/s"] * 3)
 THRUSTS: Texts = ("thrust 1", "thrust 2", "thrust 3", "thrust 4")
 ROTORS: Texts = ("rotor 1", "rotor 2", "rotor 3", "rotor 4")
+RADIANS = 2.0 * math.pi / 60.0  # per second, of one rpm
+ROTOR_SPINS = (1.0, -1.0, 1.0, -1.0)  # signs of the rotors' torques about z
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Airframe:
     arm: Meters = 0.216  # l
     rotor_torque: Positive = 1.6e-2  # k_r, m: yaw torque per newton of thrust
     rotational_drag: NonNegative = 1.0e-2  # k_a, N m s/rad, on the yaw rate
+    rotor_inertia: NonNegative = 0.0  # J_r, kg m^2, of one rotor with its motor, about its axis
     rotor_time_constant: Seconds = 0.10  # T_r
     thrust_min: NonNegative = 0.1046  # N per rotor
     thrust_max: Positive = 6.0  # N per rotor
@@ -104,12 +107,22 @@ class Airframe:
         h, k = self.arm / math.sqrt(2.0), self.rotor_torque
         return like.new_tensor([[h, -h, -h, h], [-h, -h, h, h], [k, -k, k, -k]])
 
-    def angular_acceleration(self, w: Tensor, F: Tensor) -> Tensor:
-        """w' = J^-1 (T F - w x (J w) - D w), (..., 3), with D = diag(0, 0, k_a)."""
+    def angular_acceleration(self, w: Tensor, F: Tensor, speed: Tensor | None = None) -> Tensor:
+        """w' = J^-1 (T F - w x (J w) - D w + r e3), (..., 3), with D = diag(0, 0, k_a).
+
+        r = J_r (Omega1' - Omega2' + Omega3' - Omega4') is what rotors that speed up react with, for commanded speeds in
+        rpm; 0 where none are given.
+        """
         J = w.new_tensor(self.inertia)
         torque = _apply(self.allocation(w), F) - torch.linalg.cross(w, _apply(J, w))
         drag = torch.stack((torch.zeros_like(w[..., 2]), torch.zeros_like(w[..., 2]), w[..., 2]), dim=-1)
-        return _apply(torch.linalg.inv(J), torque - self.rotational_drag * drag)
+        torque = torque - self.rotational_drag * drag
+        if speed is not None and self.rotor_inertia > 0:
+            turning = (F.clamp(min=torch.finfo(F.dtype).tiny) / self.thrust_coefficient).sqrt()
+            spins = self.rotor_inertia * RADIANS / self.rotor_time_constant * w.new_tensor(ROTOR_SPINS)
+            none = torch.zeros_like(spins)
+            torque = torque + _apply(torch.stack((none, none, spins)), speed - turning)
+        return _apply(torch.linalg.inv(J), torque)
 
     def thrust_rate(self, F: Tensor, speed: Tensor) -> Tensor:
         """F' = 2/T_r sqrt(F) (sqrt(b) u - sqrt(F)) for commanded rotor speeds u in rpm, (..., 4)."""
@@ -238,7 +251,7 @@ class QuadrotorPlant(Dynamics):
         lift = F.sum(-1) / self.airframe.mass
         pose = pose_rates(components(v), components(q), components(w), lift, self.airframe.gravity)
         pose = self.airframe.slowed(pose, components(v))
-        rates = self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)
+        rates = self.airframe.angular_acceleration(w, F, u), self.airframe.thrust_rate(F, u)
         return torch.cat((vectors(*pose), *rates), dim=-1)
 
     stretches: ClassVar[bool] = True  # type: ignore[misc]
@@ -288,4 +301,4 @@ class RotorTracking(Dynamics):
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         w, F = x[..., :3], x[..., 3:]
-        return torch.cat((self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)), dim=-1)
+        return torch.cat((self.airframe.angular_acceleration(w, F, u), self.airframe.thrust_rate(F, u)), dim=-1)

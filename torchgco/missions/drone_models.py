@@ -16,13 +16,15 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.dynamics.integrators import rk4
-from torchgco.dynamics.quadrotor import within_limits
+from torchgco.dynamics.quadrotor import Airframe, within_limits
 from torchgco.missions.plant import RotorPlant, column
 
 # Body torques of the four rotors about x, y and z, in units of arm / sqrt(2) and of the rotors' own torque.
 MIXING = np.array([[1.0, -1.0, -1.0, 1.0], [-1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0]])
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])  # xyzw
 XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]  # the package's order of a quaternion from ours, and ours from the package's
+
+Number = float | np.ndarray
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,9 @@ class DroneModelsPlant(RotorPlant):
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
         states, command, push = (part.detach().cpu().double() for part in (x, self.frame.reachable(u), force))
-        b = self.frame.thrust_coefficient * (1.0 + column(self.thrust_error, states))
-        parameters = self._parameters(b.numpy(), states)
+        errors = [column(part, states) for part in (self.mass_error, self.thrust_error, self.drag)]
+        b = self.frame.thrust_coefficient * (1.0 + errors[1])
+        parameters = parameters_of(self.frame, *(error.numpy() for error in errors))
 
         def rates(z: Tensor) -> Tensor:
             return torch.from_numpy(self._rates(z.numpy(), command.numpy(), push.numpy(), parameters))
@@ -75,24 +78,26 @@ class DroneModelsPlant(RotorPlant):
         turning = scalar * w + np.cross(vector, w), -(vector * w).sum(axis=-1, keepdims=True)
         return np.concatenate((p_dot, v_dot, 0.5 * turning[0], 0.5 * turning[1], w_dot, speed_dot), axis=-1)
 
-    def _parameters(self, b: np.ndarray, like: Tensor) -> dict[str, Any]:
-        """The package's parameters for thrust coefficients b (B or 1, 1), N/rpm^2."""
-        frame = self.frame
-        mass_error, drag = (column(part, like).numpy() for part in (self.mass_error, self.drag))
-        J, none = np.array(frame.inertia), np.zeros_like(b)
-        return {
-            "mass": frame.mass * (1.0 + mass_error),
-            "L": frame.arm / math.sqrt(2.0),
-            "prop_inertia": 0.0,
-            "gravity_vec": np.array([0.0, 0.0, -frame.gravity]),
-            "J": J,
-            "J_inv": np.linalg.inv(J),
-            "rpm2thrust": np.stack((none, none, b)),
-            "rpm2torque": np.stack((none, none, frame.rotor_torque * b)),
-            "mixing_matrix": MIXING,
-            "drag_matrix": -(drag + frame.drag)[..., None] * np.eye(3),
-            "rotor_dyn_coef": np.array([1.0, 0.0, 1.0, 0.0]) / frame.rotor_time_constant,
-        }
+
+def parameters_of(
+    frame: Airframe, mass_error: Number = 0.0, thrust_error: Number = 0.0, drag: Number = 0.0
+) -> dict[str, Any]:
+    """The package's parameters of a vehicle, rotors in our order; its errors and drag are numbers or columns (B, 1)."""
+    J, b = np.array(frame.inertia), np.asarray(frame.thrust_coefficient * (1.0 + thrust_error))
+    none = np.zeros_like(b)
+    return {
+        "mass": frame.mass * (1.0 + mass_error),
+        "L": frame.arm / math.sqrt(2.0),
+        "prop_inertia": frame.rotor_inertia,
+        "gravity_vec": np.array([0.0, 0.0, -frame.gravity]),
+        "J": J,
+        "J_inv": np.linalg.inv(J),
+        "rpm2thrust": np.stack((none, none, b)),
+        "rpm2torque": np.stack((none, none, frame.rotor_torque * b)),
+        "mixing_matrix": MIXING,
+        "drag_matrix": -np.asarray(drag + frame.drag)[..., None] * np.eye(3),
+        "rotor_dyn_coef": np.array([1.0, 0.0, 1.0, 0.0]) / frame.rotor_time_constant,
+    }
 
 
 def _unit(q: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ Three fits follow each other. Rotors: the root s of a thrust, which is proportio
 
 with u as it was some time steps before, where there is a delay. Mass and drag: m (v' + g e3) + d v = F R e3. Inertia
 and the torques about z: J w' + w x J w + k_a w_z e3 - k_r (F1 - F2 + F3 - F4) e3 is what thrusts do at the arm. That is
-given: rates and thrusts don't separate arm and inertia. Thrusts are means over a time step, of the first fit.
+given: rates and thrusts don't separate arm and inertia. Where it explains more, so do rotors of an inertia that speed
+up. Thrusts are means over a time step, of the first fit.
 """
 
 from __future__ import annotations
@@ -22,19 +23,18 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import check_tensor
-from torchgco.dynamics.quadrotor import Airframe
+from torchgco.dynamics.quadrotor import RADIANS, ROTOR_SPINS, Airframe
 from torchgco.missions.plant import Plant, flown, hovering
 
 SLOW_FLIGHT, CALM_FLIGHT = 8.0, 10.0  # m/s and rad/s: samples beyond don't count, as air and long steps tell there
 THRUST_RANGE = 3.4  # of the logarithm of the root of a thrust coefficient: thirty times more or less
 MOST_DELAY = 10  # time steps of a delay that are tried
-DELAY_GAIN = 0.9  # share of the error without a delay, below which a delay is believed
+DELAY_GAIN = 0.9  # share of the error without a delay, or an inertia of rotors, below which that is believed
 LEAST = 50  # samples of a fit
 RESOLVED = 1.0  # time steps: Euler's steps, as the tracker's are, go beyond the end of a faster lag
 ASKED_MORE = 0.01  # share of the root of a limit by which a command has to ask for more, to have met it
 LEAST_SPIN = 0.02  # of the thrust in hover: rotors that stand still take long to turn again
 INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of the inertia
-ROTOR_SPINS = np.array((1.0, -1.0, 1.0, -1.0))  # of the torques about z
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,8 @@ def identify(x: Tensor, u: Tensor, dt: float, airframe: Airframe) -> Identified:
         )
     first, second, F = first[use], second[use], F[use]
     mass, drag, force_error = _mass(first, second, F, dt, airframe)
-    inertia, turning, torque_error = _inertia(first, second, F, dt, airframe)
+    fits = [_inertia(first, second, F, dt, airframe, b) for b in (None, rotors.b)]
+    inertia, turning, torque_error = fits[fits[1][-1] < DELAY_GAIN * fits[0][-1]]
     found = {
         "mass": mass, "drag": drag, "inertia": inertia, **turning, **rotors.limits(mass, dt, airframe),
         "hover_speed": math.sqrt(mass * airframe.gravity / 4.0 / rotors.b),
@@ -228,9 +229,9 @@ def _mass(
 
 
 def _inertia(
-    first: np.ndarray, second: np.ndarray, F: np.ndarray, dt: float, given: Airframe
+    first: np.ndarray, second: np.ndarray, F: np.ndarray, dt: float, given: Airframe, b: float | None
 ) -> tuple[tuple[tuple[float, float, float], ...], dict[str, float], float]:
-    """Inertia, `rotor_torque` and `rotational_drag`, and the error; arguments as of `_mass`.
+    """Inertia, `rotor_torque`, `rotational_drag`, with a thrust coefficient b `rotor_inertia`, and the error.
 
     What is left is measured as angular accelerations, whose differences have the noise: in torques, where they are
     multiplied by the unknowns, noise would make the inertia small. The search begins at the torques' linear fit.
@@ -238,40 +239,43 @@ def _inertia(
     rate, w = (second[:, 10:13] - first[:, 10:13]) / dt, 0.5 * (first[:, 10:13] + second[:, 10:13])
     torque = F @ given.allocation(torch.zeros(1, dtype=torch.float64)).numpy().T
     torque[:, 2] = 0.0
-    about, columns = np.array((0.0, 0.0, 1.0)), list[np.ndarray]()
+    about, columns, spins = np.array((0.0, 0.0, 1.0)), list[np.ndarray](), np.array(ROTOR_SPINS)
+    speeds = np.sqrt(second[:, 13:].clip(min=0.0)) - np.sqrt(first[:, 13:].clip(min=0.0))
+    faster = np.zeros(len(w)) if b is None else RADIANS / math.sqrt(b) / dt * speeds @ spins
     for i, j in INERTIA_ENTRIES:
         J = np.zeros((3, 3))
         J[i, j] = J[j, i] = 1.0
         columns.append(rate @ J + np.cross(w, w @ J))
-    columns += [-(F @ ROTOR_SPINS)[:, None] * about, w[:, 2:] * about]
-    A, scale = np.stack([column.ravel() for column in columns], axis=1), _scale(given)
+    columns += [-(F @ spins)[:, None] * about, w[:, 2:] * about, *([] if b is None else [-faster[:, None] * about])]
+    A, scale = np.stack([column.ravel() for column in columns], axis=1), _scale(given)[: len(columns)]
     begin = np.linalg.lstsq(A * scale, torque.ravel(), rcond=None)[0]
 
     def left(z: np.ndarray) -> np.ndarray:
-        J, spin, loss = _unpacked(z * scale)
-        moment = torque - np.cross(w, w @ J) + (spin * (F @ ROTOR_SPINS) - loss * w[:, 2])[:, None] * about
+        J, spin, loss, rotor = _unpacked(z * scale)
+        yaw = spin * (F @ spins) - loss * w[:, 2] + rotor * faster
+        moment = torque - np.cross(w, w @ J) + yaw[:, None] * about
         return (np.linalg.lstsq(J, moment.T, rcond=None)[0].T - rate).ravel()
 
     z = least_squares(left, begin, x_scale=np.maximum(np.abs(begin), 1e-3)).x
-    J, spin, loss = _unpacked(z * scale)
+    J, spin, loss, rotor = _unpacked(z * scale)
     xx, xy, xz, yy, yz, zz = J[np.triu_indices(3)].tolist()
-    turning = {"rotor_torque": spin, "rotational_drag": max(loss, 0.0)}
+    turning = {"rotor_torque": spin, "rotational_drag": max(loss, 0.0), "rotor_inertia": max(rotor, 0.0)}
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)), turning, _share(left(z), rate.ravel())
 
 
-def _unpacked(theta: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """The inertia (3, 3), the yaw torque and its drag, from the unknowns of `_inertia`."""
+def _unpacked(theta: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+    """The inertia (3, 3), the yaw torque, its drag and the rotors' inertia, from the unknowns of `_inertia`."""
     J = np.zeros((3, 3))
     for value, (i, j) in zip(theta, INERTIA_ENTRIES, strict=False):
         J[i, j] = J[j, i] = value
-    return J, float(theta[6]), float(theta[7])
+    return J, float(theta[6]), float(theta[7]), float(theta[8]) if len(theta) > 8 else 0.0
 
 
 def _scale(given: Airframe) -> np.ndarray:
     """Sizes of the unknowns of `_inertia`."""
     J = np.array(given.inertia)
     size = float(np.diag(J).mean())
-    return np.array([size] * 6 + [given.rotor_torque, size])
+    return np.array([size] * 6 + [given.rotor_torque, size, 1e-3 * size])
 
 
 def _axis(q: np.ndarray) -> np.ndarray:

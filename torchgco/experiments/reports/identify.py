@@ -28,8 +28,9 @@ from torchgco.missions.planning_problem import airframe_of
 VEHICLE_FILE = Path("mine") / "vehicle" / "identified.yaml"
 AIRFRAME_UNITS = {
     "mass": "kg", "inertia": "kg m^2", "arm": "m; given", "rotor_torque": "m", "rotational_drag": "N m s/rad",
-    "rotor_time_constant": "s, the delay in it", "thrust_min": "N per rotor", "thrust_max": "N per rotor",
-    "hover_speed": "rpm", "gravity": "m/s^2; given", "drag": "N s/m", "radius": "m; given",
+    "rotor_inertia": "kg m^2", "rotor_time_constant": "s, the delay in it", "thrust_min": "N per rotor",
+    "thrust_max": "N per rotor", "hover_speed": "rpm", "gravity": "m/s^2; given", "drag": "N s/m",
+    "radius": "m; given",
 }  # fmt: skip
 Recorded = tuple[Tensor, Tensor, float, Airframe]  # states, commands, time step, the airframe that was planned with
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.missions.plant import RotorPlant, column
 
 FARTHEST_STATE = 1e6  # of any number of a state, in its unit: simulators stop the process, or begin anew, far beyond
@@ -35,3 +38,28 @@ class EachPlant(RotorPlant):
     @abstractmethod
     def one(self, x: np.ndarray, u: np.ndarray, force: np.ndarray, deviation: tuple[float, float, float]) -> np.ndarray:
         """A state (17,) one step later; deviation is (mass_error, thrust_error, drag) of this vehicle."""
+
+    def names_own(self, field: str) -> bool:
+        """Whether this field names a vehicle that the simulator has itself.
+
+        Raises:
+            InputError: errors of such a vehicle, which has its own.
+        """
+        if getattr(self, field) is None:
+            return False
+        for name in ("mass_error", "thrust_error", "drag"):
+            if np.any(np.asarray(getattr(self, name)) != 0):
+                raise InputError(f"plant.{name}", f"0 for a vehicle of plant.{field}", getattr(self, name))
+        return True
+
+
+def imported(module: str, title: str, extra: str) -> Any:
+    """A simulator's module.
+
+    Raises:
+        InputError: it isn't installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise InputError("plant", f"{title} (`pip install torchgco[{extra}]`)", error) from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.missions.simulators.each import EachPlant
+from torchgco.missions.simulators.each import EachPlant, imported
 from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, mjcf
 
 LONGEST_STEP = 0.005  # s, of a time step of MuJoCo in a model that we write
@@ -46,10 +46,7 @@ class MujocoPlant(EachPlant):
     def __post_init__(self) -> None:
         super().__post_init__()
         _mujoco()
-        if self.model is not None:
-            for name in ("mass_error", "thrust_error", "drag"):
-                if np.any(np.asarray(getattr(self, name)) != 0):
-                    raise InputError(f"plant.{name}", "0 for a vehicle of plant.model", getattr(self, name))
+        if self.names_own("model"):
             self._quadrotor((0.0, 0.0, 0.0))
 
     def _quadrotor(self, deviation: tuple[float, float, float]) -> _Quadrotor:
@@ -210,11 +207,6 @@ def _rotation(q: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
-@cache
 def _mujoco() -> Any:
     """The package."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise InputError("plant", "MuJoCo (`pip install torchgco[mujoco]`)", error) from None
-    return mujoco
+    return imported("mujoco", "MuJoCo", "mujoco")

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError
-from torchgco.dynamics.quadrotor import Airframe
-from torchgco.missions.simulators.each import EachPlant
+from torchgco.dynamics.quadrotor import RADIANS, Airframe
+from torchgco.missions.drone_models import WXYZ, XYZW
+from torchgco.missions.simulators.each import EachPlant, imported
 from torchgco.missions.simulators.mjcf import ROTOR_CORNERS
 
-RADIANS = 2.0 * math.pi / 60.0  # per second, of one rpm
-XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]  # the package's order of a quaternion from ours, and ours from the package's
 ODE_SOLVER = {"method": "RK45", "rtol": 1e-6, "atol": 1e-9}  # the package's own tolerance is 1e-3 of a step
 
 
@@ -42,11 +41,8 @@ class RotorpyPlant(EachPlant):
     def __post_init__(self) -> None:
         super().__post_init__()
         _multirotor()
-        if self.parameters is not None:
-            for name in ("mass_error", "thrust_error", "drag"):
-                if np.any(np.asarray(getattr(self, name)) != 0):
-                    raise InputError(f"plant.{name}", "0 for a vehicle of plant.parameters", getattr(self, name))
-            _named(self.parameters)
+        if self.names_own("parameters"):
+            _named(str(self.parameters))
 
     def one(self, x: np.ndarray, u: np.ndarray, force: np.ndarray, deviation: tuple[float, float, float]) -> np.ndarray:
         """See `EachPlant`."""
@@ -108,11 +104,6 @@ def _named(name: str) -> tuple[Any, np.ndarray]:
     raise InputError("plant.parameters", "crazyflie, hummingbird, or a module with quad_params", f"{name} ({last})")
 
 
-@cache
 def _multirotor() -> Any:
     """The package's class."""
-    try:
-        from rotorpy.vehicles.multirotor import Multirotor  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise InputError("plant", "RotorPy (`pip install torchgco[rotorpy]`)", error) from None
-    return Multirotor
+    return imported("rotorpy.vehicles.multirotor", "RotorPy", "rotorpy").Multirotor
