@@ -269,12 +269,13 @@ class Solution:
                 straight lines between the knots.
 
         Raises:
-            InputError: a rate that isn't above 0, a problem of another form, or dynamics without a time step.
+            InputError: a rate that isn't above 0, a problem of another form, one that was changed in place since, or
+                dynamics without a time step.
         """
         import pandas as pd
 
         check_value(rate, Positive | None, "rate")
-        own = problem if problem is not None else None if self.account is None else self.account.problem
+        own = problem if problem is not None else None if self.account is None else self.account.as_solved()
         if own is not None:
             check_shape(self.X, (own.B, own.N + 1, own.n), "problem: solution.X")
         t, frames = self.detach().t if problem is None or self.times is not None else times(problem), []

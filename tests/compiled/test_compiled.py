@@ -420,3 +420,19 @@ def test_numbers_are_listed_and_only_the_chosen_ones_change() -> None:
         mpc(radii=[1.0, 1.0])
     with pytest.raises(InputError, match="solver: expected"):
         torchgco.compile(problem, "al_ilqr")
+
+
+def test_numbers_of_the_given_problem_that_change_in_place_are_named() -> None:
+    centers = torch.tensor([[1.5, 0.1]], dtype=D)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.15, "rk4", position=slice(0, 2))
+    cost = QuadraticCost([1, 1, 0.1, 0.1], [0.1, 0.1], [50, 50, 5, 5], x_ref=[3.0, 0, 0, 0])
+    problem = Problem(model, cost, [Spheres(centers, [0.4], 0.1), ControlBounds(-4, 4)], torch.zeros(1, 4, dtype=D), 20)
+    mpc, found = torchgco.compile(problem, "interior_point"), torchgco.solve(problem, solver="interior_point")
+    before = mpc()
+    assert mpc.stale() is None and len(found.trajectories(100.0)) > 20
+    centers += torch.tensor([0.0, -0.3], dtype=D)
+    assert "in place" in str(mpc.stale()) and torch.equal(mpc(warm=False).X, before.X), "it has numbers of its own"
+    for figure in (lambda: found.trajectories(100.0), lambda: found.t, lambda: found.duration):
+        with pytest.raises(InputError, match="changed in place since"):
+            figure()
+    assert len(found.trajectories(100.0, problem=problem)) > 20

@@ -133,6 +133,7 @@ class Compiled:
         if problem.x0.device.type != "cpu":
             raise InputError("problem", "one on the CPU", str(problem.x0.device))
         self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
+        self._given: Problem | None = problem
         with _plainly():
             self._begin(with_own_numbers(problem))
 
@@ -242,9 +243,11 @@ class Compiled:
     def stale(self) -> str | None:
         """What the compiled code would compute otherwise if it were compiled now, in a line; None: nothing.
 
-        It sees functions that do something else, other numbers in them, and other tensors in the place of those that
-        they captured.
+        It sees functions that do something else, other numbers in them, other tensors in the place of those that they
+        captured, and numbers of the given problem that were changed in place: a compiled problem has its own.
         """
+        if self._given is not None and self._given.current() is not self._given:
+            return "numbers of the problem were changed in place since it was compiled: pass them to the call by name"
         if self._kept is None:
             return None  # PyTorch's kernels call the functions themselves
         problem, then = self._now().renewed(), self._kept.engine
@@ -262,6 +265,7 @@ class Compiled:
     def __setstate__(self, state: dict[str, Any]) -> None:
         problem = state.pop("problem")
         vars(self).update(state)
+        self._given = None
         with _plainly():
             self._begin(with_own_numbers(problem))
 

@@ -59,13 +59,26 @@ class Account(PerElement):
         """The same of the solution with a smoothing."""
         return Account(self._whole, self.solver, self._name, self._rows, self._t, self.kernels, by)
 
+    def as_solved(self) -> Problem | None:
+        """`problem`, where its numbers are still those that were solved for.
+
+        Raises:
+            InputError: they were changed in place since.
+        """
+        if self._whole is not None and self._whole.current() is not self._whole:
+            expected = "a problem whose numbers are as they were solved: pass a copy of it as problem="
+            raise InputError("solution", expected, "one whose numbers were changed in place since")
+        return self.problem
+
     def times(self) -> Tensor:
         """The times of the knots, (N+1,) or (b, N+1), s.
 
         Raises:
-            InputError: dynamics without a time step, or no times in the file that was loaded.
+            InputError: dynamics without a time step, no times in the file that was loaded, or a problem that was changed
+                in place since.
         """
         if self._whole is not None:
+            self.as_solved()
             t = times(self._whole)
         elif self._t is not None:
             t = self._t

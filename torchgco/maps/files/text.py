@@ -28,9 +28,11 @@ def read_xyz(source: Source) -> np.ndarray:
     first = next((line for line in map(_bare, BytesIO(text)) if line), None)
     if first is None:
         source.refuse(XYZ, "no line of numbers")
-    columns = len(SEPARATORS.split(first))
+    columns, more = len(SEPARATORS.split(first)), len(SEPARATORS.split(_bare(text.rstrip().rpartition(b"\n")[2])))
     if columns < 2:
         source.refuse(XYZ, f"{columns} in the first line")
+    if columns == 2 < more:
+        source.refuse(XYZ, f"2 in the first line, which may be a heading, and {more} in the last")
     return finite_points(source, columns_of(source, text, range(min(columns, 3)), XYZ))
 
 
