@@ -58,7 +58,7 @@ def solve(
         "status": torch.zeros(B, dtype=torch.int32, device=X.device),
         "iterations": torch.zeros(B, dtype=torch.int64, device=X.device),
         "gains": X.new_zeros(B, problem.N, problem.m, problem.n + 1),
-        "error": X.new_zeros(B), "theta": X.new_zeros(B),
+        "error": X.new_zeros(B), "theta": X.new_zeros(B), "falls": X.new_zeros(B),
     }  # fmt: skip
     loop = _Loop(kinds, model, blank(problem, X, U, flat))
     if B > 0:
@@ -77,6 +77,8 @@ def solve(
         out["status"][rows], out["iterations"][rows] = end.to(torch.int32), t.made
         out["error"][rows], out["theta"][rows] = error[ended], t.theta
         out["gains"][rows, ..., : problem.n] = gains(kinds, part, t)
+        if how.minimum:
+            out["falls"][rows] = (~_factors(kinds, part, t, torch.zeros_like(t.shift)).good).to(X.dtype)
         X[rows], U[rows], barrier[rows] = t.X, t.U, t.mu
         lam = t.z / column(t.scale)
         split_multipliers(part, t, lam)
@@ -131,10 +133,15 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
 
 def gains(kinds: Kinds, model: Model, t: State) -> Tensor:
     """The gains K (b, N, m, n) along the trajectories."""
+    return _factors(kinds, model, t, t.shift).K.transpose(0, 1)
+
+
+def _factors(kinds: Kinds, model: Model, t: State, shift: Tensor) -> riccati.Factors:
+    """The factors at the iterate with shifts (b,)."""
     at = model.expand(t.X, t.U, t.scale * t.objective, column(t.objective).unsqueeze(-1) * t.y,
                       column(t.objective) * t.z)  # fmt: skip
     H = curvature(kinds, at, t)
-    return riccati.factor(at.F, H, t.shift, kinds.how.pivot, model.problem.free_start).K.transpose(0, 1)
+    return riccati.factor(at.F, H, shift, kinds.how.pivot, model.problem.free_start)
 
 
 class _Loop:

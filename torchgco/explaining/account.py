@@ -74,8 +74,7 @@ class Account(PerElement):
         """The times of the knots, (N+1,) or (b, N+1), s.
 
         Raises:
-            InputError: dynamics without a time step, no times in the file that was loaded, or a problem that was changed
-                in place since.
+            InputError: dynamics without a time step, no times in the file that was loaded, or changes in place since.
         """
         if self._whole is not None:
             self.as_solved()

@@ -52,13 +52,14 @@ class InteriorEngine:
             options: the fields of `structures.Interior`.
 
         Returns:
-            status, iterations (B,); error of the end test and theta, the sum of residuals (B,); gains (B, N, m, n+1).
+            status, iterations (B,); error of the end test, theta, the sum of residuals, and whether the cost falls to
+            second order, 0 or 1, (B,); gains (B, N, m, n+1).
         """
         B, N = problem.B, problem.N
         out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
         out["gains"] = X.new_zeros(B, N, problem.m, problem.n + 1)
         free = problem.free_start
-        ends = {name: X.new_zeros(B) for name in ("error", "theta")}
+        ends = {name: X.new_zeros(B) for name in ("error", "theta", "falls")}
         rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
         for row, lam in zip(rows, multipliers, strict=True):
             row.lam = lam

@@ -65,7 +65,7 @@ class Kept:
         self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
         self._follow = self.packed.copy()
         self._follow.fill({"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst})
-        ends = {name: like.new_zeros(B) for name in ("error", "theta")}
+        ends = {name: like.new_zeros(B) for name in ("error", "theta", "falls")}
         self.how = c.Interior.complete(of=self.packed, barrier=self.barrier, free_start=None, **ends, **options)
 
     def solve(self, rows: np.ndarray, mu: float, **options: float) -> None:

@@ -160,11 +160,13 @@ class Interior(Structure):
 
     declared = (
         ("const Problem *", "of"),
-        ("double *", "barrier error theta"),  # (E): mu, in and out; error of the end test and sum of residuals, out
+        # (E): mu, in and out; out: error of the end test, sum of residuals, and 1 where the cost falls to second order
+        # from where the conditions hold, which is looked for where `minimum` is
+        ("double *", "barrier error theta falls"),
         ("const double *", "constant least_cost"),  # (E): what of the cost does not count, and its least size
         ("const double *", "free_start"),  # (E, NX): 1 where a component of the start is a variable; NULL: nowhere
         ("int64_t", "max_iterations failures patience trials idle"),
-        ("int32_t", "corrects warm"),
+        ("int32_t", "corrects warm minimum"),
         ("double", "tolerance violation push steepest boundary closest central smallest restored"),
         ("double", "barrier_error barrier_share barrier_floor barrier_least counts usual_multiplier"),
         ("double", "largest_multiplier"),

@@ -54,7 +54,7 @@ class Converge(Row):
         if self.among == "all":
             self._tighten(search)
         elif self.begins(problem) and not search.begun:
-            search.begin(search.interior.solved(search.call))
+            search.begin(search.interior.solved(search.call, escapes=True))
             if search.record is not None:
                 search.record.passes[-1][2].extend(search.call.rows.tolist())
             self._from_rest(search)

@@ -13,6 +13,7 @@ from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.eager.fixed import GOLDEN
 from torchgco.eager.kernels import least_violation
 from torchgco.kernels import (
     cost_unit,
@@ -37,6 +38,7 @@ from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
 
 REPORTED_AT_ONCE = 256  # problems between two reports of progress
+SADDLE_STEPS = 1e-3, 1e-1  # sizes of the controls, by which a solve goes on beside a saddle point or a maximum
 ROUGH, FEW = 1e-2, 60  # tolerance, and iterations, of a trajectory whose time is to be freed next
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 # In brackets: the names of Waechter and Biegler (2006). Constants without such a name are not in the paper.
@@ -63,6 +65,7 @@ FILTER: dict[str, Any] = {
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,
     "smoothing": 0.0,  # mu, in units of the cost, at which the barrier stays
+    "minimum": 0,  # 1: says where the cost falls to second order from a point that meets the conditions of first order
     "rounding": 1e-10, "idle": 3,  # an error below this that doesn't fall by half for so long is due to rounding
 }  # fmt: skip
 
@@ -101,7 +104,7 @@ class InteriorPoint(Solver):
         """Solve a checked call."""
         session, admitted = Session(call, RAW), self.admitted(call.problem)
         guess = guessed(session.call)
-        end = self.no_worse(session.call, guess, self.solved(session.call, guess=guess))
+        end = self.no_worse(session.call, guess, self.solved(session.call, guess=guess, escapes=True))
         return session.finished(least_violated(session.call, end, admitted), admitted)
 
     def admitted(self, problem: Problem) -> float:
@@ -143,7 +146,12 @@ class InteriorPoint(Solver):
         return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
 
     def solved(
-        self, call: Call, X0: Tensor | None = None, guess: Iterate | None = None, smoothing: float = 0.0
+        self,
+        call: Call,
+        X0: Tensor | None = None,
+        guess: Iterate | None = None,
+        smoothing: float = 0.0,
+        escapes: bool = False,
     ) -> SolveEnd:
         """The solve without its verdict, in the units of the call.
 
@@ -152,6 +160,8 @@ class InteriorPoint(Solver):
                 the rollout of its controls; the start held where these are not finite.
             guess: `guessed` of the call, where it is known.
             smoothing: mu in units of the cost: J_var - mu times the logarithms of all slacks is minimised; 0: J_var.
+            escapes: where the conditions of first order hold but the cost falls to second order, as at an equilibrium
+                that a guess at rest never leaves, solve again from beside, and keep what costs less.
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         kernels = interior_of(problem)
@@ -166,12 +176,12 @@ class InteriorPoint(Solver):
         end = SolveEnd.blank(problem, call.U0)
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
-        begun = torch.zeros_like(status, dtype=torch.bool)
+        begun, falls = torch.zeros_like(status, dtype=torch.bool), torch.zeros_like(status, dtype=torch.bool)
         for part in rows.split(REPORTED_AT_ONCE):
             if call.late:
                 end.status[part] = Status.TIME_LIMIT
                 continue
-            self._some(kernels, call.take(part), X[part], part, end, smoothing)
+            falls[part] = self._some(kernels, call.take(part), X[part], part, end, smoothing, escapes)
             begun[part] = True
             if call.callback is not None:
                 done = int((end.status != Status.RUNNING).sum())
@@ -179,7 +189,26 @@ class InteriorPoint(Solver):
         if not bool(begun.all()):
             others = (~begun).nonzero().flatten()
             put(end.best, others, take(guess or guessed(call), others))
+        self._escape(kernels, call, end, falls)
         return end
+
+    def _escape(self, kernels: InteriorKernels, call: Call, end: SolveEnd, falls: Tensor) -> None:
+        """Solve again beside the results that `falls` (B,) marks; what costs less takes their place in `end`."""
+        for share in SADDLE_STEPS:
+            rows = falls.nonzero().flatten()
+            if rows.numel() == 0 or call.late:
+                return
+            old, part = take(end.best, rows), call.take(rows)
+            part = replace(part, U0=_beside(part.problem, old.U, share), warm=None, X0=None, callback=None)
+            new = SolveEnd.blank(part.problem, part.U0)
+            fell = self._some(kernels, part, open_loop(part.problem, part.U0), torch.arange(len(rows)), new, 0.0, True)
+            cheaper = new.best.cost < old.cost - STATIONARY * old.cost.abs()
+            better = (new.status == SOLVED) & cheaper & (new.best.violation <= self.admitted(part.problem))
+            end.iterations[rows] += new.iterations
+            kept = better.nonzero().flatten()
+            put(end.best, rows[kept], take(new.best, kept))
+            put(end.last, rows[kept], take(new.best, kept))
+            falls[rows[kept]] = fell[kept]
 
     def no_worse(self, call: Call, guess: Iterate, end: SolveEnd) -> SolveEnd:
         """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
@@ -195,16 +224,23 @@ class InteriorPoint(Solver):
         return end
 
     def _some(
-        self, kernels: InteriorKernels, call: Call, X: Tensor, rows: Tensor, end: SolveEnd, smoothing: float
-    ) -> None:
-        """Solves problems, and puts how they ended into `end` at `rows`."""
+        self,
+        kernels: InteriorKernels,
+        call: Call,
+        X: Tensor,
+        rows: Tensor,
+        end: SolveEnd,
+        smoothing: float,
+        escapes: bool,
+    ) -> Tensor:
+        """Solves problems, and puts how they ended into `end` at `rows`; whether their costs fall to second order."""
         problem, warm = call.problem, call.warm
         if warm is None:
             multipliers, mu, how = Multipliers.zero(problem, 1.0).lam, self.initial_barrier, FILTER
         else:
             mu, how = self.warm_barrier, FILTER | {"push": self.warm_barrier}
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
-        how = how | {"smoothing": smoothing}
+        how = how | {"smoothing": smoothing, "minimum": int(escapes)}
         X, U = inside(problem, X, call.U0, how["push"])
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
         fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
@@ -226,6 +262,17 @@ class InteriorPoint(Solver):
         sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
         end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]
+        return (out["falls"] > 0.0) & (end.status[rows] == SOLVED)
+
+
+def _beside(problem: Problem, U: Tensor, share: float) -> Tensor:
+    """Controls (B, N, m) beside U, by an uneven share of their size or range, the same whatever the batch."""
+    size = U.abs().amax(1, keepdim=True).clamp(min=1.0)
+    if problem.control_bounds is not None:
+        half = 0.5 * problem.control_bounds.range.unsqueeze(1)
+        size = torch.where(torch.isfinite(half), half, size)
+    count = torch.arange(1, U[0].numel() + 1, dtype=U.dtype, device=U.device).view(U.shape[1:])
+    return U + share * size * (2.0 * torch.frac(GOLDEN * count) - 1.0)
 
 
 def guessed(call: Call) -> Iterate:

@@ -361,6 +361,16 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     return ended;
 }
 
+/* Lanes of `ended` from whose iterate the cost falls to second order: the reduced Hessian isn't positive definite. */
+static I find_falls(Barrier *t, I ended) {
+    V shift = t->shift;
+    expand(t);
+    t->shift = tgco_choose(ended, SET(0.0), shift);
+    I sound = factor(t, ended);
+    t->shift = shift;
+    return ended & ~sound;
+}
+
 static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, double error) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N, e = t->lanes.element[lane];
@@ -416,6 +426,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         int late = seconds_now() > until;
         if (late) for (int l = 0; l < LANES; l++) if (running[l] && !ended[l]) { status[l] = TIME_LIMIT; ended[l] = -1; }
         fresh &= ~fresh;
+        I falls = how->minimum && any(ended) ? find_falls(t, ended) : fresh & ~fresh;
         if (any(ended)) { /* gains along the trajectories that leave, whatever the other lanes do */
             expand(t);
             factor(t, fresh);
@@ -423,6 +434,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         for (int l = 0; l < LANES; l++) {
             if (!ended[l]) continue;
             if (l < own) leave_barrier(t, k, l, status[l], error[l]);
+            if (l < own) how->falls[t->lanes.element[l]] = falls[l] ? 1.0 : 0.0;
             if (next < last && !late) { enter_barrier(t, l, next++); fresh[l] = -1; }
             else running[l] = 0;
         }
