@@ -78,7 +78,11 @@ def solve(
         out["error"][rows], out["theta"][rows] = error[ended], t.theta
         out["gains"][rows, ..., : problem.n] = gains(kinds, part, t)
         if how.minimum:
-            out["falls"][rows] = (~_factors(kinds, part, t, torch.zeros_like(t.shift)).good).to(X.dtype)
+            stiffest = torch.nn.functional.pad(torch.where(kinds.inside(t), t.z / t.s, 0.0), (0, 1)).amax(
+                -1
+            )  # rounding decides where it is too large
+            falls = ~_factors(kinds, part, t, torch.zeros_like(t.shift)).good & (stiffest < 1.0 / how.rounding)
+            out["falls"][rows] = falls.to(X.dtype)
         X[rows], U[rows], barrier[rows] = t.X, t.U, t.mu
         lam = t.z / column(t.scale)
         split_multipliers(part, t, lam)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -48,7 +49,6 @@ class DistanceField:
     spacing: float
     source: OccupancyGrid | PointCloud
     unknown: Unknown = "occupied"
-    _nodes: dict[torch.device, Tensor] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -142,9 +142,10 @@ class DistanceField:
 
     def nodes(self, device: torch.device) -> Tensor:
         """`values` as a tensor; on a CPU it shares their memory."""
-        if device not in self._nodes:
-            self._nodes[device] = torch.from_numpy(self.values).to(device)
-        return self._nodes[device]
+        kept = _nodes.setdefault(self, {})
+        if device not in kept:
+            kept[device] = torch.from_numpy(self.values).to(device)
+        return kept[device]
 
     def distance(self, points: Any, smooth: bool = True) -> Tensor:
         """Distances (...) at points (..., d), m: lower bounds of the true ones; see `Field`.
@@ -256,3 +257,7 @@ def _check_count(counts: list[float], most: int = FIELD_NODES, way: str = "cells
     if np.prod(np.asarray(counts, float)) > most:
         wanted = f"at most {most:,} nodes: {way}"
         raise InputError("field", wanted, " x ".join(f"{count:.0f}" for count in counts))
+
+
+# No fields: what a problem holds is compared before each solve, and this comes with the first one.
+_nodes: WeakKeyDictionary[DistanceField, dict[torch.device, Tensor]] = WeakKeyDictionary()

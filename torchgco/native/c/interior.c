@@ -361,9 +361,13 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     return ended;
 }
 
-/* Lanes of `ended` from whose iterate the cost falls to second order: the reduced Hessian isn't positive definite. */
+/* Lanes of `ended` from whose iterate the cost falls to second order: the reduced Hessian isn't positive definite. Where
+   rows have become so stiff that rounding decides, none. */
 static I find_falls(Barrier *t, I ended) {
-    V shift = t->shift;
+    V shift = t->shift, stiffest = SET(0.0);
+    ROWS(t, 0, stiffest = most(by_role(t, q, t->z[q] / t->s[q], SET(0.0)), stiffest))
+    ended &= stiffest < SET(1.0 / t->how->rounding);
+    if (!any(ended)) return ended;
     expand(t);
     t->shift = tgco_choose(ended, SET(0.0), shift);
     I sound = factor(t, ended);
