@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -53,10 +54,19 @@ class Cost(PerElement):
         """The same cost times `factor` (B,), one positive number per problem."""
         return ScaledCost(self, factor)
 
+    @property
+    def reads_knots(self) -> bool:
+        """Whether the cost of a stage may depend on its number."""
+        return True
+
+    def precision(self, dtype: torch.dtype) -> AbstractContextManager[None]:
+        """In which the cost is evaluated: PyTorch's default one is changed for whole numbers, such as k."""
+        return whole_numbers_become(dtype) if self.reads_knots else nullcontext()
+
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         """J_var (B,) of trajectories X (B, N+1, n), U (B, N, m)."""
         k = torch.arange(U.shape[1], device=U.device)
-        with whole_numbers_become(X.dtype):
+        with self.precision(X.dtype):
             return self.stage(X[:, :-1], U, k).sum(-1) + self.terminal(X[:, -1])
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
@@ -64,7 +74,7 @@ class Cost(PerElement):
         n, N = X.shape[-1], U.shape[1]
         H.zero_()
         k, z = torch.arange(N, device=U.device), torch.cat((X[:, :-1], U), dim=-1)
-        with whole_numbers_become(X.dtype):
+        with self.precision(X.dtype):
             g, h = gradient_and_hessian(lambda z: self.stage(z[..., :n], z[..., n:], k), z)
             last = gradient_and_hessian(self.terminal, X[:, -1])
         add_blocks(H[:, :-1], n, g[..., :n], g[..., n:], h[..., :n, :n], h[..., n:, n:], h[..., n:, :n])
@@ -79,6 +89,7 @@ class WrappedCost(Cost):
     cost: Cost
 
     calls_function = property(lambda self: is_users(self.cost))
+    reads_knots = property(lambda self: self.cost.reads_knots)
 
     def rest_controls(self, like: Tensor) -> Tensor:
         return self.cost.rest_controls(like)

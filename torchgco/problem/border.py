@@ -22,7 +22,6 @@ from torchgco.base.shapes import MISTAKES, Dimensions, describe
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint, innermost
 from torchgco.costs.base import Cost
-from torchgco.costs.function import FunctionCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import check_names
 from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
@@ -158,7 +157,7 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
-    reads = not isinstance(cost, FunctionCost) or cost.reads_knots
+    reads = cost.reads_knots
     _check_axes("cost.stage", lambda i, k, x, u: stage(i, x, u, k), reads, rows, k, X[:, :-1], U)
     _check_axes("cost.terminal", lambda i, _, x: cost.take(i).terminal(x), False, rows, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)

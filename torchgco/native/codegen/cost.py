@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.tree import apart
-from torchgco.base.values import whole_numbers_become
 from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
 from torchgco.native.codegen import calls
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
@@ -107,7 +106,7 @@ def spans_of_cost(problem: Problem) -> tuple[Span, Span]:
 
     def span(name: str, function: Callable[..., Tensor], states: int, controls: int) -> Span:
         examples = problem.x0.new_zeros(1, states, n), problem.x0.new_zeros(1, controls, m)
-        with whole_numbers_become(problem.x0.dtype):  # as where PyTorch sums the cost
+        with cost.precision(problem.x0.dtype):
             traced = Traced(_named(name, cost), function, *examples, own=own)
         return Span(traced, n, m, states, controls, range(states))
 
