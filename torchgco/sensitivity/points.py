@@ -203,6 +203,8 @@ def probe(problem: Problem, active: Tensor) -> RightSides:
 
 def _weakness(problem: Problem, solution: Solution, active: Tensor, untold: Tensor) -> Tensor:
     """WEAKLY_ACTIVE (B,) where it matters for derivatives which of the rows `untold` hold, else DIFFERENTIABLE."""
+    if problem.B == 0:
+        return torch.zeros_like(solution.status)
     z = []
     for rows in (active | untold, active & ~untold):
         z.append(solve_at(problem, solution, rows, probe(problem, rows)).z[0].flatten(1))
