@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -46,3 +48,14 @@ def test_clearances_at_the_nodes_are_those_of_all_obstacles() -> None:
         due = np.minimum(due, away.amin(-1)[0].numpy())
     got = lattice.map.at(every[some])
     assert np.allclose(got, np.minimum(due, got.max()), atol=1e-5) and got.max() >= 4.0 * lattice.spacing
+
+
+def test_a_scene_without_an_end_has_no_path() -> None:
+    setup = compose(["scenario=rooms"])
+    problem = setup.task(setup.scenario.draw([1], 1)).problem
+    scene = scene_of(problem, problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m)))
+    assert scene is not None
+    for far in (torch.inf, torch.nan):
+        start = scene.start.clone()
+        start[0, 0] = far
+        assert not bool(Roadmap().paths(replace(scene, start=start), 2)[1].any())
