@@ -43,6 +43,7 @@ from torchgco.native.structures import STRUCTURES, Kind, array
 from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
+NO_MEMORY = "native kernels: no memory"
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -268,11 +269,16 @@ class Engine:
     def _fixed(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
         if "packed" not in vars(problem):
-            object.__setattr__(problem, "packed", self._made(problem))
+            made = None if problem.one is None else self._fixed(problem.one)
+            if made is None or any(row.map_of for row in made[1]):  # which maps C reads is a number of each problem
+                made = self._made(problem)
+            object.__setattr__(problem, "packed", made)
         return vars(problem)["packed"]
 
     def _model(self, problem: Problem) -> c.Problem:
         """The model's part of it; that of the last problem where this one has the same dynamics."""
+        if problem.one is not None:
+            return self._model(problem.one)
         if "model_packed" not in vars(problem):
             known, B, packed = problem.known.model
             if known is not problem.dynamics or B != problem.B:  # what problems share stays the same object in a subset
@@ -289,20 +295,29 @@ class Engine:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
         rows, packed = self._constraints(problem), self._model(problem).copy()
         packed.constraints, packed.constraint = len(rows), rows
-        cost, shared = self.cost, self.shared.cost
-        packed.cost_data = quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, shared)
-        packed.bounded = int(self.cost is None and is_bounded(problem.cost))
+        packed.cost_data, packed.bounded = self._cost(problem)
         return packed, rows
 
+    def _cost(self, problem: Problem) -> tuple[list[c.Array], int]:
+        """The cost's arrays, and whether it is `bounded`; those of the last problem where this one has the same."""
+        known, B, own = problem.known.cost
+        if known is not problem.cost or B != problem.B:
+            if self.cost is None:
+                own = quadratic_arrays(problem.cost), int(is_bounded(problem.cost))
+            else:
+                own = cost_arrays(problem, self.cost, self.shared.cost), 0
+            problem.known.cost = problem.cost, problem.B, own
+        return own
+
     def _constraints(self, problem: Problem) -> list[c.Constraint]:
-        """The rows without multipliers; those of the last problem where this one differs in its cost alone."""
-        known, rows = problem.known.packed
-        if known is problem.constraints:
-            return rows
-        rows = []
+        """The rows without multipliers; of each constraint those of the last problem where this one has the same."""
+        packed, rows = problem.known.packed, []
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
-            rows.append(constraint_of(constraint, shape, self.row_numbers(problem, i), problem))
-        problem.known.packed = problem.constraints, rows
+            known, B, row = packed.get(i, (None, 0, None))
+            if known is not constraint or B != problem.B:
+                row = constraint_of(constraint, shape, self.row_numbers(problem, i), problem)
+                packed[i] = constraint, problem.B, row
+            rows.append(row)
         return rows
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
@@ -323,14 +338,16 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure, first
     """
     if count == 0:
         return
-    groups = -(-count // group)
-    threads = torch.get_num_threads()
+    groups, threads = -(-count // group), torch.get_num_threads()
+    if groups == 1 or threads == 1:
+        if not function(ctypes.byref(argument), ctypes.c_int64(first), ctypes.c_int64(first + count)):
+            raise MemoryError(NO_MEMORY)
+        return
     parts = min(threads, groups)
     edges = [first + group * (groups * i // parts) for i in range(parts)] + [first + count]
     spans = [(ctypes.byref(argument), ctypes.c_int64(a), ctypes.c_int64(b)) for a, b in pairwise(edges)]
-    done = [function(*spans[0])] if parts == 1 else _at_once(function, spans, _helpers(threads - 1))
-    if not all(done):
-        raise MemoryError("native kernels: no memory")
+    if not all(_at_once(function, spans, _helpers(threads - 1))):
+        raise MemoryError(NO_MEMORY)
 
 
 def _at_once(function: Any, spans: list[tuple[Any, ...]], helpers: ThreadPoolExecutor) -> list[int]:

@@ -102,6 +102,8 @@ class Best:
         """Remember those of two trajectories that lose by their cost alone to one that touches between two knots."""
         limit = self.solver.violation_tolerance
         fits = (old.best.violation <= limit) & (new.best.violation <= limit)
+        if not bool(fits.any()):
+            return
         fits &= ~leaves_goal(problem, new.best.X, old.best.X) & ~leaves_goal(problem, old.best.X, new.best.X)
         if not bool(fits.any()):
             return

@@ -396,6 +396,8 @@ def _replaced(work: OuterLoop, state: State, status: Tensor, waiting: Tensor) ->
             waiting = waiting[news:]
             put(state, ended[:news], begun)
             status[ended[:news]] = refused
+        if news == 0 and ended.numel() == status.numel():
+            return take(state, slice(0, 0)), waiting
         if ended.numel() > news:
             stays = torch.ones_like(status, dtype=torch.bool)
             stays[ended[news:]] = False
