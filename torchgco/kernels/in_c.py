@@ -88,10 +88,9 @@ class NativeKernels:
         return backward
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
-        state = {}
-        for name in ITERATED:
-            state[name] = getattr(s, name).clone(memory_format=torch.contiguous_format)
-            setattr(s, name, state[name])
+        state = {name: getattr(s, name).contiguous() for name in ITERATED}
+        for name, part in state.items():
+            setattr(s, name, part)
         out = self.engine.inner_solve(lagrangian, state, native_options(how), limit)
         converged, stuck, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
         ended = out["status"] == End.ENDED

@@ -136,9 +136,10 @@ class Engine:
 
     def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,) of trajectories."""
-        cost, merit = X.new_empty(2, len(X))
+        B = lagrangian.problem.B
+        cost, merit = X.new_empty(B), X.new_empty(B)
         packed = self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=cost, merit=merit)
-        self._run("tgco_value", len(X), packed)
+        self._run("tgco_value", B, packed)
         return cost, merit
 
     def gains(
@@ -210,14 +211,14 @@ class Engine:
 
     def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
         """The largest violation (B,) of trajectories, of problems that the library `measures`; of obstacles alone?"""
-        worst, name = X.new_empty(len(X)), "tgco_penetration" if obstacles else "tgco_violation"
-        self._run(name, len(X), self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
+        worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
+        self._run(name, problem.B, self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
         return worst
 
     def chords(self, problem: Problem, X: Tensor, scale: float) -> Tensor:
         """The smallest distance (B,) of the lines between knots from spheres with radii times `scale`; or infinity."""
-        U, least = X.new_zeros(len(X), problem.N, problem.m), X.new_empty(len(X))
-        self._run("tgco_chords", len(X), self.packed(problem, X=X.contiguous(), U=U, merit=least, gain=scale))
+        U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
+        self._run("tgco_chords", problem.B, self.packed(problem, X=X.contiguous(), U=U, merit=least, gain=scale))
         return least
 
     def outer_loop(self, outer: c.Outer, B: int) -> None:
@@ -257,10 +258,10 @@ class Engine:
         """The problem with multipliers, penalties and guide."""
         multipliers = lagrangian.multipliers
         rows = self._fixed(lagrangian.problem)[1]
-        if best is not None or not all(map(_is_blank, multipliers.lam)):
+        if best is not None or not multipliers.blank:
             rows = [constraint.copy() for constraint in rows]
-            for row, lam in zip(rows, multipliers.lam, strict=True):
-                row.lam = None if _is_blank(lam) else lam.contiguous()
+            for row, lam in zip(rows, () if multipliers.blank else multipliers.lam, strict=not multipliers.blank):
+                row.lam = lam.contiguous()
             for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
                 row.best = lam
         own = {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
@@ -377,11 +378,6 @@ def _measured(part: Constraint) -> bool:
     if part.row_radii is not None:
         return type(innermost(part)).violation in (NormBounds.violation, SpheresInFreeTime.violation)
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
-
-
-def _is_blank(lam: Tensor) -> bool:
-    """Whether multipliers are `Multipliers.none`: one zero for all."""
-    return not any(lam.stride()) and lam.numel() > 0 and float(lam[0, 0, 0]) == 0.0
 
 
 def _flags(B: int) -> Tensor:
