@@ -359,9 +359,9 @@ class OuterLoop:
     def report(self, passes: int, rows: Tensor, waiting: int, before: State, state: State | None) -> None:
         """The progress of a pass, for the callback; `state` is that of the problems that run on, if any."""
         if self.call.callback is not None:
-            state = take(before, slice(0, 0)) if state is None else state
-            total, left = self.call.problem.B, state.rows.numel() + waiting
-            self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, state))
+            now = take(before, slice(0, 0)) if state is None else state
+            total, left = self.call.problem.B, now.rows.numel() + waiting
+            self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, now))
 
 
 def run_all(work: OuterLoop, rows: Tensor, slots: int) -> None:
