@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -86,6 +86,8 @@ class Family(Scenario):
     stages: checks.Stages
     dt: checks.TimeStep
 
+    zeros: ClassVar[int] = 0  # states after the position, at rest; none where what these are is the model's to say
+
     def __post_init__(self) -> None:
         check_options(self, "scenario")
         if not self.name:
@@ -94,13 +96,17 @@ class Family(Scenario):
             object.__setattr__(self, field.name, checks.plain(getattr(self, field.name)))
 
     @property
+    def dimension(self) -> int:
+        """That of its start."""
+        return len(self.start)
+
+    @property
     def states(self) -> int:
         """n."""
-        return len(self._at_rest(self.start))
+        return self.dimension + self.zeros
 
-    @abstractmethod
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        """The vehicle's state (n,) at rest in `position` (d,), or the position where that is the model's to say."""
+        return np.array([*position, *[0.0] * self.zeros])
 
     def _layout(self, **obstacles: Any) -> Layouts:
         """One layout with these fields of Layouts; without `centers` there are no spheres."""
