@@ -59,7 +59,7 @@ class Scenario(ABC):
         raise NotImplementedError(f"{type(self).__name__} overrides _draw_one or draw")
 
 
-def generator(seed: int, number: int) -> np.random.Generator:
+def generator(seed: Any, number: int) -> np.random.Generator:
     """The stream of layout `number` under `seed`: counter-based, independent of every other number's."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(number,))))
 
