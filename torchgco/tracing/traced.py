@@ -7,6 +7,7 @@ whenever they are asked for, and a problem's own numbers for each problem. Only 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,11 @@ from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
+# What moves numbers and computes none.
+PICKING = {f"aten.{name}" for name in (
+    "index", "index_select", "select", "slice", "unsqueeze", "squeeze", "view", "reshape", "expand", "detach", "alias",
+    "clone", "permute", "transpose", "t", "unbind", "split", "cat", "stack",
+)}  # fmt: skip
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
 
@@ -173,6 +179,10 @@ class Traced:
         """
         if not self._own:
             return torch.zeros(len(index), 0, dtype=torch.float64, device=index.device)
+        if self.picks is not None:
+            rows = [self._captured[slot].double() for slot in self._named]
+            rows = [row.expand(len(index), *row.shape[1:]) if len(row) == 1 else row[index] for row in rows]
+            return torch.cat([row.flatten(1) for row in rows], dim=1)[:, self.picks.to(index.device)].detach()
 
         def one(i: Tensor) -> Tensor:
             computed = self._computed(i.unsqueeze(0))
@@ -182,6 +192,31 @@ class Traced:
             return torch.func.vmap(one)(index)
         except RuntimeError:  # an operation that vmap can't batch
             return torch.stack([one(i) for i in index])
+
+    @cached_property
+    def picks(self) -> Tensor | None:
+        """Where each of the `count` numbers stands among those of a problem's own tensors, (count,) int64.
+
+        None where one of them is computed.
+        """
+        own, operations = [self._captured[slot] for slot in self._named], _needed(self._plain, *self._own)
+        read = {slot for one in operations for slot in one.inputs}
+        if any(name_of(one.function) not in PICKING for one in operations) or any(part.dim() == 0 for part in own):
+            return None
+        others = {slot for slot in read - {self._index} - self._named.keys() if slot in self._captured}
+        places = {slot for one in operations if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
+        if any(slot.dtype.is_floating_point for slot in others) or places & _followers(operations, self._named):
+            return None
+        if places & (_followers(operations, [self._index]) - {self._index}):
+            return None
+        known: dict[Slot, Any] = {slot: self._captured[slot] for slot in others}
+        known[self._index], first = torch.zeros(1, dtype=torch.int64, device=own[0].device), 0
+        for slot, part in zip(self._named, own, strict=True):
+            row, size = part[:1], part[:1].numel()
+            known[slot] = torch.arange(first, first + size, dtype=torch.float64, device=row.device).reshape(row.shape)
+            first += size
+        replay_all(operations, known)
+        return torch.cat([known[slot].double().flatten() for slot in self._own]).long()
 
     def rebound(self, own: Sequence[Tensor], B: int) -> Traced | None:
         """The same function of B problems with other tensors in the place of its `own`; None: trace it again.
@@ -197,6 +232,7 @@ class Traced:
             # The row of a single problem stands for all of its repetitions.
             is_spread = _one_row(tensor) and not was_row
             tensors.append(tensor.expand(B, *tensor.shape[1:]) if is_spread else tensor)
+        _ = self.picks  # once for all copies
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
         copy._captured = self._captured | {slot: tensors[place] for slot, place in self._named.items()}
