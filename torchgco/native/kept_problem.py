@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -88,9 +89,9 @@ class KeptProblem:
         picks, part = self.engine.functions[i].picks, self.problem.constraints[i]
         if picks is None or picks.numel() == 0 or kind_of(part) is not Kind.FUNCTION or part.row_radii is not None:
             return None
-        first = 0
-        for own in own_tensors(part):
-            size = own[:1].numel()
+        first, every = 0, own_tensors(part)
+        for own in (every[place] for place in self.engine.functions[i].span.traced.named):
+            size = math.prod(own.shape[1:])
             if first <= int(picks.min()) and int(picks.max()) < first + size:
                 (there,) = self._numbers[i]["bound"].kept
                 fits = own.is_contiguous() and len(own) == self.problem.B == len(there) and own.dtype == torch.float64

@@ -6,6 +6,7 @@ whenever they are asked for, and a problem's own numbers for each problem. Only 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -30,6 +31,7 @@ PICKING = {f"aten.{name}" for name in (
     "index", "index_select", "select", "slice", "unsqueeze", "squeeze", "view", "reshape", "expand", "detach", "alias",
     "clone", "permute", "transpose", "t", "unbind", "split", "cat", "stack",
 )}  # fmt: skip
+PROBED = 3  # problems for which a function is asked which numbers it takes
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
 
@@ -182,7 +184,8 @@ class Traced:
         if self.picks is not None:
             rows = [self._captured[slot].double() for slot in self._named]
             rows = [row.expand(len(index), *row.shape[1:]) if len(row) == 1 else row[index] for row in rows]
-            return torch.cat([row.flatten(1) for row in rows], dim=1)[:, self.picks.to(index.device)].detach()
+            flat = [row.reshape(len(row), math.prod(row.shape[1:])) for row in rows]
+            return torch.cat(flat, dim=1)[:, self.picks.to(index.device)].detach()
 
         def one(i: Tensor) -> Tensor:
             computed = self._computed(i.unsqueeze(0))
@@ -195,28 +198,50 @@ class Traced:
 
     @cached_property
     def picks(self) -> Tensor | None:
-        """Where each of the `count` numbers stands among those of a problem's own tensors, (count,) int64.
+        """Where each of the `count` numbers stands in a problem's row of its own tensors, (count,) int64.
 
-        None where one of them is computed.
+        These are the ones at the places `named`, in turn. None where a number is computed, or chosen by others.
         """
-        own, operations = [self._captured[slot] for slot in self._named], _needed(self._plain, *self._own)
-        read = {slot for one in operations for slot in one.inputs}
-        if any(name_of(one.function) not in PICKING for one in operations) or any(part.dim() == 0 for part in own):
+        operations = _needed(self._plain, *self._own)
+        at = {slot for one in operations if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
+        chosen = at & (_followers(operations, [self._index, *self._named]) - {self._index})
+        if not _followers(operations, self._named).issuperset(self._own):
             return None
-        others = {slot for slot in read - {self._index} - self._named.keys() if slot in self._captured}
-        places = {slot for one in operations if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
-        if any(slot.dtype.is_floating_point for slot in others) or places & _followers(operations, self._named):
+        if chosen or not self._named or any(name_of(one.function) not in PICKING for one in operations):
             return None
-        if places & (_followers(operations, [self._index]) - {self._index}):
+        others = self._captured.keys() & {slot for one in operations for slot in one.inputs} - self._named.keys()
+        own = {slot: self._captured[slot] for slot in self._named}
+        rows = {slot: PROBED if slot in self._indexed else 1 for slot in own}
+        odd = any(part.dim() == 0 or (len(part) > 1 and rows[slot] == 1) for slot, part in own.items())
+        if odd or any(slot.dtype.is_floating_point for slot in others):
             return None
+        sizes = {slot: math.prod(part.shape[1:]) for slot, part in own.items()}
         known: dict[Slot, Any] = {slot: self._captured[slot] for slot in others}
-        known[self._index], first = torch.zeros(1, dtype=torch.int64, device=own[0].device), 0
-        for slot, part in zip(self._named, own, strict=True):
-            row, size = part[:1], part[:1].numel()
-            known[slot] = torch.arange(first, first + size, dtype=torch.float64, device=row.device).reshape(row.shape)
-            first += size
+        total, first, row_of = sum(sizes.values()), 0, list[int]()  # row_of: 1 for numbers of a problem's own row
+        for slot, part in own.items():
+            places = torch.arange(first, first + sizes[slot], dtype=torch.float64)
+            numbers = total * torch.arange(rows[slot]).unsqueeze(-1) + places
+            known[slot] = numbers.reshape(rows[slot], *part.shape[1:]).to(part.device)
+            row_of, first = row_of + [int(rows[slot] > 1)] * sizes[slot], first + sizes[slot]
+        try:
+            found = torch.stack([self._picked(operations, known, i) for i in range(PROBED)])
+        except (RuntimeError, IndexError):  # other shapes than these
+            return None
+        if not bool((found[0] < total).all()):
+            return None
+        moved = total * torch.tensor(row_of)[found[0]]
+        return found[0] if torch.equal(found, found[0] + torch.arange(PROBED).unsqueeze(-1) * moved) else None
+
+    def _picked(self, operations: list[Operation], known: dict[Slot, Any], i: int) -> Tensor:
+        some = next(iter(known.values()))
+        known = {**known, self._index: torch.full((1,), i, dtype=torch.int64, device=some.device)}
         replay_all(operations, known)
-        return torch.cat([known[slot].double().flatten() for slot in self._own]).long()
+        return torch.cat([known[slot].flatten().long().cpu() for slot in self._own])
+
+    @property
+    def named(self) -> list[int]:
+        """The places of the tensors in `own` that the function reads."""
+        return list(self._named.values())
 
     def rebound(self, own: Sequence[Tensor], B: int) -> Traced | None:
         """The same function of B problems with other tensors in the place of its `own`; None: trace it again.
