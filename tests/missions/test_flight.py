@@ -108,7 +108,7 @@ def test_what_is_kept_from_call_to_call_changes_no_bit(monkeypatch: pytest.Monke
     x0 = problem.x0.clone()
     x0[0, 0] = -0.2
     problem = replace(problem, x0=x0)
-    flown = mission(SOLVER, 0.4, disturbance=Disturbance(wind=0.3, position_noise=0.01), goal_radius=1.95)
+    flown = mission(SOLVER, 0.4, disturbance=Disturbance(wind=0.3, position_noise=0.01), goal_radius=1.99)
     kept = flown.fly(problem, seed=4)
     monkeypatch.setattr(NativeKernels, "kept_descent", lambda *arguments: None)
     for module in (pilot, planner):
