@@ -16,8 +16,8 @@ from torchgco.native.packing import is_bounded
 from torchgco.problem.problem import Problem
 
 ZEROED = "regularisation", "inner", "iterations", "rung", "status", "converged", "refused", "lost", "alpha", "used"
-KINDS = {"inner": torch.int64, "iterations": torch.int64, "rung": torch.int64}
-KINDS |= dict.fromkeys(("status", "converged", "refused", "lost"), torch.int32)
+STATE_TYPES = {"inner": torch.int64, "iterations": torch.int64, "rung": torch.int64}
+STATE_TYPES |= dict.fromkeys(("status", "converged", "refused", "lost"), torch.int32)
 
 
 class KeptDescent(KeptProblem):
@@ -33,7 +33,7 @@ class KeptDescent(KeptProblem):
         B, like = problem.B, problem.x0
         self.mu = like.new_zeros(B)
         names = ("cost", "merit", *ZEROED)
-        state = {name: torch.zeros(B, dtype=KINDS.get(name, torch.float64)) for name in names}
+        state = {name: torch.zeros(B, dtype=STATE_TYPES.get(name, torch.float64)) for name in names}
         bounded = int(engine.cost is None and is_bounded(problem.cost))
         self.packed.fill({"mu": self.mu, "phr": phr, "bounded": bounded, "options": options, **state})
         self.packed.fill({"limit": options.max_iterations, "replicas": replicas_of(B)})

@@ -29,8 +29,8 @@ OVERRULED = {
     "start": "start", "goal": "goal", "radius": "vehicle_radius", "goal_radius": "goal_radius", "stages": "stages",
     "control_lower": "control_lower", "control_upper": "control_upper",
 }  # fmt: skip
-FILES = "files"  # what a configuration's files hold, see `files_of`
-CLOSED_LOOP = ("mission", "plant", FILES)  # nodes of missions
+READ_FILES = "files"  # what a configuration's files hold, see `files_of`
+CLOSED_LOOP = ("mission", "plant", READ_FILES)  # nodes of missions
 GROUPS = ("scenario", "model", "device", *CLOSED_LOOP)
 DIGITS = 16  # hexadecimal, of a digest: 64 bits
 EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same float
@@ -60,7 +60,7 @@ def closed_loop(configuration: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def files_of(configuration: Mapping[str, Any], further: Iterable[Any] = ()) -> dict[str, dict[str, str]]:
-    """Digests of the files that a plant is made of, by their paths, as a node `FILES`; empty where there are none.
+    """Digests of the files that a plant is made of, by their paths, as a node `READ_FILES`; empty where there are none.
 
     A path alone doesn't say which vehicle flies: a file may be edited between two runs.
 
@@ -70,7 +70,7 @@ def files_of(configuration: Mapping[str, Any], further: Iterable[Any] = ()) -> d
     named = [value for value in flat({"plant": configuration.get("plant") or {}}).values() if isinstance(value, str)]
     paths = {path: os.path.expanduser(path) for path in (*named, *map(str, further))}
     held = {path: checksum(Path(there))[:DIGITS] for path, there in paths.items() if os.path.isfile(there)}
-    return {FILES: held} if held else {}
+    return {READ_FILES: held} if held else {}
 
 
 @dataclass(frozen=True)
