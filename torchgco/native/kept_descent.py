@@ -16,8 +16,10 @@ from torchgco.native.packing import is_bounded
 from torchgco.problem.problem import Problem
 
 ZEROED = "regularisation", "inner", "iterations", "rung", "status", "converged", "refused", "lost", "alpha", "used"
-STATE_TYPES = {"inner": torch.int64, "iterations": torch.int64, "rung": torch.int64}
-STATE_TYPES |= dict.fromkeys(("status", "converged", "refused", "lost"), torch.int32)
+STATE_TYPES = {
+    **dict.fromkeys(("inner", "iterations", "rung"), torch.int64),
+    **dict.fromkeys(("status", "converged", "refused", "lost"), torch.int32),
+}
 
 
 class KeptDescent(KeptProblem):
