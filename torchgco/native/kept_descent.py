@@ -23,7 +23,7 @@ STATE_TYPES = {
 
 
 class KeptDescent(KeptProblem):
-    """Kept problems for inner solves: the same bits as `solvers.ilqr.descend`, which packs its problems anew.
+    """Kept problems for inner solves: the same bits as `solvers.ilqr.descend`, which packs its problems again.
 
     Args:
         engine, problem: see `KeptProblem`.
