@@ -25,6 +25,7 @@ from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
+from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
 from torchgco.native.structures import End, Options
 from torchgco.obstacles.spheres import BoundSpheres
@@ -109,6 +110,9 @@ class NativeKernels:
         state = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in given.items()}
         accepted = self.engine.lift(lagrangian, state, lifted.LIFTED_STEPS, lifted.GAIN)
         return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted)
+
+    def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:
+        return KeptDescent(self.engine, problem, native_options(how), phr) if self.engine.measures else None
 
     def outer_passes(self, problem: Problem, s: State, how: Descent, **limits: Any) -> NativeOuter | None:
         return NativeOuter(self.engine, native_options(how), problem, s, **limits) if self.engine.measures else None

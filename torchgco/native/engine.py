@@ -204,8 +204,7 @@ class Engine:
         B = lagrangian.problem.B
         out = {name: _flags(B) for name in ("status", "converged", "refused", "lost")}
         out |= {name: torch.zeros(B, dtype=torch.float64) for name in ("alpha", "used")}
-        replicas = LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
-        packed = self.terms(lagrangian, None, **state, **out, options=options, limit=limit, replicas=replicas)
+        packed = self.terms(lagrangian, None, **state, **out, options=options, limit=limit, replicas=replicas_of(B))
         self._run("tgco_ilqr", B, packed)
         return out
 
@@ -329,6 +328,11 @@ class Engine:
         shared = self.shared.rows[i]
         own = numbers_of(constraint, rows_numbers(problem, i, source, shared), problem)
         return {**own, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
+
+
+def replicas_of(B: int) -> int:
+    """How many lanes share the line search of each of B problems."""
+    return LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:

@@ -354,6 +354,17 @@ class Problem:
             check_code(dims, started.x0, pair(dynamics, "dynamics"), pair(cost, "cost"), new)
         return started
 
+    def moved_to(self, x0: Tensor, constraints: Sequence[Constraint] | None, dynamics: Dynamics | None) -> Self:
+        """`started_at` by parts of the same kinds, code and shapes (None: those before), unchecked."""
+        dims, parts = self._dimensions(x0, dynamics), dict[str, Any]()
+        if dynamics is not None:
+            parts["dynamics"] = dynamics.bind(dims)
+        if constraints is not None:
+            rows = [part.bind(dims) for part in without_goal(self.goal, dims, constraints)]
+            parts["constraints"] = with_goal(self.goal, rows, dims)
+        parts["x0"] = moved_inside(x0, self.free_start, parts.get("constraints", self.constraints))
+        return self._with(parts, known=self.known)
+
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
         names = "dynamics", "cost", "constraints", "x0", "goal", "time"
