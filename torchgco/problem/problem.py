@@ -168,10 +168,16 @@ class Problem:
 
     @cached_property
     def start_is_clear(self) -> Tensor:
-        """Whether each problem starts outside its obstacles, (B,) bool."""
+        """Whether each problem starts outside its obstacles, (B,) bool.
+
+        Those that hold at later knots than 1 don't count: a vehicle may leave them. Nor does a guess of a free start.
+        """
         clear = torch.ones(self.B, dtype=torch.bool, device=self.x0.device)
         for constraint in self.constraints:
-            clear &= constraint.start_is_clear(self.x0)
+            if constraint.holds_at(0) or constraint.holds_at(1):
+                clear &= constraint.start_is_clear(self.x0)
+        if self.free_start is not None and self.dynamics.position is not None:
+            clear |= self.free_start[:, self.position].any(dim=-1)
         return clear
 
     @cached_property
