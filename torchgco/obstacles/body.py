@@ -244,6 +244,8 @@ class BoundBody(Obstacles):
     sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
     moving = property(lambda self: self.inner.moving)  # type: ignore[assignment]
     radii = property(lambda self: torch.stack([ball.vehicle_radius for ball in self.balls], dim=-1))  # (B, P), m
+    # Of the smallest ball about the position that holds the body, (B,), m.
+    reach = property(lambda self: (self.points.offsets.norm(dim=-1) + self.radii).amax(-1))
     calls_function = property(lambda self: self.points.attitude.calls_function)
 
     def __repr__(self) -> str:
