@@ -8,15 +8,12 @@ derivative is continuous, so that the cost has no kinks in tau.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchgco.costs.base import WrappedCost
-
-if TYPE_CHECKING:
-    from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.costs.base import Cost, WrappedCost
 
 
 @dataclass(frozen=True)
@@ -27,7 +24,7 @@ class QuadraticInFreeTime(WrappedCost):
     trajectory is drawn to on its way; its last row then counts at the end, whenever that is.
     """
 
-    cost: BoundQuadratic  # with the references at the nominal times
+    cost: Any  # a BoundQuadratic, with the references at the nominal times
     along: Tensor  # (B|1, N+1, n): coefficients of the B-splines around the rows
     rests: Tensor  # (B|1,) bool: the reference is the same at all stages
 
@@ -35,8 +32,8 @@ class QuadraticInFreeTime(WrappedCost):
     per_element: ClassVar[tuple[str, ...]] = ("along", "rests")
 
     @classmethod
-    def of(cls, cost: BoundQuadratic) -> QuadraticInFreeTime | None:
-        """None where no reference of states differs from stage to stage."""
+    def of(cls, cost: Any) -> QuadraticInFreeTime | None:
+        """That of a BoundQuadratic; None where no reference of states differs from stage to stage."""
         rests = (cost.x_ref == cost.x_ref[:, :1]).flatten(1).all(-1)
         if bool(rests.all()):
             return None
@@ -45,7 +42,7 @@ class QuadraticInFreeTime(WrappedCost):
         return cls(cost, torch.where(rests.view(-1, 1, 1), still, coefficients(rows)), rests)
 
     @property
-    def of_errors(self) -> BoundQuadratic:
+    def of_errors(self) -> Cost:
         """The cost of what states differ by from references."""
         zero = torch.zeros_like(self.cost.xf_ref[:1])
         return replace(self.cost, x_ref=zero.unsqueeze(1), xf_ref=zero)
