@@ -14,7 +14,7 @@ from benchmarks.lib import acados
 from benchmarks.lib.families import WORLDS
 from tests.problems import quadrotor_batch
 from torchgco import Problem, compose, judge, presets
-from torchgco.baselines import CasADiSolver, Hold
+from torchgco.baselines import CasADiSolver
 from torchgco.experiments.results.identity import layout_digests
 from torchgco.scenarios import Layouts, Task
 
@@ -124,9 +124,3 @@ def test_the_kept_rows_are_of_known_worlds_and_solvers() -> None:
     rows = worlds_peers.rows_of(worlds_peers.FILE)
     assert set(rows["world"]) <= set(WORLDS) and set(rows["solver"]) <= set(worlds_peers.NAMES)
     assert not rows.duplicated(["world", "solver", "layout", "layout_digest"]).any()
-
-
-def test_holding_still_reaches_nothing(tmp_path: Path) -> None:
-    world = tiny(tmp_path)
-    U = Hold().solve(world.problem(1), world.task.U0[1:]).U
-    assert worlds_peers._judged(world, "fatrop", 1, worlds_peers.Flight(U, "FEASIBLE", 0.1, 1))["reached"] is False

@@ -110,9 +110,9 @@ class BoundQuadratic(Cost):
         def at_k(part: Tensor) -> Tensor:
             if not isinstance(k, int):
                 return part
-            part = part[:, k if part.shape[1] > 1 else 0]
+            at = k if part.shape[1] > 1 else 0
             # The axis of samples, if any, follows the batch axis.
-            return part if x.dim() == 2 else part.unsqueeze(1)
+            return part[:, at] if x.dim() == 2 else part[:, at : at + 1]
 
         ex, eu = x - at_k(self.x_ref), u - at_k(self.u_ref)
         value = 0.5 * ((ex * self._times(at_k(self.Q), ex)).sum(-1) + (eu * self._times(at_k(self.R), eu)).sum(-1))

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
-from torchgco.base.tree import Rows, cast, is_users
+from torchgco.base.tree import Rows, cast, field_names, is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -69,6 +69,7 @@ class Problem:
 
     known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
     given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
+    one: ClassVar[Problem | None] = None  # the single problem that all of these are; None: they are no such copies
 
     def __post_init__(self) -> None:
         fields_given = as_given({f.name: getattr(self, f.name) for f in fields(self)})
@@ -261,6 +262,8 @@ class Problem:
             "time": None if self.time is None else self.time.take(index),
         }
         part = self._with(parts, known=self.known)
+        if self.B == 1 or self.one is not None:
+            object.__setattr__(part, "one", self.one or self)
         if self.given is not None:
             object.__setattr__(part, "given", self.given.followed(self, lambda whole: whole.take(index)))
         return part
@@ -352,6 +355,17 @@ class Problem:
             check_code(dims, started.x0, pair(dynamics, "dynamics"), pair(cost, "cost"), new)
         return started
 
+    def moved_to(self, x0: Tensor, constraints: Sequence[Constraint] | None, dynamics: Dynamics | None) -> Self:
+        """`started_at` by parts of the same kinds, code and shapes (None: those before), unchecked."""
+        dims, parts = self._dimensions(x0, dynamics), dict[str, Any]()
+        if dynamics is not None:
+            parts["dynamics"] = dynamics.bind(dims)
+        if constraints is not None:
+            rows = [part.bind(dims) for part in without_goal(self.goal, dims, constraints)]
+            parts["constraints"] = with_goal(self.goal, rows, dims)
+        parts["x0"] = moved_inside(x0, self.free_start, parts.get("constraints", self.constraints))
+        return self._with(parts, known=self.known)
+
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
         names = "dynamics", "cost", "constraints", "x0", "goal", "time"
@@ -360,8 +374,8 @@ class Problem:
     def _with(self, parts: dict[str, object], known: Known | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
         copy = object.__new__(type(self))
-        for f in fields(self):
-            object.__setattr__(copy, f.name, parts.get(f.name, getattr(self, f.name)))
+        for name in field_names(type(self)):
+            object.__setattr__(copy, name, parts[name] if name in parts else getattr(self, name))
         object.__setattr__(copy, "known", Known() if known is None else known)
         return copy
 

@@ -23,13 +23,13 @@ from torchgco.roadmap.scene import around_body
 from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
 from torchgco.search.converge import mapped
-from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Follow, Free, Paths
 from torchgco.search.manoeuvres import MANOEUVRES_TEXT as MANOEUVRES
 from torchgco.search.manoeuvres import manoeuvre
 from torchgco.search.proposals import Part
 from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
 from torchgco.search.row import Row
+from torchgco.search.solved_candidates import BOTH, in_order, solved
 
 TRACKED_AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
 # Tracked candidates lie a small part of R inside an obstacle, from where the interior point leads out of it again; from
