@@ -107,7 +107,8 @@ class Problem:
         first = 0 if chooses_position(self.free_start, model.position) else 1
         goal, dt = self.goal and self.goal.place, getattr(model, "dt", None)
         names = tuple(getattr(model, "state_names", ()))
-        return Dimensions(len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon, names)
+        parts = len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon, names
+        return Dimensions(*parts, free_time=self.time is not None)
 
     def __repr__(self) -> str:
         return summary(self)
