@@ -22,7 +22,7 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import as_given, bound, remember
 from torchgco.problem.border import check_code
-from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
+from torchgco.problem.free_start import checked_horizon, chooses_position, clear_starts, moved_inside, start_mask
 from torchgco.problem.free_time import FreeTime, check_served
 from torchgco.problem.given import Given, place, replaced
 from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
@@ -169,17 +169,8 @@ class Problem:
 
     @cached_property
     def start_is_clear(self) -> Tensor:
-        """Whether each problem starts outside its obstacles, (B,) bool.
-
-        Those that hold at later knots than 1 don't count: a vehicle may leave them. Nor does a guess of a free start.
-        """
-        clear = torch.ones(self.B, dtype=torch.bool, device=self.x0.device)
-        for constraint in self.constraints:
-            if constraint.holds_at(0) or constraint.holds_at(1):
-                clear &= constraint.start_is_clear(self.x0)
-        if self.free_start is not None and self.dynamics.position is not None:
-            clear |= self.free_start[:, self.position].any(dim=-1)
-        return clear
+        """Whether each problem starts outside its obstacles, (B,) bool; see `free_start.clear_starts`."""
+        return clear_starts(self.constraints, self.x0, self.free_start, self.dynamics.position)
 
     @cached_property
     def cost_scale(self) -> CostScale:
