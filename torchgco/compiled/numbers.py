@@ -226,7 +226,7 @@ def numbers_of(problem: Problem) -> list[Number]:
 def with_numbers_as_they_are(problem: Problem) -> Problem:
     """The same problems after numbers were written, with nothing that was computed from the previous ones."""
     constraints = tuple(_renewed(part) for part in problem.constraints)
-    known = replace(problem.known, row_shapes=None, interior=None, packed=(None, None))
+    known = replace(problem.known, row_shapes=None, interior=None, packed={}, cost=(None, 0, None))
     now = problem._with({"constraints": constraints}, known)
     if now.goal is None or now.goal.assumed:
         dims = now._dimensions(now.x0)
