@@ -27,7 +27,8 @@ from torchgco import ControlBounds, FunctionDynamics, Problem, QuadraticCost
 
 PERIOD, AHEAD = 0.02, 15  # s; periods
 STRONGEST, WEAKEST = 0.72, 0.1  # N, commanded
-OFTEN = 0.4  # s, at most, from plan to plan
+OFTEN, SOON = 0.4, 0.1  # s, at most, from plan to plan; from one with eased limits
+RETRY = 0.06  # s, from where none was found to the next
 CLOSE = 0.12  # s before a gate, in which the plan isn't changed
 ON_GROUND = 0.05  # m
 STEEPEST = 1.1  # rad, commanded
@@ -60,6 +61,7 @@ class Pilot:
         self.plan, self.mpc, self.limits = nominal, mpc, limits
         self.strength, self.t, self.planned = Strength(), 0.0, -np.inf
         self.known: Any = None
+        self.lost = False  # whether the last plan wasn't found
         self.before: tuple[np.ndarray, np.ndarray] | None = None  # velocity and axis of a period ago
         self.command = 0.0
         self.stray = 0.0  # m, the farthest from a plan so far
@@ -107,10 +109,13 @@ class Pilot:
         new = known != self.known
         at_gate = min((passed - self.plan.passed + 1) * STAGES, len(self.plan.t) - 1)
         to_gate = self.plan.t[at_gate] - self.t
-        if not new and (self.t - self.planned < OFTEN - 1e-9 or to_gate < CLOSE):
+        often = SOON if self.plan.eased else OFTEN
+        if self.t - self.planned < RETRY - 1e-9 and self.lost:
+            return
+        if not new and (self.t - self.planned < often - 1e-9 or to_gate < CLOSE):
             return
         found = again(self.plan, track, x, self.t, passed, self.strength.share, self.limits)
-        self.planned = self.t
+        self.planned, self.lost = self.t, found is None
         if found is not None:
             self.plan, self.known = found, known
 

@@ -67,7 +67,7 @@ class Limits:
     """What a plan leaves to feedback, and how near it goes."""
 
     speed: float = 2.2  # m/s
-    room: float = 0.14  # m, of the drone's middle from frames
+    room: float | None = 0.14  # m, of the drone's middle from frames; None: only the squares keep it from these
     beside: float = 0.14  # m, from poles
     unseen: float = 0.06  # m, more from poles that aren't seen
     half: float = 0.05  # m, half the width of the squares in which gates are crossed
@@ -79,6 +79,7 @@ class Limits:
 EASED = (
     Limits(3.0, 0.12, 0.12, 0.03, 0.075, 0.9, (0.3, 1.6)),
     Limits(4.0, 0.10, 0.11, 0.0, 0.10, 1.0, (0.25, 1.7)),
+    Limits(4.0, None, 0.11, 0.0, 0.08, 1.0, (0.25, 1.7)),
 )  # fmt: skip
 
 
@@ -90,6 +91,8 @@ class Plan:
     X: np.ndarray
     U: np.ndarray
     passed: int  # gates before the first leg
+    gates: np.ndarray  # (G, 3), m: where they were when it was made
+    eased: bool = False  # whether the usual limits had no plan
     solution: torchgco.Solution | None = field(default=None, repr=False)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +133,7 @@ def posed(track: Track, x: np.ndarray, passed: int, share: float, limits: Limits
         NormBounds(("x", [3, 4, 5]), upper=speed),
         Gates(centers, normals=turned(track.turns[passed:])[..., 0], half_widths=limits.half,
               knots=[*firsts, N - 1]),
-        Boxes(boxes, halves, limits.room, rotations),
+        *([] if limits.room is None else [Boxes(boxes, halves, limits.room, rotations)]),
         Capsules(track.poles, track.poles - [0.0, 0.0, TALL], around, limits.beside),
     ]  # fmt: skip
     time = FreeTime(0.01, 4.0, guess=1.0, segments=firsts or None)
@@ -162,7 +165,7 @@ def first(track: Track, x: np.ndarray, limits: Limits) -> Plan:
     found = torchgco.solve(problem, torch.from_numpy(U0)[None], solver, X0=torch.from_numpy(X0)[None])
     if not float(found.violation[0]) <= ADMITTED:
         raise RuntimeError(f"no plan through the nominal track: {found.statuses[0].name}, {found.violation}")
-    return Plan(found.t[0].numpy(), found.X[0].numpy(), found.U[0].numpy(), 0, found)
+    return Plan(found.t[0].numpy(), found.X[0].numpy(), found.U[0].numpy(), 0, track.gates, solution=found)
 
 
 def _along(way: Sequence[Sequence[Sequence[float]]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -187,12 +190,14 @@ def again(
 ) -> Plan | None:
     """A plan from state x at a time, beginning with the plan before; None where none is found."""
     X0, U0, times = _left(before, x, now, passed)
+    X0[:, POSITION] += _moved(track.gates[passed:] - before.gates[passed:])
     for bounds in (limits, *EASED):
         problem = posed(track, x, passed, share, bounds)
         problem = guessing_times(problem, torch.from_numpy(times - times[0])[None])
         found = _from_guess(problem, torch.from_numpy(X0)[None], torch.from_numpy(U0)[None])
         if float(found.violation[0]) <= ADMITTED:
-            return Plan(now + found.t[0].numpy(), found.X[0].numpy(), found.U[0].numpy(), passed, found)
+            t, X, U = now + found.t[0].numpy(), found.X[0].numpy(), found.U[0].numpy()
+            return Plan(t, X, U, passed, track.gates, bounds is not limits, found)
     return None
 
 
@@ -202,6 +207,14 @@ def _from_guess(problem: Problem, X0: Tensor, U0: Tensor, barrier: float = 1e-3)
     X, U = states_in_time(problem, X0, U0, problem.time.guess)
     solver = InteriorPoint(tolerance=1e-3, initial_barrier=barrier, max_iterations=100)
     return of_user(problem, solver.solve(in_time(problem), U, X0=X))
+
+
+def _moved(by: np.ndarray) -> np.ndarray:
+    """How far the knots (N+1, 3) of a guess move where the gates at the ends of its G legs have moved by (G, 3), m."""
+    G = len(by)
+    ends, knots = np.arange(G + 1) * STAGES, np.arange(G * STAGES + 2)
+    moves = np.concatenate((np.zeros((1, 3)), by))
+    return np.stack([np.interp(knots, ends, moves[:, j]) for j in range(3)], axis=-1)
 
 
 def _left(before: Plan, x: np.ndarray, now: float, passed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
