@@ -129,7 +129,7 @@ def table(repository: str, first: int, count: int, flights: str) -> str:
 
 
 main = Command(
-    __doc__, "drone_racing", table, "seeds {first} to the {count}th after it", INTERVALS,
+    __doc__, "drone_racing", table, "{count} seeds from {first} on", INTERVALS,
     repository=("lsy_drone_racing", "their repository, at eb891d0"), first=(0, "the first seed"),
     count=(200, "how many seeds"), flights=("drone_racing.csv", "the file of the flights"),
 )  # fmt: skip
