@@ -76,7 +76,7 @@ def commanded(tilt: np.ndarray, heading: float) -> np.ndarray:
 
 
 class Strength:
-    """How strong the thrust is beside the nominal one, 1 + an unknown share: the mass isn't told.
+    """How strong the thrust is beside the nominal one, 1 + an unknown share: the mass isn't known.
 
     Least squares of what the velocities say, with the spread that the mass is drawn with as what is known before.
     """
