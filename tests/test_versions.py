@@ -40,32 +40,3 @@ def test_other_lines_have_the_newest_versions(versions) -> None:
     for line in lines.values():
         found = versions.requirements(line, Path("/wheels/torchgco.whl"), PROJECT)
         assert found[0].startswith("torchgco[plants,maps] @ ") and not any("==" in requirement for requirement in found)
-
-
-def test_an_interpreter_is_tried_before_it_counts(versions, monkeypatch, tmp_path: Path) -> None:
-    """pyenv puts commands on PATH for versions that it then refuses to run."""
-    own = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    refused = tmp_path / "python3.99"
-    refused.write_text("#!/bin/sh\necho not found >&2\nexit 127\n")
-    refused.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
-    assert versions.find(own) == sys.executable
-    assert versions.find("3.99") is None
-    (tmp_path / "versions" / f"{own}.0" / "bin").mkdir(parents=True)
-    (tmp_path / "versions" / f"{own}.0" / "bin" / "python").symlink_to(sys.executable)
-    monkeypatch.setattr(versions.sys, "executable", str(refused))
-    assert versions.find(own) == str(tmp_path / "versions" / f"{own}.0" / "bin" / "python")
-
-
-def test_the_table_names_missing_interpreters(versions) -> None:
-    rows = [{"line": "a", "python": "3.12.1", "passed": 5, "note": ""}, {"line": "b", "python": "3.13", "note": "gone"}]
-    assert versions.table(rows, ["line", "python", "passed", "note"]).splitlines()[2:] == [
-        "| a | 3.12.1 | 5 |  |", "| b | 3.13 |  | gone |"
-    ]  # fmt: skip
-
-
-def test_an_unknown_line_is_refused(versions, capsys) -> None:
-    with pytest.raises(SystemExit) as stop:
-        versions.main(["latest"])
-    assert stop.value.code == 2 and "no line latest" in capsys.readouterr().err

@@ -190,7 +190,7 @@ main = Command(
     "of one thread",
     "CasADi",
     count=(64, "layouts"),
-    seed=(0, "of the layouts"),
+    seed=(12, "of the layouts; constants were chosen on others"),
     beside=(16, "layouts that IPOPT solves, too"),
     minutes=(30.0, "of processor time, after which no further layout is begun"),
     tracks=(10, "races with moved gates"),

@@ -1,7 +1,8 @@
 """python -m benchmarks.families.missions: how often missions reach their goal, by planner, and how long planning takes.
 
 Every case is a study of missions below outputs/missions, so that a run that was stopped resumes where it was. With
---write the tables are put into results/missions.md, with date and commit.
+--write the tables are put into results/missions.md, with date and commit; with --times those of the times alone, which
+takes a few minutes.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ def many(count: int, outputs: Path) -> str:
     return "\n\n".join([markdown(head, [row]), *lines])
 
 
-def timing(outputs: Path, alone: int, together: int) -> str:
+def timing(alone: int, together: int) -> str:
     """Markdown: what a period takes in missions that fly alone, a row per case, and seconds per mission of a batch."""
     head = (
         "missions, each alone", "n", "periods", "median, ms", "90 %", "99 %", "longest", "tracker, ms a call", "missed",
@@ -148,7 +149,7 @@ def timing(outputs: Path, alone: int, together: int) -> str:
     rows, totals = [], []
     for case in TIMED:
         _periods(CASES[case], 0)  # compiles
-        parts = [_periods(CASES[case], seed) for seed in range(alone)]
+        parts = [part for seed in range(alone) for part in _periods(CASES[case], seed)]
         totals += [float(part.sum()) / 1000.0 for part in parts if case == TIMED[0]]
         every = np.concatenate(parts)
         missed = int((every.sum(1) > PERIOD).sum())
@@ -157,22 +158,22 @@ def timing(outputs: Path, alone: int, together: int) -> str:
         rows.append(
             (case, str(alone), f"{len(every):,}", *cells, calls, f"{missed} ({100 * missed / len(every):.2f} %)")
         )
-    batch = float(fly(TIMED[0], "gco", together, outputs)["seconds"].mean())
+    batch = float(np.mean([part.sum() for part in _periods(CASES[TIMED[0]], 0, together)])) / 1000.0
     text = [
         "A period of 50 ms is missed where the planner and the tracker's five calls take longer; elapsed times.",
         f"Planner and tracker take {np.mean(totals):.2f} s for a mission of the first row alone,",
-        f"{batch:.2f} s per mission in a batch of {min(together, AT_ONCE)}.",
+        f"{batch:.2f} s per mission in a batch of {together}.",
     ]
     return "\n".join([markdown(head, rows), "", *text])
 
 
-def _periods(words: list[str], seed: int) -> np.ndarray:
-    """Milliseconds of planner and tracker in the periods of a mission that flies alone, (periods, 2)."""
+def _periods(words: list[str], seed: int, count: int = 1) -> list[np.ndarray]:
+    """Milliseconds of planner and tracker in the periods of missions that fly together, (periods, 2) of each."""
     setup = compose(["experiment=mission", *words, f"seed={seed}", "device.threads=1"])
     assert setup.mission is not None
-    log = setup.mission.fly(setup.task(setup.layouts(1)).problem, seed=seed)
-    took = torch.stack((log.planner_seconds[0], log.tracker_seconds[0]), dim=-1)[: int(log.steps()[0])]
-    return 1000.0 * took.numpy()
+    log = setup.mission.fly(setup.task(setup.layouts(count)).problem, seed=seed)
+    took = 1000.0 * torch.stack((log.planner_seconds, log.tracker_seconds), dim=-1).numpy()
+    return [part[:steps] for part, steps in zip(took, log.steps(), strict=True)]
 
 
 def _origin(done: str) -> str:
@@ -181,6 +182,17 @@ def _origin(done: str) -> str:
         f"{done} on {origin['date']} at commit {origin['commit']}, seed 0, 95 % Wilson intervals in percent; one\n"
         f"thread, {origin['processor']}, shared."
     )
+
+
+def _flown(asked: argparse.Namespace) -> str:
+    """Markdown: the outcomes of the cases and planners that are asked for."""
+    parts = []
+    for case in list(CASES)[: asked.cases]:
+        for solver in asked.planners if case in WITH_PEERS else asked.planners[:1]:
+            if solver not in SLOW or case == WITH_PEERS[0]:
+                parts.append(fly(case, solver, max(1, round(asked.share * PLANNERS[solver])), asked.outputs))
+    trials = pd.concat(parts)
+    return f"{_origin('Flown')}\n\n{short(table(trials), misses(trials))}"
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -193,6 +205,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--alone", type=int, default=20, help="missions that fly alone, for times; 0: the page keeps its times"
     )
+    parser.add_argument("--times", action="store_true", help="fly and write the times alone")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "missions")
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/missions.md")
     parser.add_argument(
@@ -205,17 +218,10 @@ def main(words: Sequence[str] | None = None) -> int:
         if asked.write:
             put(RESULTS / "maps.md", "many", text)
         return 0
-    parts = []
-    for case in list(CASES)[: asked.cases]:
-        for solver in asked.planners if case in WITH_PEERS else asked.planners[:1]:
-            if solver in SLOW and case != WITH_PEERS[0]:
-                continue
-            parts.append(fly(case, solver, max(1, round(asked.share * PLANNERS[solver])), asked.outputs))
-    trials = pd.concat(parts)
-    blocks = {"missions": f"{_origin('Flown')}\n\n{short(table(trials), misses(trials))}"}
+    blocks = {} if asked.times else {"missions": _flown(asked)}
     if asked.alone > 0:
-        together = max(1, round(asked.share * PLANNERS["gco"]))
-        blocks["times"] = f"{_origin('Measured')}\n\n{timing(asked.outputs, asked.alone, together)}"
+        together = max(1, min(AT_ONCE, round(asked.share * PLANNERS["gco"])))
+        blocks["times"] = f"{_origin('Measured')}\n\n{timing(asked.alone, together)}"
     for name, text in blocks.items():
         print(text)
         if asked.write:

@@ -35,7 +35,6 @@ STAGES = 60
 LANES, EACH = np.linspace(2.0, 8.0, 5), 5  # m, where the lanes are, and discs of each
 WALLS, FASTEST, THRUST = 2.0, 2.5, 2.0  # m, m/s, m/s^2
 END = [10.0, 0.0, 0.0, 0.0]
-ALONE = 5.25  # s: without discs, the least time
 TIMES = 2.0, 20.0  # s
 EFFORT = 0.2  # per second, of half the square of the acceleration
 NOMINAL = 6.0, 12.0  # s

@@ -49,8 +49,8 @@ def main(words: Sequence[str] | None = None) -> int:
         head = f"{source(asked, 'world')}, two processes, {machine()}, shared."
         if not asked.fresh:
             head += _peers_source(rows_of(asked.peers))
-        name = "drawn" if asked.fresh else "worlds"
-        put(RESULTS / "worlds.md", name, f"{head}\n\n{short(f'worlds-{name}', markdown(HEAD, rows))}")
+        name, file = ("drawn", "worlds-drawn") if asked.fresh else ("worlds", "worlds")
+        put(RESULTS / "worlds.md", name, f"{head}\n\n{short(file, markdown(HEAD, rows))}")
     return 0
 
 

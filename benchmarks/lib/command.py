@@ -34,7 +34,7 @@ class Command:
         text: the table in Markdown, and what follows it; called with the options by name.
         how: number of problems, seed, kind of time; the names of options in braces give their values.
         notes: further parts of the line above the table; "CasADi" gets its version.
-        mark: name of the marks there; None: that of the page.
+        mark: name of the marks there, with options as in `how`; None: that of the page.
         options: default and help of each, and `choices` as a third; a sequence takes several values.
     """
 
@@ -68,5 +68,5 @@ class Command:
         if write:
             said = {key: ", ".join(map(str, v)) if isinstance(v, (list, tuple)) else v for key, v in asked.items()}
             head = page.measured(self.how.format(**said), *self.notes)
-            page.put(RESULTS / f"{self.name}.md", self.mark, f"{head}\n\n{text}")
+            page.put(RESULTS / f"{self.name}.md", self.mark.format(**said), f"{head}\n\n{text}")
         return 0

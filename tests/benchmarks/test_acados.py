@@ -14,7 +14,6 @@ from benchmarks.lib import acados, acados_worker
 from benchmarks.lib.provenance import provenance
 from benchmarks.speed import families
 from benchmarks.speed.bench import Bench
-from benchmarks.speed.peers import AcadosPeer
 from benchmarks.speed.results import Results
 from tests.benchmarks.test_speed import TINY
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
@@ -168,24 +167,3 @@ def test_acados_agrees_with_fatrop(tmp_path: Path) -> None:
     part = problem.take(rows)
     alone = acados.fly(part, U0[rows], tmp_path)
     torch.testing.assert_close(alone.U, first.U[rows], rtol=1e-9, atol=1e-9)
-
-
-@needs_acados
-def test_acados_ends_at_its_limit(tmp_path: Path) -> None:
-    """A limit below 0 s is exceeded by any solve."""
-    problem, U0 = planar_batch(B=1, N=30, obstacles=3, seed=2)
-    program = acados.program_of(problem)
-    with pytest.raises(TimeoutError, match="longer than -1 s"):
-        acados.fly(problem, U0, tmp_path, program, limit=-1)
-    assert int(acados.fly(problem, U0, tmp_path, program, limit=60).status[0]) == 0
-
-
-@needs_acados
-def test_acados_flies_a_family(tmp_path: Path) -> None:
-    bench = Bench(TINY, None, {}, say=lambda text: None)
-    setup = bench.setup("scenario=forest")
-    task = setup.task(setup.layouts(1))
-    for name in ("acados", "acados_guided"):
-        peer = AcadosPeer.ready(bench, name, task, tmp_path)
-        peer.fly(bench)
-        assert peer.verdict is not None and peer.seconds > 0 and peer.setup > 0 and peer.iterations >= 1

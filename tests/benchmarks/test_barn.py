@@ -9,7 +9,19 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
-from benchmarks.outside.barn import BODY, VEHICLE, Drives, drive, gap, main, problems, worlds
+from benchmarks.outside.barn import (
+    BODY,
+    RECTANGLE,
+    VEHICLE,
+    Drives,
+    drive,
+    gap,
+    headings,
+    main,
+    problems,
+    rectangle_gap,
+    worlds,
+)
 from benchmarks.outside.barn_data import GOAL, RADIUS, START, cylinders, path_length
 from benchmarks.outside.barn_lidar import CELL, CORNER, RETURNS, Robot, braking, run, world_of
 from torchgco import Unicycle, judge, solve
@@ -83,16 +95,31 @@ def test_the_planned_disc_fits_through_every_world() -> None:
 def test_the_drive_is_that_of_a_fine_unicycle() -> None:
     generator = torch.Generator().manual_seed(0)
     U, x = torch.randn(20, 2, generator=generator, dtype=torch.float64), torch.tensor([-2.25, 3.0, 1.5, 0.3]).double()
-    path, fine = drive(x.numpy(), U.numpy()), Unicycle(dt=0.001)
+    path, along, fine = drive(x.numpy(), U.numpy()), headings(x.numpy(), U.numpy()), Unicycle(dt=0.001)
     for k in range(20):
         for _ in range(100):
             x = fine.step(x, U[k])
         np.testing.assert_allclose(path[100 * (k + 1)], x[:2], rtol=0, atol=1e-6)
+        assert along[100 * (k + 1)] == pytest.approx(float(x[2]), abs=1e-9)
 
 
 def test_contact_between_knots_counts() -> None:
     path = np.stack((np.zeros(1001), np.linspace(0.0, 1.0, 1001)), axis=-1)
     assert gap(path, np.array([[0.5, 0.55], [np.nan, np.nan]])) == pytest.approx(0.5 - RADIUS - BODY)
+
+
+def test_the_rectangle_is_measured_as_it_turns() -> None:
+    path, length, width = np.array([[1.0, 2.0]]), 0.229, 0.207795  # half of each, m
+    cases = {(1.0, 2.5): 0.5 - length, (1.5, 2.0): 0.5 - width, (1.3, 2.3): np.hypot(0.3 - length, 0.3 - width)}
+    for center, apart in cases.items():
+        rows = np.array([center, [np.nan, np.nan], [9.0, 9.0]])
+        assert rectangle_gap(path, np.array([np.pi / 2]), rows) == pytest.approx(apart - RADIUS)
+        other = rectangle_gap(np.repeat(path, 2, 0), np.array([np.pi / 2, 0.0]), rows)
+        assert other == pytest.approx(min(apart, 0.5 - length if 1.5 in center else apart) - RADIUS)
+    assert rectangle_gap(path, np.zeros(1), np.array([[1.1, 2.1]])) == pytest.approx(-RADIUS)  # within
+    corners = np.array([[sx * length, sy * width] for sx in (-1, 1) for sy in (-1, 1)])
+    away = np.linalg.norm(corners[:, None] - RECTANGLE.offsets.numpy(), axis=-1)
+    assert (away.min(1) <= RECTANGLE.radii.numpy().max()).all()
 
 
 def test_the_score_is_the_challenges() -> None:

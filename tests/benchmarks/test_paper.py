@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from benchmarks.lib import RESULTS
 from benchmarks.paper import __main__ as script
-from benchmarks.paper import flights, missions, quadrotor_figures, runs, tables
+from benchmarks.paper import flights, missions, runs, tables
 from torchgco.plotting import animation
 
 STAGES = 80
@@ -93,29 +93,6 @@ def test_samples_of_a_mission_belong_to_their_control_step() -> None:
         state = part.frame.loc[step, [f"x{i}" for i in range(13)]].to_numpy(dtype=float)
         assert np.allclose(call.problem.x0[0, :13].numpy(), state, rtol=0, atol=1e-12)  # a quaternion is normed again
         assert np.allclose(call.samples(2)[:, 0], np.stack([state[:3]] * 2), rtol=0, atol=1e-12)
-
-
-def test_costs_are_drawn_one_below_the_other() -> None:
-    solve = runs.quadrotor("gco_paper")
-    figure = quadrotor_figures.costs([solve, solve, solve])
-    figure.draw_without_rendering()
-    boxes = [ax.get_position() for ax in figure.axes]
-    assert len({round(box.x0, 6) for box in boxes}) == 1 and boxes[0].y0 > boxes[1].y1 > boxes[1].y0 > boxes[2].y1
-
-
-def test_another_folder_gets_a_page_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page, folder = tmp_path / "docs" / "paper.md", tmp_path / "docs" / "paper"
-    folder.mkdir(parents=True)
-    before = "![a picture](paper/figure-03.png)\n"
-    page.write_text(before)
-    monkeypatch.setattr(script, "PAGE", page)
-    monkeypatch.setattr(script, "FOLDER", folder)
-    assert script.main(["--parts", "tables", "--outputs", str(tmp_path / "out")]) == 0
-    other = (tmp_path / "out" / "paper.md").read_text()
-    assert page.read_text() == before and "](figure-03.png)" in other
-    assert script.main(["--parts", "tables", "--outputs", str(folder)]) == 0
-    assert page.read_text() == before and [path.name for path in folder.iterdir()] == [script.TABLES]
-    assert (folder / script.TABLES).read_bytes() == (tmp_path / "out" / script.TABLES).read_bytes()
 
 
 def test_the_papers_tables_have_our_values() -> None:

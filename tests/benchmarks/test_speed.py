@@ -27,9 +27,7 @@ from benchmarks.speed import (
     share,
     targets,
 )
-from benchmarks.speed.__main__ import main
 from benchmarks.speed.bench import Bench
-from benchmarks.speed.figure import figure
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
@@ -69,10 +67,6 @@ def tiny(folder: Path) -> Bench:
 
 
 SLOW = batch, cores, families, first_use, growth, learned, mppi, paper, scaling, share
-
-
-def numbers(bench: Bench, quantity: str) -> list[float]:
-    return [float(row["value"]) for row in bench.results.rows if row["quantity"] == quantity]
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # steps of sizes for tests are long
@@ -147,24 +141,6 @@ def test_the_targets_are_read_off_the_rows(tmp_path: Path) -> None:
     assert [case for case, quantity in values if quantity == "time"] == [target.case for target in targets.TARGETS]
 
 
-def test_the_aim_and_the_former_figure_stand_beside_the_measured_one(tmp_path: Path) -> None:
-    bench = tiny(tmp_path)
-    targets.run(bench)
-    row = next(target for target in targets.TARGETS if target.case.startswith("two threads"))
-    values = {row["quantity"]: row["value"] for row in bench.results.rows if row["case"].startswith("two threads")}
-    assert values == {"time": targets.NOT_MEASURED, "aim": row.aim}
-
-
-def test_the_figure_has_a_line_per_solver(tmp_path: Path) -> None:
-    bench = tiny(tmp_path)
-    for case, solver, value in (("B = 8", "gco", 20.0), ("B = 1", "gco", 30.0), ("B = 8, 2 outer", "gco", 9.0)):
-        bench.row("batch", case, solver, "per problem", value, "ms")
-    for solver, value in (("gco", 0.01), ("fatrop", 0.2)):
-        bench.row("scaling", "50 stages", solver, "seconds per problem", value, "s")
-    lines = [[line.get_xydata().tolist() for line in ax.get_lines()] for ax in figure(bench.results.rows).axes]
-    assert lines == [[[[1.0, 30.0], [8.0, 20.0]]], [[[50.0, 10.0]], [[50.0, 200.0]]], []]
-
-
 def test_a_solver_that_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:
     bench = tiny(tmp_path)
     bench.deadline = 0.0
@@ -232,10 +208,3 @@ def test_the_published_page_matches_the_published_rows(tmp_path: Path) -> None:
         (tmp_path / page).write_text((folder / page).read_text())
     rewrite(tmp_path, read_rows(folder / "results" / "speed.csv"))
     assert [(tmp_path / page).read_text() for page in pages] == [(folder / page).read_text() for page in pages]
-
-
-def test_without_a_gpu_nothing_is_measured(monkeypatch, capsys, tmp_path: Path) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr("benchmarks.speed.__main__._one_core", lambda: None)
-    assert main(["--device", "cuda", "--results", str(tmp_path / "results.csv")]) == 0
-    assert "No CUDA device" in capsys.readouterr().out and not (tmp_path / "results.csv").exists()

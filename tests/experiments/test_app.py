@@ -151,32 +151,21 @@ def test_start_inside_an_obstacle_is_a_status(run, tmp_path) -> None:
 
 
 BAD = {
-    "unknown key": (["solver.speed=3"], "speed"),
     "unknown group": (["planner=rrt"], "planner"),
     "unknown option": (["solver=rrt"], "rrt"),
-    "unknown baseline": (["study.baselines=[rrt]"], "rrt"),
     "added key": (["+solver.local.inner.speed=3"], "speed"),
     "missing path": (["scenario=layouts"], "scenario.path: expected the layout file: add scenario.path=FILE.npz"),
     "no such file": (["scenario=layouts", "scenario.path=nowhere.npz"], "scenario.path: expected a layout file"),
     "model misfit": (["model=planar"], "with 14 states, or scenario=planar_random or planar_trap, got model=planar"),
     "model misfit in a file": (["scenario=layouts", WALLS, "model=planar"], "model=quadrotor"),
     "too many layouts": (["scenario=layouts", WALLS, "study.layouts=40"], "study.layouts"),
-    "no layouts": (["study.layouts=0"], "study.layouts: expected a whole number of at least 1"),
-    "no stages": (["scenario.stages=0"], "stages"),
     "negative radius": (["scenario.obstacle_radius=-1"], "obstacle_radius"),
     "weights": (["model.vehicle.control_weight=[1,1,1,-1]"], "cost.R"),
     "crossed bounds": (["model.vehicle.control_lower=[9,9,9,9]"], "control_bounds.lower"),
     "model dimension": (["model.dimension=2"], "model.dimension: expected 3, as its dynamics say, got 2"),
     "solver option": (["solver.local.inner.tolerance=-1"], "ilqr.tolerance"),
-    "batch size": (["study.batch_size=0"], "study.batch_size"),
     "kernels": (["device.kernels=compiled"], "device.kernels: expected native or eager"),
-    "shard size": (["study.shard_size=0"], "study.shard_size"),
-    "threads": (["device.threads=0"], "device.threads"),
-    "workers": (["study.workers=0"], "study.workers"),
     "dtype": (["device.dtype=float16"], "device.dtype"),
-    "seed": (["seed=-1"], "seed"),
-    "baselines": (["study.baselines=al_ilqr"], "study.baselines"),
-    "a word that is no override": (["forest"], "forest"),
 }  # fmt: skip
 
 
@@ -186,17 +175,6 @@ def test_mistakes_get_one_clear_line(case: str, run) -> None:
     code, out, err = run("study.layouts=2", "scenario.stages=4", *words) if "layouts" not in words[0] else run(*words)
     assert code == 2 and message in problem_line(err), err
     assert "Traceback" not in err + out
-
-
-def test_a_broken_layout_file_is_named(run, tmp_path) -> None:
-    for name, centers, radii, field in (
-        ("shapes", np.zeros((2, 3, 2)), np.zeros((2, 4)), "layouts.radii"),
-        ("nan", np.full((1, 1, 2), np.nan), np.ones((1, 1)), "layouts.radii"),
-        ("negative", np.zeros((1, 1, 2)), -np.ones((1, 1)), "layouts.radii"),
-    ):
-        np.savez(tmp_path / f"{name}.npz", centers=centers, radii=radii)
-        code, _, err = run("scenario=layouts", f"scenario.path={name}.npz", "model=planar")
-        assert code == 2 and field in problem_line(err)
 
 
 def test_version_and_help(run) -> None:
@@ -209,16 +187,6 @@ def test_version_and_help(run) -> None:
         (listed,) = re.findall(rf"^  {group} +((?:.*\n {{18}})*.*)", out, re.MULTILINE)
         assert set(re.findall(r"\w+", listed)) == set(options_of(group))
     assert "forest*," in out and "walls*," in run("--help", "scenario=walls")[1]
-
-
-@pytest.mark.slow
-def test_every_key_that_help_names_exists(run) -> None:
-    _, out, _ = run("--help")
-    words = re.findall(r"^  +([a-z_.]+=\S+)", out.split("Common keys")[1], re.MULTILINE)
-    assert len(words) > 12
-    for word in words:
-        mission = [] if word.startswith("experiment=") else ["experiment=mission"]
-        compose([*mission, word, *(["plant=null"] if word == "mission=null" else [])])
 
 
 @pytest.mark.slow

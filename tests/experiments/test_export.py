@@ -108,6 +108,32 @@ def test_a_bag_of_a_vehicle_in_the_plane(tmp_path) -> None:
         bags.write_bag(tmp_path / "none", columns, [], "mcap")
 
 
+def test_velocities_in_the_vehicles_axes_are_not_the_worlds(tmp_path) -> None:
+    """A model may have states named vx and vy: where the position's rates are there, too, they count."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    columns = {name: np.full(3, value) for name, value in (
+        ("x [m]", 0.0), ("y [m]", 0.0), ("heading [rad]", 0.5 * np.pi), ("vx [m/s]", 2.0), ("vy [m/s]", 0.0),
+        ("dx/dt [m/s]", 0.0), ("dy/dt [m/s]", 2.0))} | {"t [s]": np.arange(3.0)}  # fmt: skip
+    bags.write_bag(tmp_path / "bag", columns, ["x [m]", "y [m]"], "mcap")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with import_module("rosbags.rosbag2").Reader(tmp_path / "bag") as bag:
+        read = [store.deserialize_cdr(raw, c.msgtype) for c, _, raw in bag.messages() if c.topic == "/odometry"]
+    twist = read[1].twist.twist
+    np.testing.assert_allclose([twist.linear.x, twist.linear.y], [2.0, 0.0], atol=1e-12)
+
+
+def test_attitudes_between_samples_turn_the_short_way() -> None:
+    """Whatever signs a simulator gives its quaternions, of which q and -q are the same attitude."""
+    t, half = np.arange(5) / 10, 0.1 * np.arange(5)
+    x = np.zeros((5, 17))
+    x[:, 6], x[:, 9] = np.cos(half), np.sin(half)
+    x[2:4, 6:10] *= -1.0
+    log = pd.DataFrame({"t": t} | {f"x{i}": x[:, i] for i in range(17)} | {f"u{i}": 0.0 * t for i in range(1, 5)})
+    found = export._flown(log, 20.0)
+    turned = 2 * np.arctan2(found["qz"], found["qw"])
+    np.testing.assert_allclose(np.sin(turned), np.sin(2.0 * found["t [s]"]), atol=1e-3)
+
+
 def test_a_mistake_gets_one_line(run, tmp_path, capsys) -> None:
     code, _, err = run("scenario=yard", *HOLD, "study.figures=false", "hydra.run.dir=study")
     assert code == 0, err

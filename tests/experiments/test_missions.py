@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from torch import Tensor
 from tqdm import tqdm
 
 from tests.experiments.commands import problem_line
@@ -18,6 +20,7 @@ from torchgco.experiments.flying import progress, study
 from torchgco.experiments.reports import report
 from torchgco.experiments.reports.verify import verify
 from torchgco.experiments.statistics.mission_tables import mission_lines
+from torchgco.missions import RotorPlant
 from torchgco.plotting import missions as draw
 
 SHORT = ["mission.duration=0.2", "scenario.num_obstacles=3", "study.workers=1", "hydra.run.dir=out"]
@@ -169,6 +172,32 @@ def test_missions_fly_through_woods_and_mazes(run, tmp_path, experiment: str, wo
 def test_a_plant_needs_a_mission(run) -> None:
     code, _, err = run("plant=rotors", "hydra.run.dir=out")
     assert code == 2 and "experiment=mission" in problem_line(err)
+
+
+@dataclass(frozen=True)
+class OfFile(RotorPlant):
+    """A plant whose mass lies in a file."""
+
+    model: str = ""
+
+    def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
+        return RotorPlant(self.airframe, self.dt, float(Path(self.model).read_text())).advance(x, u, force)
+
+
+def test_what_a_plants_file_says_belongs_to_the_study(run, tmp_path) -> None:
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "mine.yaml").write_text(f"_target_: {__name__}.OfFile\nmodel: mass.txt\n")
+    words = ["--config-dir", str(tmp_path), "experiment=mission_study", "plant=mine", "study.layouts=1"]
+    words += ["mission.duration=0.05", "study.baselines=[]", "study.figures=false", *SHORT[1:]]
+    (tmp_path / "mass.txt").write_text("0.1")
+    assert run(*words)[0] == 0
+    assert "nothing was flown again" in run(*words)[1]
+    (tmp_path / "mass.txt").write_text("0.2")
+    code, _, err = run(*words)
+    assert code == 2 and "files.mass.txt is" in problem_line(err)
+    (tmp_path / "mass.txt").unlink()  # what was flown is confirmed without it
+    verified, unfinished = verify([tmp_path / "out"], trust=True)
+    assert not unfinished and not any(one.differs for one in verified)
 
 
 @pytest.mark.slow

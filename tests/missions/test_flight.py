@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.missions.missions import DT, SOLVER, far, mission, varied
-from torchgco import InputError, Problem
-from torchgco.missions import Disturbance, Flight, Outcome, endings
+from tests.missions.missions import DOUBLE, DT, REST, SOLVER, far, mission, varied
+from torchgco import FunctionCost, InputError, Problem
+from torchgco.kernels.in_c import NativeKernels
+from torchgco.missions import Disturbance, Flight, Outcome, endings, pilot, planner
 from torchgco.missions.planner import Plan
-from torchgco.missions.planning_problem import planning_state
+from torchgco.missions.planning_problem import continued, planning_state, settled
 
 
 @pytest.mark.parametrize("latency", [0, 1])
@@ -99,6 +100,38 @@ def test_another_pilot() -> None:
     assert [end.outcome for end in found] == [Outcome.TIMEOUT, Outcome.REACHED]
     assert flight.log.planner_seconds[0].tolist() == [0.125, 0.25, 0.25, 0.25]  # shared by those that fly
     assert flight.log.search_seconds[0].tolist() == [0.125] * 4
+
+
+def test_what_is_kept_from_call_to_call_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracker's packed problems, and plans whose code is looked at once; also where others end earlier."""
+    problem = varied(3)
+    x0 = problem.x0.clone()
+    x0[0, 0] = -0.2
+    problem = replace(problem, x0=x0)
+    flown = mission(SOLVER, 0.4, disturbance=Disturbance(wind=0.3, position_noise=0.01), goal_radius=1.99)
+    kept = flown.fly(problem, seed=4)
+    monkeypatch.setattr(NativeKernels, "kept_descent", lambda *arguments: None)
+    for module in (pilot, planner):
+        monkeypatch.setattr(module, "settled", lambda problem: problem)
+    anew = flown.fly(problem, seed=4)
+    assert len({*kept.steps().tolist()}) > 1 and kept.steps().max() > 2
+    for name in ("x", "commands", "tracking_violation", "plan", "cost", "violation", "iterations"):
+        assert torch.equal(getattr(kept, name).nan_to_num(9e9), getattr(anew, name).nan_to_num(9e9)), name
+
+
+def test_the_code_of_users_is_looked_at_in_every_plan() -> None:
+    """It may read what changes while a vehicle flies."""
+    problem = far()
+    weight = torch.tensor(1.0, **DOUBLE)
+    end = torch.tensor(REST, **DOUBLE)
+    user = FunctionCost(
+        lambda x, u: weight * (x - end).square().sum(-1) + u.square().sum(-1), lambda x: (x - end).square().sum(-1)
+    )
+    own, users = settled(problem), settled(replace(problem, cost=user))
+    assert own.known.current and not users.known.current
+    x0 = problem.x0 + 0.1
+    assert continued(own, x0).known is own.known and continued(users, x0).known is not users.known
+    assert torch.equal(continued(own, x0).x0, x0) and torch.equal(continued(users, x0).x0, x0)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from tests.missions.test_plants import random_states
 from torchgco import Airframe, InputError
 from torchgco.missions import RotorPlant
 from torchgco.missions.simulators.crazyflow import CrazyflowPlant
-from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, mjcf
+from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, files_named, mjcf
 from torchgco.missions.simulators.mujoco import MujocoPlant
 from torchgco.missions.simulators.rotorpy import RotorpyPlant, parameters_of
 
@@ -48,6 +48,19 @@ def needs(make: type) -> None:
 
 def numbers(element: ElementTree.Element, key: str) -> list[float]:
     return [float(word) for word in element.attrib[key].split()]
+
+
+def test_files_that_a_model_names_are_found_in_turn(tmp_path) -> None:
+    for name, text in {
+        "scene.xml": '<mujoco><include file="quad.xml"/><include file="none.xml"/></mujoco>',
+        "quad.xml": '<mujoco><compiler meshdir="assets"/><asset><mesh file="body.stl"/></asset></mujoco>',
+        "assets/body.stl": "solid",
+        "other.xml": "<mujoco/>",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found = files_named(tmp_path / "scene.xml")
+    assert sorted(found) == [tmp_path / "assets" / "body.stl", tmp_path / "quad.xml"]
 
 
 def test_the_model_that_is_written_has_the_airframes_mass_inertia_and_rotors() -> None:

@@ -10,9 +10,8 @@ from torch import Tensor
 
 import torchgco
 from tests.engines import engine_of
-from tests.native import changes_of_code
-from tests.native.changes import INPUTS, D, Drag, number
-from tests.native.changes_of_code import CODE
+from tests.native import changes
+from tests.native.changes import CODE, INPUTS, D, Drag, number
 from torchgco import FunctionDynamics, Problem, QuadraticCost
 from torchgco.dynamics.rollout import open_loop as by_pytorch
 from torchgco.kernels import choice, current
@@ -28,10 +27,10 @@ COST = QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4)
 
 @pytest.fixture(autouse=True)
 def usual() -> Any:
-    before, names = torch.get_default_dtype(), dict(vars(changes_of_code))
+    before, names = torch.get_default_dtype(), dict(vars(changes))
     yield
     torch.set_default_dtype(before)
-    vars(changes_of_code).update({name: names[name] for name in ("GAIN", "helper")})
+    vars(changes).update({name: names[name] for name in ("GAIN", "helper")})
 
 
 def after(problem: Problem) -> tuple[Tensor, bool]:
@@ -102,7 +101,7 @@ def test_training_calls_no_compiler_and_keeps_nothing(solver: str, monkeypatch: 
     assert (len(compiler._loaded), len(choice._engines)) == kept
 
 
-@pytest.mark.parametrize("name", ["tensor_in_place", "weight", "array_in_place", "cell", "attribute", "training_flag"])
+@pytest.mark.parametrize("name", ["tensor in place", "weight", "array in place", "cell", "attribute", "training flag"])
 def test_what_stays_isnt_traced_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = made((INPUTS | CODE)[name]()[0])
     after(problem)

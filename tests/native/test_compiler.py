@@ -375,14 +375,19 @@ def test_lanes_are_those_that_a_processor_computes_at_once(monkeypatch, describe
 
 
 WIDTH = """
-import hashlib, torch
+import dataclasses, hashlib, torch
 from tests.problems import planar_batch
 from torchgco import presets
 from torchgco.native.codegen.source import LANES
 torch.set_num_threads(1)
 problem, U0 = planar_batch(5)
-solution = presets.gco(problem).solve(problem, U0)
-print(LANES, hashlib.sha256(solution.U.numpy().tobytes()).hexdigest(), solution.status.tolist())
+sampled = dataclasses.replace(presets.mppi(problem), iterations=3)
+halved = dataclasses.replace(sampled, sampler=dataclasses.replace(sampled.sampler, dtype="float32"))
+said = [LANES]
+for solver in (presets.gco(problem), sampled, halved):
+    solution = solver.solve(problem, U0, seed=3)
+    said += [hashlib.sha256(solution.U.numpy().tobytes()).hexdigest(), solution.status.tolist()]
+print(*said)
 """
 
 

@@ -15,7 +15,7 @@ from torchgco import MPPI, ControlBounds, Field, Goal, Planar, Problem, Quadrati
 from torchgco.base.draws import DrawKey
 from torchgco.eager import sampling
 from torchgco.guidance import mppi
-from torchgco.kernels import measured
+from torchgco.kernels import measured, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.maps import DistanceField, OccupancyGrid
@@ -37,6 +37,21 @@ def mapped_batch(d: int, interpolation: str, B: int = 5, N: int = 30) -> Problem
     radii = torch.linspace(0.0, 0.3, B, dtype=torch.float64)
     parts = [*plain.constraints, Field(field, radii, interpolation)]
     return Problem(plain.dynamics, plain.cost, parts, plain.x0, N)
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_copies_of_one_problem_are_measured_as_it_is(mapped: bool) -> None:
+    """They share its packed form, but for which map is each one's."""
+    whole = mapped_batch(2, "linear", B=4) if mapped else planar_batch(4, 30, 3)[0]
+    one = whole.take([2])
+    X, U = random_trajectory(whole, spread=0.8)
+    copies = one.take([0, 0, 0, 0])
+    assert copies.one is one and copies.take([1, 2]).one is one and whole.take([0, 0]).one is None
+    found = measured(copies, X, U)
+    assert torch.equal(found, torch.cat([measured(one, X[b : b + 1], U[b : b + 1]) for b in range(4)]))
+    assert bool(found.any()) or not mapped
+    lagrangian = Lagrangian(copies, Multipliers.zero(copies, 3.0), None, True)
+    torch.testing.assert_close(value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("interpolation", ["smooth", "linear"])

@@ -204,16 +204,31 @@ def test_other_forms_keep_the_rows() -> None:
 def test_the_search_sees_the_ball_that_the_body_holds() -> None:
     """Paths are sought for it, which the body's length doesn't bar; no obstacle that the body reaches is left out."""
     body = Body([[-2.0, 0.0], [0.0, 0.0], [2.0, 0.0]], 0.5)
-    far = [[0.0, 0.0], [3.0, 2.1], [3.0, 30.0]]
+    far = [[0.0, 0.0], [3.0, 5.0], [3.0, 30.0]]  # m: a ball alone meets the first on the way, the body two
     x0, cost = torch.zeros(1, 4, dtype=D), QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4, x_ref=[6.0, 0, 0, 0])
     problem = Problem(Unicycle(), cost, [Spheres(far, [0.1] * 3, body)], x0, 5, Goal([6.0, 0.0], 0.5))
     assert body.inscribed_radius == 0.5 and body.reach == 2.5
     scene = scene_of(problem, torch.zeros(1, 5, 2, dtype=D))
     assert scene is not None and scene.obstacles.spheres.radii.tolist() == [[0.6] * 3]
-    assert Nearby.of(Call.checked(problem, torch.zeros(1, 5, 2, dtype=D))) is None
+    near = Nearby.of(Call.checked(problem, torch.zeros(1, 5, 2, dtype=D)))
+    assert near is not None and near.call.problem.obstacles[0].absent.tolist() == [[False] * 6]
+    assert near.places[0].tolist() == [[0, 1, 3, 4, 6, 7]]  # type: ignore[union-attr]
     assert not bool(problem.start_is_clear)
     assert row_told(problem.constraints[0], 4, problem.dynamics).startswith("ball 1, obstacle 1")
     assert "Body(3 balls among Spheres(3 each of 1 problems))" in repr(problem)
+
+
+@pytest.mark.parametrize(("d", "kind"), [(2, "spheres"), (2, "capsules"), (3, "boxes")])
+@pytest.mark.parametrize("spread", [0.02, 0.4])
+def test_only_what_may_be_nearest_is_measured_between_knots(d: int, kind: str, spread: float, monkeypatch) -> None:
+    """Of obstacles here and there along the way some are left out, and the clearance keeps its bits."""
+    problem, _, _ = problem_of(d, kinds(d)[kind])
+    X, _ = random_trajectory(problem, 3, spread)
+    (part,) = problem.constraints
+    found, near = part.chord_clearance(X), part._nearest(X, 0.05)
+    assert near is not None and (spread > 0.1 or near.shape[1] < 4)
+    monkeypatch.setattr(BoundBody, "_nearest", lambda self, X, share: None)
+    assert torch.equal(found, part.chord_clearance(X))
 
 
 def test_balls_cover_a_box() -> None:

@@ -1,8 +1,6 @@
-"""Boxes against a brute_force, simple NumPy version and against autodiff, and the checks of their input."""
+"""Boxes: their rows by hand, where their slopes lead, and the checks of their input."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +8,6 @@ import torch
 from torch import Tensor
 
 from tests.problems import boxed_batch, planar_batch, random_trajectory
-from tests.reference import boxes as brute_force
-from tests.slow import mostly
 from torchgco import Boxes, InputError, Problem, Spheres
 from torchgco.obstacles.base import ABSENT, Solids, marked
 from torchgco.obstacles.box_geometry import Cuboids
@@ -30,64 +26,6 @@ def turned(d: int, M: int = 6, seed: int = 0) -> tuple[np.ndarray, np.ndarray, n
     turns = rng.normal(size=(M, 4))
     rotations = turns[:, 0] if d == 2 else turns / np.linalg.norm(turns, axis=-1, keepdims=True)
     return rng.uniform(-1, 1, (M, d)), rng.uniform(0.1, 0.6, (M, d)), rotations
-
-
-def bound(d: int, radius: float = 0.1, seed: int = 0) -> tuple[BoundBoxes, tuple[np.ndarray, ...]]:
-    """The boxes of one problem, and their centres, half sizes and rotations."""
-    parts = turned(d, seed=seed)
-    plain, _ = boxed_batch(d, B=1, N=3)
-    centers, half, rotations = parts
-    problem = Problem(plain.dynamics, plain.cost, [Boxes(centers, half, radius, rotations)], plain.x0, 3)
-    return boxes_of(problem), parts
-
-
-def points(d: int, count: int, seed: int = 1) -> Tensor:
-    return torch.as_tensor(np.random.default_rng(seed).uniform(-2, 2, (1, count, d)))
-
-
-def one_by_one(boxes: BoundBoxes, a: Tensor, b: Tensor) -> Tensor:
-    """Distances (E, M) of segments a to b (1, E, d), each as if there were no other box and no other segment."""
-    segments, columns = range(a.shape[1]), []
-    for i in range(boxes.absent.shape[1]):
-        others = torch.arange(boxes.absent.shape[1]) != i
-        box = replace(boxes, absent=boxes.absent | others)
-        columns.append([float(box.segment_clearance(a[:, e : e + 1], b[:, e : e + 1])[0, 0, i]) for e in segments])
-    return torch.tensor(columns, dtype=a.dtype).T
-
-
-def check_bounds(boxes: BoundBoxes, found: Tensor, alone: Tensor) -> None:
-    """Of all together, distances within a margin of the smallest are exact, the others at most as large."""
-    near = alone <= alone.min() + boxes.margins.amax()
-    torch.testing.assert_close(found[near], alone[near], rtol=0, atol=1e-12)
-    assert bool((found <= alone + 1e-12).all()) and bool((found[~near] > alone.min()).all()) and bool(near.any())
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_distances_by_hand(d: int) -> None:
-    boxes, (centers, half, rotations) = bound(d)
-    p = torch.cat((points(d, 60), torch.as_tensor(centers)[None] + 0.01), dim=1)  # the last six lie inside
-    found = boxes.signed_distance(p, torch.zeros(p.shape[1], dtype=p.dtype))
-    for k in range(p.shape[1]):
-        for i in range(len(centers)):
-            expected = brute_force.distance(p[0, k].numpy(), centers[i], half[i], rotations[i]) - 0.1
-            assert float(found[0, k, i]) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize("d", mostly([2, 3], 3))
-def test_segments_by_hand(d: int) -> None:
-    boxes, (centers, half, rotations) = bound(d)
-    a, b = points(d, 25, seed=2), points(d, 25, seed=3)
-    b[:, :5] = a[:, :5]  # segments of no length
-    b[:, 5:10, 1:] = a[:, 5:10, 1:]  # along the first axis
-    found, alone = boxes.segment_clearance(a, b), one_by_one(boxes, a, b)
-    squares = boxes.inflated().squares_from_segments(a, b)
-    for e in range(25):
-        for i in range(len(centers)):
-            ends = a[0, e].numpy(), b[0, e].numpy()
-            sampled = brute_force.segment_distance(*ends, centers[i], half[i], rotations[i], samples=801)
-            assert sampled - 3e-3 <= float(alone[e, i]) + 0.1 <= sampled + 1e-12
-            assert float(squares[0, e, i]) ** 0.5 == pytest.approx(max(float(alone[e, i]) + 0.1, 0.0), abs=1e-7)
-    check_bounds(boxes, found[0], alone)
 
 
 def test_parts_of_a_batch_have_the_bits_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,7 +47,7 @@ def test_parts_of_a_batch_have_the_bits_of_the_whole(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_rows_and_their_expansion(d: int) -> None:
+def test_rows_and_violations(d: int) -> None:
     problem, U = boxed_batch(d, B=3, N=12)
     X, _ = random_trajectory(problem, spread=0.3 * (4.0 if d == 3 else 1.0))
     boxes = boxes_of(problem)
@@ -122,18 +60,6 @@ def test_rows_and_their_expansion(d: int) -> None:
     torch.testing.assert_close(boxes.violation(X, U), depth)
     for k in (1, 5):
         torch.testing.assert_close(boxes.at(X[:, k : k + 1], k), value[:, k - 1 : k])
-    generator = torch.Generator().manual_seed(4)
-    g, h = (torch.rand(value.shape, generator=generator, dtype=torch.float64) for _ in range(2))
-    s = problem.n + 1 + problem.m
-    H = torch.zeros(3, 13, s, s, dtype=torch.float64)
-    boxes.accumulate(X, U, g, h, H)
-    for b in range(3):
-        one = boxes.take(torch.tensor([b]))
-        slopes = torch.autograd.functional.jacobian(lambda x, one=one: one.value(x, U[:1])[0], X[b : b + 1])
-        for k in range(1, 13):
-            J = slopes[k - 1, :, 0, k]  # (M, n)
-            torch.testing.assert_close(H[b, k, : problem.n, problem.n], J.T @ g[b, k - 1])
-            torch.testing.assert_close(H[b, k, : problem.n, : problem.n], J.T @ torch.diag(h[b, k - 1]) @ J)
 
 
 def test_every_point_inside_has_a_gradient_that_leads_out() -> None:
@@ -179,15 +105,6 @@ def test_of_an_absent_obstacle_only_the_mark_is_left() -> None:
         numbers = [value[0, 0] for name, value in vars(solids).items() if name not in ("absent", "axes")]
         assert not any(bool(value.any()) for value in numbers) and solids.sizes[0, 0] == 0
         assert marked(solids.radii, solids.absent).tolist() == [[ABSENT, float(solids.radii[0, 1])]]
-
-
-def test_no_boxes_at_all() -> None:
-    plain, U = planar_batch(B=2, N=4)
-    problem = Problem(plain.dynamics, plain.cost, [Boxes([], [], 0.1)], plain.x0, 4)
-    X, _ = random_trajectory(problem)
-    boxes = boxes_of(problem)
-    assert boxes.value(X, U).shape == (2, 4, 0) and bool(problem.start_is_clear.all())
-    assert boxes.chord_clearance(X).tolist() == [torch.inf] * 2
 
 
 def test_the_region_of_a_start_a_goal_and_boxes() -> None:

@@ -1,17 +1,14 @@
 """Pictures of what a vehicle knows."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from torchgco.base.errors import InputError
 from torchgco.missions.log import MissionLog, SeenLog
 from torchgco.plotting.bodies import Ball
 from torchgco.plotting.course import Course
-from torchgco.plotting.seen import seen_animation, seen_figure
+from torchgco.plotting.seen import seen_figure
 
 COURSE = Course((Ball(np.array([2.0, 0.0, 0.0]), 0.5, np.zeros(3)),), np.array([4.0, 0.0, 0.0]), 0.5, 0.2)
 
@@ -41,12 +38,6 @@ def test_a_figure_shows_the_map_of_its_step() -> None:
         assert shown[4, 3 * step] == 2
         lines = [line.get_xydata() for line in ax.get_lines()]
         assert any(np.allclose(np.asarray(line)[-1], [0.2 * step + 1, 0.3]) for line in lines)
-
-
-def test_an_animation_is_a_gif_of_the_steps(tmp_path: Path) -> None:
-    path = seen_animation(flown(), 0, COURSE, tmp_path / "seen.gif", frames=4)
-    with Image.open(path) as gif:
-        assert gif.n_frames == 4  # type: ignore[attr-defined]
 
 
 def test_what_was_not_flown_or_seen_is_refused() -> None:

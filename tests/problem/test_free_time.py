@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import CubicSpline
 
+from tests.engines import compiled, engine_of
 from torchgco import (
     Body,
     Boxes,
@@ -24,6 +26,7 @@ from torchgco import (
     StateBounds,
     Unicycle,
 )
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.problem.in_time import at_times, factors_in, in_time, states_in_time, times_of
 
 D = torch.float64
@@ -170,8 +173,15 @@ UNSERVED = [
     ({"dynamics": FunctionDynamics(lambda x, u, k: x, 4, 2, 0.1)}, "dynamics: expected the same model at all stages"),
     ({"cost": FunctionCost(lambda x, u, k: k * u.sum(-1))}, "cost: expected the same cost at all stages"),
     (
-        {"cost": QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4, x_ref=torch.arange(36, dtype=D).view(1, 9, 4))},
+        {"cost": QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4, u_ref=torch.arange(16, dtype=D).view(8, 2))},
         "cost: expected the same cost at all stages",
+    ),
+    (
+        {
+            "cost": QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4, torch.eye(9, 4, dtype=D)),
+            "time": FreeTime(segments=2),
+        },
+        "time.segments: expected None where x_ref follows the time, got 2 segments",
     ),
 ]
 
@@ -256,3 +266,51 @@ def test_what_moves_otherwise_is_refused_in_a_free_time() -> None:
             among_moving(constraints=[part])
     with pytest.raises(InputError, match=r"time.segments: expected None among obstacles that move, got 2 segments"):
         among_moving(time=FreeTime(segments=2))
+
+
+def following() -> Problem:
+    """Two references of four states, of which the second rests until its last row."""
+    rows = torch.rand(2, N + 1, 4, generator=torch.Generator().manual_seed(4), dtype=D)
+    rows[1, :-1] = rows[1, 0]
+    cost = QuadraticCost([1.0, 2.0, 0.5, 0.1], [0.3, 0.2], [[2.0, 1, 0, 0], [1, 2, 0, 0], [0] * 4, [0] * 4], rows)
+    return plain(cost=cost, x0=torch.zeros(2, 4, dtype=D), time=FreeTime(weight=0.7))
+
+
+@pytest.mark.parametrize("factors", [(0.6, 0.6), (1.0, 1.0), (2.3, 1.7)])
+def test_references_follow_the_time(factors: tuple[float, float]) -> None:
+    """They are SciPy's natural spline through the rows, straight beyond; one that rests keeps its last row."""
+    user, draws = following(), torch.Generator().manual_seed(5)
+    X, U = (torch.rand(2, N + more, size, generator=draws, dtype=D) for more, size in ((1, 4), (0, 2)))
+    whole, lifted, V = at_times(user, X, U, times_of(user, torch.tensor(factors, dtype=D).unsqueeze(-1)))
+    rows, expected = torch.cat((user.cost.cost.x_ref, user.cost.cost.xf_ref.unsqueeze(1)), dim=1).numpy(), []
+    for b, tau in enumerate(factors):
+        spline, s = CubicSpline(np.arange(N + 1), rows[b], bc_type="natural"), tau * np.arange(N + 1)
+        r = spline(np.minimum(s, N)) + np.maximum(s - N, 0.0)[:, None] * spline(N, 1)
+        r = np.vstack([rows[1, [0] * N], rows[1, -1:]]) if b == 1 else r
+        e, u = X[b].numpy() - r, U[b].numpy()
+        stages = 0.5 * (e[:-1] ** 2 @ [1.0, 2.0, 0.5, 0.1] + u**2 @ [0.3, 0.2]) + 0.7 * DT
+        expected.append(tau * stages.sum() + e[-1, 0] ** 2 + e[-1, 1] ** 2 + e[-1, 0] * e[-1, 1])
+    torch.testing.assert_close(whole.cost.total(lifted, V), torch.tensor(expected, dtype=D), rtol=1e-12, atol=0)
+    one = user.take([1])
+    assert float(in_time(one).cost.total(lifted[1:], V[1:])) == pytest.approx(expected[1], rel=1e-12)
+
+
+@compiled
+def test_native_derivatives_of_references_are_autodiffs() -> None:
+    user, draws = following(), torch.Generator().manual_seed(6)
+    whole = in_time(user)
+    X, U = (torch.rand(2, N + more, size, generator=draws, dtype=D) for more, size in ((1, 5), (0, 2)))
+    X[..., 4] = 0.4 + 1.4 * X[..., 4]
+    X[0, 3, 4], X[0, 4, 4], X[1, 2, 4] = 1.0, 2.5, -0.5  # at a row, beyond the last, before the first
+    engine = engine_of(whole)
+    assert engine is not None
+    lagrangian = Lagrangian(whole, Multipliers.zero(whole, 0.0), None, True)
+    slopes, H = engine.expand(whole, X, U, lagrangian)
+    total = lambda x, u: whole.cost.total(x, u).sum()
+    dX, dU = torch.func.grad(total, (0, 1))(X, U)
+    torch.testing.assert_close(slopes[..., :5], dX, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(slopes[:, :-1, 5:], dU, rtol=1e-12, atol=1e-12)
+    second = torch.func.hessian(total)(X, U)
+    for b in range(2):
+        for k in range(N + 1):
+            torch.testing.assert_close(H[b, k, :5, :5].triu(), second[b, k, :, b, k].triu(), rtol=1e-10, atol=1e-10)

@@ -28,8 +28,10 @@ from torchgco import (
     RateBounds,
     Spheres,
     StateBounds,
+    Status,
 )
 from torchgco.api import solve
+from torchgco.base.errors import StartWarning
 
 nan, inf = float("nan"), float("inf")
 
@@ -216,3 +218,22 @@ def test_shapes_that_parts_state_are_those_of_their_rows() -> None:
     X, U = torch.zeros(2, 6, 4), torch.zeros(2, 5, 2)
     for part, shape in zip(problem.constraints, problem.row_shapes, strict=True):
         assert part.row_shape(problem.N) == shape == tuple(part.value(X, U).shape[1:])
+
+
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
+def test_a_start_counts_where_obstacles_hold_from_the_first_knots() -> None:
+    """A vehicle may leave an obstacle that holds later, and a free start is a guess."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.2, "euler", position=slice(0, 2))
+    cost = QuadraticCost([1, 1, 0.1, 0.1], [0.1, 0.2], [30, 30, 2, 2], [1.5, 0.8, 0, 0])
+
+    def near(knots: slice | None, free: list[bool] | None = None) -> Problem:
+        spheres = Spheres([[0.1, 0.0]], 0.2, 0.05, knots=knots)
+        return Problem(model, cost, [ControlBounds(-4.0, 4.0), spheres], [[0.0] * 4], 10, free_start=free)
+
+    for knots in (None, slice(0, 11), slice(1, 3)):
+        assert solve(near(knots), verbose=False).statuses == [Status.INVALID_START]
+    for problem in (near(slice(5, 11)), near(None, [True, True, False, False])):
+        found = solve(problem, solver="interior_point", verbose=False)
+        assert found.statuses == [Status.CONVERGED] and float(found.violation) <= 1e-6
+    with pytest.warns(StartWarning):
+        assert solve(near(None, [False, False, True, True]), solver="al_ilqr").statuses == [Status.INVALID_START]

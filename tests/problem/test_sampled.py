@@ -137,6 +137,26 @@ def test_a_quadrotors_thrust_and_acceleration() -> None:
     assert "vx [m/s]" in found and list(found.columns).count("vz [m/s]") == 1
 
 
+@pytest.mark.parametrize("units", [("m", "m", "rad", "m/s", "m/s"), ()])
+def test_velocities_in_the_vehicles_axes_are_not_those_of_its_position(units: tuple[str, ...]) -> None:
+    """States named vx and vy: the position's own rates have other names."""
+
+    def slips(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        cosine, sine, ahead, left = x[..., 2].cos(), x[..., 2].sin(), x[..., 3], x[..., 4]
+        rates = ahead * cosine - left * sine, ahead * sine + left * cosine, u[..., 1], u[..., 0], 0.0 * left
+        return torch.stack(rates, -1)
+
+    names = ("x", "y", "heading", "vx", "vy") if units else ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]")
+    model = FunctionDynamics(
+        slips, 5, 2, DT, "rk4", position=slice(0, 2), state_names=names, state_units=units or ("",) * 5
+    )
+    problem = Problem(model, QuadraticCost([0] * 5, [1] * 2, [0] * 5), [], [[0.0, 0.0, 1.0, 2.0, 0.5]], 4)
+    found = torchgco.solve(problem, solver="hold").trajectories()
+    ahead, left = 2 * np.cos(1.0) - 0.5 * np.sin(1.0), 2 * np.sin(1.0) + 0.5 * np.cos(1.0)
+    assert found["vx [m/s]"][0] == 2.0 and "ax [m/s^2]" in found
+    np.testing.assert_allclose(found[["dx/dt [m/s]", "dy/dt [m/s]"]].iloc[0].astype(float), [ahead, left])
+
+
 @pytest.mark.parametrize("kind", [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle])
 def test_the_librarys_models_have_names(kind: type[Any]) -> None:
     model = kind()

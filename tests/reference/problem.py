@@ -182,12 +182,3 @@ def constraint_rows(problem, k, x, u):
     rows = sphere_rows(problem, k, x) + bound_rows(problem, k, u)
     rows += function_rows(problem, k, x, "equalities")
     return rows + function_rows(problem, k, x, "inequalities")
-
-
-def max_violation(problem, X, U):
-    """The largest max(c, 0), or |c| of an equality, in the units of c (m^2 for spheres)."""
-    worst = 0.0
-    for k in range(problem.N + 1):
-        for row in constraint_rows(problem, k, X[k], U[k] if k < problem.N else None):
-            worst = max(worst, abs(row.c) if row.equality else row.c)
-    return worst

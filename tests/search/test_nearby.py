@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.problems import assert_same_bits, planar_batch, quick_gco
-from torchgco import Boxes, InteriorPoint, Problem, Solution, Spheres, judge
+from torchgco import Body, Boxes, InteriorPoint, Problem, Solution, Spheres, judge
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.native.compiler import find_compiler
 from torchgco.search import nearby
@@ -33,13 +33,17 @@ def planar(kind: str, far: float, near: int = 9) -> tuple[Problem, Problem, torc
     angle = torch.arange(FAR) * 0.1
     ring = far * torch.stack((angle.cos(), angle.sin()), dim=-1).expand(B, -1, -1).to(spheres.centers)
     vehicle = spheres.vehicle_radius
-    if kind == "spheres":
+    if kind in ("spheres", "body"):
         radii = torch.cat((spheres.inflated_radii, vehicle[:, None] + 0.05 + 0.0 * ring[..., 0]), dim=1)
         more = [of(torch.cat((spheres.centers, ring), dim=1), radii, vehicle)]
     else:
         more = [spheres, Boxes(ring, torch.full_like(ring, 0.05), vehicle_radius=vehicle)]
-    rest = [part for part in problem.constraints if part is not spheres]
-    return replace(problem, constraints=[spheres, *rest]), replace(problem, constraints=[*more, *rest]), U0
+    rest, few = [part for part in problem.constraints if part is not spheres], [spheres]
+    if kind == "body":
+        rod = Body([[0.05, 0.0], [-0.05, 0.0]], float(vehicle[0]))
+        few = [of(spheres.centers, spheres.inflated_radii, vehicle)]
+        few, more = ([replace(part, vehicle_radius=rod) for part in parts] for parts in (few, more))
+    return replace(problem, constraints=[*few, *rest]), replace(problem, constraints=[*more, *rest]), U0
 
 
 def trajectories(solution: Solution) -> tuple[torch.Tensor, ...]:
@@ -55,12 +59,12 @@ def test_fewer_obstacles_leave_the_scale_of_the_cost_as_it_is() -> None:
     assert all(map(torch.equal, scale, near.call.problem.renewed().cost_scale))
 
 
-@pytest.mark.parametrize("kind", ["spheres", "boxes"])
+@pytest.mark.parametrize("kind", ["spheres", "boxes", "body"])
 def test_far_obstacles_change_no_bit(kind: str) -> None:
     few, many, U0 = planar(kind, 9.0)
     solver = quick_gco(few)
     one, two = solver.solve(few, U0, seed=3), solver.solve(many, U0, seed=3)
-    if kind == "spheres":
+    if kind != "boxes":
         for a, b in zip(trajectories(one), trajectories(two), strict=True):
             assert torch.equal(a, b)
     shapes = [part.value(two.X, two.U).shape for part in many.constraints]

@@ -32,15 +32,8 @@ CORNER = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0]])
 AHEAD = 10
 
 
-def turned(x: Tensor, u: Tensor) -> Tensor:
-    """A unicycle with its states and controls in another order, and one state more."""
-    _, speed, _, heading, _ = x.unbind(-1)
-    turn, push = u.unbind(-1)
-    return torch.stack((turn, 2.0 * push, speed * heading.cos(), turn, speed * heading.sin()), dim=-1)
-
-
 def moved(x: Tensor, u: Tensor) -> Tensor:
-    """The same with its position first."""
+    """A unicycle with its states and controls in another order, and one state more."""
     heading, speed, _ = x[..., 2:].unbind(-1)
     turn, push = u.unbind(-1)
     return torch.stack((speed * heading.cos(), speed * heading.sin(), turn, 2.0 * push, turn), dim=-1)

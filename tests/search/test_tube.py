@@ -30,7 +30,7 @@ from torchgco.maps import OccupancyGrid
 from torchgco.roadmap.geometry import length
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
-from torchgco.search import Solve, Tube, directly, pursue, tube
+from torchgco.search import Solve, Tube, pursue, solved_candidates, tube
 from torchgco.search.following import Free, Paths
 
 D = torch.float64
@@ -76,11 +76,11 @@ def test_it_arrives_behind_a_thick_wall_of_a_map(model: Dynamics) -> None:
 def test_the_cheapest_that_is_feasible_and_arrives_is_kept(monkeypatch, model: Dynamics) -> None:
     problem, ends = room(B=1, model=model), list[tuple[Problem, SolveEnd]]()
 
-    def note(solver, call, X, real=directly.solved_nearby):
+    def note(solver, call, X, real=solved_candidates.solved_nearby):
         ends.append((call.problem, real(solver, call, X)))
         return ends[-1][1]
 
-    monkeypatch.setattr(directly, "solved_nearby", note)
+    monkeypatch.setattr(solved_candidates, "solved_nearby", note)
     found = alone(problem, Tube("maps")).solve(problem, rest(problem))
     ((part, end),) = ends
     assert 1 < part.B <= (tube.TOP if model is STEPS else pursue.SOLVED_WAYS)

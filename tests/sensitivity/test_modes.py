@@ -11,7 +11,9 @@ import torchgco
 from tests.engines import compiled
 from tests.sensitivity.problems import D, along, discs, numbers, solved, weights
 from tests.sensitivity.test_contract import COST, MODEL, small
-from torchgco import ControlBounds, Goal, InputError, Problem, QuadraticCost
+from torchgco import ControlBounds, FreeTime, FunctionDynamics, Goal, InputError, Problem, QuadraticCost, Spheres
+from torchgco.base.autodiff import jacobian as jacobian_of
+from torchgco.base.autodiff import slope_along
 from torchgco.kernels import use_native
 
 X0 = torch.tensor([[1.0, 0.0], [-1.5, 1.0]], dtype=D)
@@ -85,6 +87,36 @@ def test_forward_mode_needs_kernels_in_c() -> None:
             small(forward_ad.make_dual(X0, V))
     finally:
         use_native(True)
+
+
+@compiled
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
+def test_a_solve_in_free_time_is_the_same_within_forward_mode() -> None:
+    """Its search takes derivatives of its own, and PyTorch nests no forward mode."""
+    ahead = lambda x, u: torch.cat((x[..., 2:], u), -1)
+    problem = Problem(
+        FunctionDynamics(ahead, n=4, m=2, dt=0.15, integrator="rk4", position=slice(0, 2)),
+        QuadraticCost(Q=[0.0] * 4, R=[0.05] * 2, Qf=[0.0] * 4),
+        [ControlBounds(-3.0, 3.0), Spheres([[1.0, -0.6]], 0.3, 0.1, velocities=[[0.0, 0.5]])],
+        [0.0] * 4,
+        12,
+        Goal(state=[2.0, 0.3, 0.0, 0.0], required=True),
+        time=FreeTime(0.2, 4.0, weight=1.0),
+    )
+    outside = torchgco.solve(problem, solver="interior_point", verbose=False)
+    with forward_ad.dual_level():
+        within = torchgco.solve(problem, solver="interior_point", verbose=False)
+    torch.testing.assert_close(within.U, outside.U, rtol=1e-9, atol=1e-9)
+
+
+def test_slopes_along_tangents_within_forward_mode() -> None:
+    function = lambda x, u: torch.stack((x[..., 0] * u[..., 0].sin(), x[..., 1].exp() + u[..., 0] ** 3), -1)
+    args, tangents = (X0, V[:, :1]), (V, X0[:, :1])
+    outside = slope_along(function, args, tangents), *jacobian_of(function, *args)
+    with forward_ad.dual_level():
+        within = slope_along(function, args, tangents), *jacobian_of(function, *args)
+    for one, other in zip(within, outside, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-14, atol=1e-14)
 
 
 @compiled

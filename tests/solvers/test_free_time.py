@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import CubicSpline
 
 import torchgco
 from tests.problems import assert_same_bits
@@ -356,3 +357,30 @@ def test_a_moving_disc_in_other_hands() -> None:
         assert bool(judge(problem, found.U, times=found.t).sound.all())
     figure = torchgco.plot(problem, found)
     assert figure.axes and torchgco.show(problem, found).save
+
+
+def test_a_moving_target_is_met_at_the_time_that_is_found() -> None:
+    """The duration balances effort, time and where the target is then; with the stages held there, the cost is the
+    same, and larger in a little less or more time."""
+    N, dt, weight = 30, 0.1, 0.4
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, dt, "rk4")
+    rows = lambda s: np.stack((1.0 + 0.3 * s + 0.05 * s * s, 0.3 + 0.1 * s), -1)  # m and m/s, at s seconds
+    target = CubicSpline(np.arange(N + 1), rows(dt * np.arange(N + 1)), bc_type="natural")
+
+    def chase(tau: float | None = None) -> Problem:
+        own = 1.0 if tau is None else tau
+        x_ref = target(own * np.arange(N + 1))
+        cost = QuadraticCost([0.2 * own, 0.0], [0.1 * own], [50.0, 20.0], torch.from_numpy(x_ref))
+        free = FreeTime(0.2, 3.0, weight) if tau is None else None
+        return Problem(replace(model, dt=own * dt), cost, [ControlBounds(-3.0, 3.0)], [[0.0, 0.0]], N, time=free)
+
+    found = torchgco.solve(chase())
+    assert [status.name for status in found.statuses] == ["CONVERGED"]
+    tau = float(found.duration) / (N * dt)
+    assert 0.3 < tau < 0.95
+    held = torchgco.solve(chase(tau))
+    torch.testing.assert_close(held.X, found.X, rtol=0, atol=1e-5)
+    least = float(held.cost) + weight * float(found.duration)
+    assert float(found.cost) == pytest.approx(least, rel=1e-8)
+    for other in (0.98 * tau, 1.02 * tau):
+        assert float(torchgco.solve(chase(other)).cost) + weight * other * N * dt > least

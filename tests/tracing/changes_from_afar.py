@@ -19,19 +19,20 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils import parametrize
 
-D = torch.float64
-LITTLE, MUCH = 0.2, 2.0
+from tests.native.changes import LITTLE, MUCH, Case, D, of, put
+
 Patch = pytest.MonkeyPatch
-Case = tuple[Callable[[Tensor], Any], Callable[[], object]]  # a function of the velocity, and what changes it
-FAR = dict[str, Callable[[Patch], Case]]()
-
-
-def is_far(make: Callable[[Patch], Case]) -> None:
-    FAR[make.__name__] = make
-
-
 GAIN = LITTLE
 HERE = sys.modules[__name__]
+
+
+def by_global(patch: Patch, drag: Any) -> Case:
+    return drag, lambda: patch.setattr(HERE, "GAIN", MUCH)
+
+
+def replaced(patch: Patch, drag: Any, where: Any, name: str) -> Case:
+    """A drag by a function of PyTorch, which is replaced."""
+    return drag, lambda: patch.setattr(where, name, lambda *given: 3.0 * given[-1])
 
 
 class Weighted(nn.Module):
@@ -50,24 +51,13 @@ class Twice(nn.Module):
         return 2.0 * weight
 
 
-@is_far
-def global_of_a_parametrized_module(patch: Patch) -> Case:
-    net = Weighted()
+def parametrized(net: nn.Module) -> nn.Module:
     parametrize.register_parametrization(net, "weight", Twice())  # its class is made by PyTorch then
-    return net, lambda: patch.setattr(HERE, "GAIN", MUCH)
+    return net
 
 
-@is_far
-def class_of_a_parametrized_module(patch: Patch) -> Case:
-    net = Weighted()
-    parametrize.register_parametrization(net, "weight", Twice())
-    return net, lambda: patch.setattr(Weighted, "gain", MUCH)
-
-
-@is_far
 def kept_parametrization(patch: Patch) -> Case:
-    net = nn.Linear(2, 2, dtype=D)
-    parametrize.register_parametrization(net, "weight", Twice())
+    net = parametrized(nn.Linear(2, 2, dtype=D))
 
     def change() -> None:
         patch.setattr(parametrize, "_cache_enabled", 1)
@@ -76,13 +66,11 @@ def kept_parametrization(patch: Patch) -> Case:
     return net, change
 
 
-@is_far
 def hook_of_all_modules(patch: Patch) -> Case:
     hooks: Any = nn.modules.module._global_forward_hooks
     return nn.Linear(2, 2, dtype=D), lambda: patch.setitem(hooks, -1, lambda module, args, out: 3.0 * out)
 
 
-@is_far
 def module_that_says_it_is_pytorchs(patch: Patch) -> Case:
     class Own(Weighted):
         __module__ = "torch.nn"
@@ -90,16 +78,6 @@ def module_that_says_it_is_pytorchs(patch: Patch) -> Case:
     return Own(), lambda: patch.setattr(Own, "gain", MUCH)
 
 
-@is_far
-def function_that_says_it_is_pytorchs(patch: Patch) -> Case:
-    @functools.wraps(nn.init.uniform_)
-    def drag(v: Tensor) -> Tensor:
-        return GAIN * v
-
-    return drag, lambda: patch.setattr(HERE, "GAIN", MUCH)
-
-
-@is_far
 def code_run_under_pytorchs_name(patch: Patch) -> Case:
     known: dict[str, Any] = {"__name__": "torch.own", "gain": LITTLE}
     exec("def drag(v): return gain * v", known)
@@ -124,38 +102,10 @@ class Number(enum.IntEnum):
         return GAIN
 
 
-@is_far
-def method_of_an_enum(patch: Patch) -> Case:
-    mode = Mode.SLOW
-    return lambda v: mode.by_global() * v, lambda: patch.setattr(HERE, "GAIN", MUCH)
+class Plain:
+    __gain__ = LITTLE
 
 
-@is_far
-def attribute_of_a_member(patch: Patch) -> Case:
-    return lambda v: Mode.SLOW.own * v, lambda: patch.setattr(Mode.SLOW, "own", MUCH)
-
-
-@is_far
-def value_of_a_member(patch: Patch) -> Case:
-    return lambda v: sum(Mode.SLOW.value) * v, lambda: patch.setattr(Mode.SLOW, "_value_", (MUCH,))
-
-
-@is_far
-def property_of_a_whole_member(patch: Patch) -> Case:
-    one = Number.ONE
-    return lambda v: one.gain * v, lambda: patch.setattr(HERE, "GAIN", MUCH)
-
-
-@is_far
-def attribute_with_underscores(patch: Patch) -> Case:
-    class Own:
-        __gain__ = LITTLE
-
-    own = Own()
-    return lambda v: own.__gain__ * v, lambda: setattr(Own, "__gain__", MUCH)
-
-
-@is_far
 def call_that_is_an_object(patch: Patch) -> Case:
     memory = {"by": LITTLE}
 
@@ -165,31 +115,10 @@ def call_that_is_an_object(patch: Patch) -> Case:
     return Own(), lambda: memory.update(by=MUCH)
 
 
-@is_far
-def docstring(patch: Patch) -> Case:
-    def drag() -> None:
-        """0.2"""
-
-    return lambda v: float(str(drag.__doc__)) * v, lambda: setattr(drag, "__doc__", "2.0")
+def documented() -> None:
+    """0.2"""
 
 
-@is_far
-def name_of_a_class(patch: Patch) -> Case:
-    class Own:
-        pass
-
-    return lambda v: len(Own.__name__) * v, lambda: setattr(Own, "__name__", "Longer")
-
-
-@is_far
-def annotations(patch: Patch) -> Case:
-    def drag() -> None: ...
-
-    drag.__annotations__ = {"by": LITTLE}
-    return lambda v: drag.__annotations__["by"] * v, lambda: drag.__annotations__.update(by=MUCH)
-
-
-@is_far
 def metadata_of_a_field(patch: Patch) -> Case:
     about = {"by": LITTLE}
 
@@ -201,7 +130,6 @@ def metadata_of_a_field(patch: Patch) -> Case:
     return lambda v: dataclasses.fields(own)[0].metadata["by"] * v, lambda: about.update(by=MUCH)
 
 
-@is_far
 def subclasses(patch: Patch) -> Case:
     class Own: ...
 
@@ -209,18 +137,14 @@ def subclasses(patch: Patch) -> Case:
     return lambda v: len(Own.__subclasses__()) * v, lambda: made.append(type("More", (Own,), {}))
 
 
-@is_far
 def class_registered_for_an_abstract_one(patch: Patch) -> Case:
     class Kind(ABC):  # noqa: B024
         pass
 
-    class Own: ...
-
-    own = Own()
-    return lambda v: (MUCH if isinstance(own, Kind) else LITTLE) * v, lambda: Kind.register(Own)
+    own = Plain()
+    return lambda v: (MUCH if isinstance(own, Kind) else LITTLE) * v, lambda: Kind.register(Plain)
 
 
-@is_far
 def module_with_getattr(patch: Patch) -> Case:
     settings: Any = types.ModuleType("lazy_settings")
     patch.setitem(sys.modules, "lazy_settings", settings)
@@ -228,95 +152,39 @@ def module_with_getattr(patch: Patch) -> Case:
     return lambda v: settings.gain * v, lambda: settings.known.update(gain=MUCH)
 
 
-@is_far
-def function_of_pytorch_replaced(patch: Patch) -> Case:
-    return lambda v: torch.tanh(v), lambda: patch.setattr(torch, "tanh", lambda v: 3.0 * v)
-
-
-@is_far
 def number_put_into_pytorch(patch: Patch) -> Case:
     patch.setattr(torch, "own_gain", LITTLE, raising=False)
     return lambda v: torch.own_gain * v, lambda: patch.setattr(torch, "own_gain", MUCH)  # type: ignore[attr-defined]
 
 
-@is_far
 def method_put_into_pytorch(patch: Patch) -> Case:
     patch.setattr(Tensor, "own_drag", lambda v: LITTLE * v, raising=False)
     change = lambda: patch.setattr(Tensor, "own_drag", lambda v: MUCH * v)
     return lambda v: v.own_drag(), change  # type: ignore[attr-defined]
 
 
-@is_far
-def layer_of_pytorch_replaced(patch: Patch) -> Case:
-    return nn.Linear(2, 2, dtype=D), lambda: patch.setattr(nn.Linear, "forward", lambda layer, v: 3.0 * v)
-
-
-@is_far
 def operation_of_a_users(patch: Patch) -> Case:
     library = torch.library.Library("torchgco_tests", "FRAGMENT")
     name = f"drag{len(dir(torch.ops.torchgco_tests))}"
     library.define(f"{name}(Tensor v) -> Tensor")
     library.impl(name, lambda v, library=library: GAIN * v, "CompositeImplicitAutograd")
     drag = getattr(torch.ops.torchgco_tests, name)
-    return lambda v: drag(v), lambda: patch.setattr(HERE, "GAIN", MUCH)
+    return by_global(patch, lambda v: drag(v))
 
 
-@is_far
 def operation_by_its_names(patch: Patch) -> Case:
     library = torch.library.Library("torchgco_named", "FRAGMENT")
     if "by_names" not in dir(torch.ops.torchgco_named):
         library.define("by_names(Tensor v) -> Tensor")
         library.impl("by_names", lambda v, library=library: GAIN * v, "CompositeImplicitAutograd")
-    return lambda v: torch.ops.torchgco_named.by_names(v), lambda: patch.setattr(HERE, "GAIN", MUCH)
+    return by_global(patch, lambda v: torch.ops.torchgco_named.by_names(v))
 
 
-@is_far
 def operation_of_numpy_made_of_a_function(patch: Patch) -> Case:
     by = np.frompyfunc(lambda x: GAIN * x, 1, 1)
-    return lambda v: float(by(1.0)) * v, lambda: patch.setattr(HERE, "GAIN", MUCH)
+    return by_global(patch, lambda v: float(by(1.0)) * v)
 
 
-@is_far
-def setting_of_numpy(patch: Patch) -> Case:
-    by = np.geterr()["over"]
-    return lambda v: (LITTLE if np.geterr()["over"] == by else MUCH) * v, lambda: np.seterr(over="raise")
-
-
-@is_far
-def setting_of_pytorch(patch: Patch) -> Case:
-    read = torch.are_deterministic_algorithms_enabled
-    return lambda v: (MUCH if read() else LITTLE) * v, lambda: torch.use_deterministic_algorithms(True)
-
-
-@is_far
-def unit_of_time(patch: Patch) -> Case:
-    memory = [np.timedelta64(1, "s")]
-    change = lambda: memory.__setitem__(0, np.timedelta64(1, "ms"))
-    return lambda v: float(memory[0] / np.timedelta64(1, "ms")) * v, change
-
-
-@is_far
-def names_in_an_array(patch: Patch) -> Case:
-    array = np.array([(LITTLE, MUCH)], dtype=[("a", float), ("b", float)])
-    memory = [array]
-    change = lambda: setattr(array, "dtype", [("b", float), ("a", float)])
-    return lambda v: float(memory[0]["a"][0]) * v, change
-
-
-@is_far
-def sign_of_a_complex_zero(patch: Patch) -> Case:
-    memory = [complex(1.0, 0.0)]
-    change = lambda: memory.__setitem__(0, complex(1.0, -0.0))
-    return lambda v: math.copysign(1.0, memory[0].imag) * v, change
-
-
-@is_far
-def end_of_a_range(patch: Patch) -> Case:
-    memory = [range(0, 3, 2)]
-    return lambda v: memory[0].stop * v, lambda: memory.__setitem__(0, range(0, 4, 2))
-
-
-@is_far
 def place_in_memory(patch: Patch) -> Case:
     both = torch.tensor([LITTLE, MUCH], dtype=D)
     drag = both[:1]
@@ -324,13 +192,76 @@ def place_in_memory(patch: Patch) -> Case:
     return lambda v: float(drag.storage_offset()) * v, change
 
 
-@is_far
-def hook_of_a_tensor(patch: Patch) -> Case:
-    weight = nn.Parameter(torch.ones(1, dtype=D))
-    change = lambda: weight.register_hook(lambda slope: slope)
-    return lambda v: (MUCH if weight._backward_hooks else LITTLE) * v, change
+def listed(before: Any, after: Any, read: Callable[[Any], Any]) -> Case:
+    """A number that is read of the only object of a list, which gets another one."""
+    return of([before], lambda memory: read(memory[0]), lambda memory: memory.__setitem__(0, after))
 
 
-@is_far
-def function_of_a_layer_replaced(patch: Patch) -> Case:
-    return lambda v: F.relu(v), lambda: patch.setattr(F, "relu", lambda v: 3.0 * v)
+SECOND, THOUSANDTH = np.timedelta64(1, "s"), np.timedelta64(1, "ms")
+FAR: dict[str, Callable[[Patch], Case]] = {
+    "global of a parametrized module": lambda patch: by_global(patch, parametrized(Weighted())),
+    "class of a parametrized module": lambda patch: (
+        parametrized(Weighted()), lambda: patch.setattr(Weighted, "gain", MUCH)
+    ),
+    "kept parametrization": kept_parametrization,
+    "hook of all modules": hook_of_all_modules,
+    "module that says it is PyTorch's": module_that_says_it_is_pytorchs,
+    "function that says it is PyTorch's": lambda patch: by_global(
+        patch, functools.wraps(nn.init.uniform_)(lambda v: GAIN * v)
+    ),
+    "code run under PyTorch's name": code_run_under_pytorchs_name,
+    "method of an enum": lambda patch: by_global(patch, lambda v: Mode.SLOW.by_global() * v),
+    "attribute of a member": lambda patch: (
+        lambda v: Mode.SLOW.own * v, lambda: patch.setattr(Mode.SLOW, "own", MUCH)
+    ),
+    "value of a member": lambda patch: (
+        lambda v: sum(Mode.SLOW.value) * v, lambda: patch.setattr(Mode.SLOW, "_value_", (MUCH,))
+    ),
+    "property of a whole member": lambda patch: by_global(patch, lambda v: Number.ONE.gain * v),
+    "attribute with underscores": lambda patch: of(
+        Plain(), lambda own: own.__gain__, lambda _: patch.setattr(Plain, "__gain__", MUCH)
+    ),
+    "call that is an object": call_that_is_an_object,
+    "docstring": lambda patch: of(
+        documented, lambda function: float(str(function.__doc__)),
+        lambda function: patch.setattr(function, "__doc__", "2.0"),
+    ),
+    "name of a class": lambda patch: of(type("Own", (), {}), lambda cls: len(cls.__name__), put("__name__", "Longer")),
+    "annotations": lambda patch: of(
+        documented, lambda function: len(function.__annotations__),
+        lambda function: patch.setitem(function.__annotations__, "by", MUCH),
+    ),
+    "metadata of a field": metadata_of_a_field,
+    "subclasses": subclasses,
+    "class registered for an abstract one": class_registered_for_an_abstract_one,
+    "module with getattr": module_with_getattr,
+    "function of PyTorch replaced": lambda patch: replaced(patch, lambda v: torch.tanh(v), torch, "tanh"),
+    "function of a layer replaced": lambda patch: replaced(patch, lambda v: F.relu(v), F, "relu"),
+    "layer of PyTorch replaced": lambda patch: replaced(patch, nn.Linear(2, 2, dtype=D), nn.Linear, "forward"),
+    "number put into PyTorch": number_put_into_pytorch,
+    "method put into PyTorch": method_put_into_pytorch,
+    "operation of a user's": operation_of_a_users,
+    "operation by its names": operation_by_its_names,
+    "operation of NumPy made of a function": operation_of_numpy_made_of_a_function,
+    "setting of NumPy": lambda patch: of(
+        np.geterr()["over"], lambda by: LITTLE if np.geterr()["over"] == by else MUCH, lambda _: np.seterr(over="raise")
+    ),
+    "setting of PyTorch": lambda patch: of(
+        torch.are_deterministic_algorithms_enabled, lambda read: MUCH if read() else LITTLE,
+        lambda _: torch.use_deterministic_algorithms(True),
+    ),
+    "unit of time": lambda patch: listed(SECOND, THOUSANDTH, lambda time: float(time / THOUSANDTH)),
+    "names in an array": lambda patch: of(
+        [np.array([(LITTLE, MUCH)], dtype=[("a", float), ("b", float)])], lambda memory: float(memory[0]["a"][0]),
+        lambda memory: put("dtype", [("b", float), ("a", float)])(memory[0]),
+    ),
+    "sign of a complex zero": lambda patch: listed(
+        complex(1.0, 0.0), complex(1.0, -0.0), lambda number: math.copysign(1.0, number.imag)
+    ),
+    "end of a range": lambda patch: listed(range(0, 3, 2), range(0, 4, 2), lambda numbers: numbers.stop),
+    "place in memory": place_in_memory,
+    "hook of a tensor": lambda patch: of(
+        nn.Parameter(torch.ones(1, dtype=D)), lambda weight: MUCH if weight._backward_hooks else LITTLE,
+        lambda weight: weight.register_hook(lambda slope: slope),
+    ),
+}  # fmt: skip

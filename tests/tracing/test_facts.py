@@ -10,7 +10,8 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrizations, parametrize
 
-from tests.tracing.changes_from_afar import FAR, D, Mode, Twice, Weighted
+from tests.native.changes import D
+from tests.tracing.changes_from_afar import FAR, Mode, Twice, Weighted
 from torchgco.tracing import Facts, Unseen
 
 V = torch.tensor([[1.0, -0.5]], dtype=D)

@@ -304,3 +304,28 @@ def test_unsupported_operations_are_named(function, named: str) -> None:
     with pytest.raises(InputError, match=named) as caught:
         by_casadi(lambda i, x: function(x), [0], torch.rand(1, 4, **DOUBLE))
     assert caught.value.field == "field"
+
+
+TABLE, OUTER = torch.tensor([2, 0, 1]), torch.randn(3, 4, dtype=torch.float64)
+MOVES = {
+    "a row": (lambda own, i: own[i], True),
+    "part of a row": (lambda own, i: own[i][:, 1:3], True),
+    "in another order": (lambda own, i: torch.cat((own[i][:, 2:], own[i][:, :1]), dim=-1), True),
+    "computed": (lambda own, i: 2.0 * own[i], False),
+    "always of the first problem": (lambda own, i: own[:1], False),
+    "columns": (lambda own, i: own[:1, i], False),
+    "through a table": (lambda own, i: own[TABLE[i]], False),
+    "of others, too": (lambda own, i: torch.cat((own[i], OUTER[i]), dim=-1), False),
+}
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_numbers_that_are_only_moved_are_those_that_are_computed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    move, is_picked = MOVES[name]
+    own = torch.randn(3, 4, **DOUBLE)
+    traced = Traced("f", lambda i, x: x.sum() * move(own, i), torch.zeros(1, 2, **DOUBLE), own=[own])
+    index = torch.tensor([2, 0, 2, 1])
+    found = traced.parameters_of(index)
+    assert (traced.picks is not None) == is_picked
+    monkeypatch.setitem(vars(traced), "picks", None)
+    assert torch.equal(found, traced.parameters_of(index))

@@ -15,6 +15,8 @@ from torch import _is_functional_tensor as is_functional  # type: ignore[attr-de
 from torch._C._functorch import is_functorch_wrapped_tensor  # type: ignore[import]
 from torch.overrides import TorchFunctionMode
 
+from torchgco.base.gradients import is_forward
+
 
 class ReadsMemory(RuntimeError):
     """A function hands a tensor to NumPy or Python where only operations of PyTorch are seen."""
@@ -72,13 +74,25 @@ def _stands_for_another(value: Tensor) -> bool:
     return is_functional(value) or is_functorch_wrapped_tensor(value)
 
 
+def slope_along(function: Callable[..., Tensor], args: tuple[Tensor, ...], tangents: tuple[Tensor, ...]) -> Tensor:
+    """The derivative of function(*args) along tangents, of the shape of its value.
+
+    Within `forward_ad.dual_level`, where PyTorch nests no forward mode, by reverse mode of the linear map of a
+    backward pass.
+    """
+    if not is_forward():
+        return torch.func.jvp(function, args, tangents)[1]
+    value, backward = torch.func.vjp(function, *args)[:2]
+    return torch.func.vjp(backward, torch.zeros_like(value))[1](tangents)[0]
+
+
 def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
     """Derivatives of function(*args) (..., out) with respect to each argument's last axis: (..., out, in) each."""
     sizes = [arg.shape[-1] for arg in args]
 
     def along(direction: Tensor) -> Tensor:
         tangents = tuple(part.expand_as(arg) for part, arg in zip(direction.split(sizes), args, strict=True))
-        return torch.func.jvp(function, args, tangents)[1]
+        return slope_along(function, args, tangents)
 
     basis = torch.eye(sum(sizes), dtype=args[0].dtype, device=args[0].device)
     return torch.func.vmap(along)(basis).movedim(0, -1).split(sizes, dim=-1)
@@ -118,7 +132,7 @@ def gradient_and_hessian(function: Callable[[Tensor], Tensor], z: Tensor) -> tup
     gradient = torch.func.grad(lambda rows: function(rows).sum())
 
     def along(direction: Tensor) -> Tensor:
-        return torch.func.jvp(gradient, (z,), (direction.expand_as(z),))[1]
+        return slope_along(gradient, (z,), (direction.expand_as(z),))
 
     basis = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
     g, H = gradient(z), torch.func.vmap(along)(basis).movedim(0, -1)
@@ -144,10 +158,10 @@ def hessian_forward(function: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
     basis = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
 
     def slope(z: Tensor, i: int) -> Tensor:
-        return torch.func.jvp(function, (z,), (basis[i].expand_as(z),))[1]
+        return slope_along(function, (z,), (basis[i].expand_as(z),))
 
     def row(i: int) -> Tensor:
-        along = lambda direction: torch.func.jvp(lambda z: slope(z, i), (z,), (direction.expand_as(z),))[1]
+        along = lambda direction: slope_along(lambda z: slope(z, i), (z,), (direction.expand_as(z),))
         return torch.func.vmap(along)(basis).movedim(0, -1)
 
     try:

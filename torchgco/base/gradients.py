@@ -6,14 +6,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import is_dataclass
-from types import FunctionType
+from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.nn import Parameter
 
 _recording: ContextVar[bool] = ContextVar("recording", default=False)
 
@@ -56,18 +54,13 @@ def is_recording() -> bool:
     return _recording.get()
 
 
-# Types of most leaves, which hold nothing: a problem has some hundred, and each solve looks at them.
-_PLAIN = frozenset((Tensor, Parameter, np.ndarray, int, float, bool, str, FunctionType, type(None)))
-
-
 def leaves(tree: Any) -> list[Any]:
     """All that nested sequences, mappings and dataclasses hold, but for these themselves."""
     found: list[Any] = []
     waiting, seen = [tree], set[int]()
     while waiting:
         part = waiting.pop()
-        holds = type(part) not in _PLAIN and (isinstance(part, (Mapping, tuple, list)) or _is_made(part))
-        if not holds:
+        if not _holds(type(part)):
             found.append(part)
         elif id(part) not in seen:  # parts may hold each other
             seen.add(id(part))
@@ -75,9 +68,10 @@ def leaves(tree: Any) -> list[Any]:
     return found
 
 
-def _is_made(part: Any) -> bool:
-    """Whether this is an object of a dataclass."""
-    return is_dataclass(part) and not isinstance(part, type)
+@lru_cache(maxsize=4096)
+def _holds(kind: type) -> bool:
+    """Whether objects of a type are sequences, mappings, or of a dataclass: each solve looks at some hundred."""
+    return issubclass(kind, (Mapping, tuple, list)) or is_dataclass(kind)
 
 
 def asking(tree: Any) -> list[Tensor]:
@@ -108,6 +102,6 @@ def _parts(tree: Any) -> list[tuple[Any, Any]]:
         return list(tree.items())
     if isinstance(tree, (tuple, list)):
         return list(enumerate(tree))
-    if _is_made(tree) and hasattr(tree, "__dict__"):
+    if _holds(type(tree)) and hasattr(tree, "__dict__"):
         return list(vars(tree).items())
     return []

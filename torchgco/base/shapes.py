@@ -147,6 +147,7 @@ class Dimensions:
     goal: Tensor | None = None  # (B, d), m: the goal's position, where one is known
     horizon: Tensor | None = None  # (B,) int64: stages of each problem, where they differ
     state_names: tuple[str, ...] = ()  # of the model's states, where it names them
+    free_time: bool = False  # whether stages last a multiple of dt that is chosen
 
 
 def space_of(dims: Dimensions, field: str) -> int:

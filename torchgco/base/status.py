@@ -37,7 +37,8 @@ UNMOVED = -4  # the same but for violated rows that no variable moves: nothing t
 
 _SENTENCES = {
     Status.RUNNING: "The solve has not ended.",
-    Status.CONVERGED: "The trajectory is stationary and its violation is under the tolerance.",
+    Status.CONVERGED: "The violation is under the tolerance, and the trajectory is stationary, or costs at most 0.1 % "
+    "more to keep clear of an obstacle between two knots.",
     Status.FEASIBLE: "The violation is under the tolerance, but the trajectory is not stationary: its cost can be "
     "lowered.",
     Status.MAX_ITERATIONS: "The solve ended, by an iteration limit or its tolerance, before the trajectory was "

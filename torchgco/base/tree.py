@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass, replace
-from functools import cache
+from functools import lru_cache
 from typing import Any, ClassVar, Self, TypeAlias
 
 import torch
@@ -33,7 +33,7 @@ class PerElement(Brief):
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.dim() > 0 and value.shape[0] != 1:
                 changes[name] = value[index]
-        return replace(self, **changes) if changes else self  # type: ignore[type-var]
+        return changed(self, changes) if changes else self
 
 
 def is_users(part: object) -> bool:
@@ -43,29 +43,46 @@ def is_users(part: object) -> bool:
 
 def take(tree: Any, index: Rows) -> Any:
     """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
-    if isinstance(tree, Tensor):
+    if type(tree) is Tensor:  # most of all; each solve takes thousands
         return tree[index]
     if isinstance(tree, PerElement):
         return tree.take(index)
     if isinstance(tree, tuple):
-        rows = (take(leaf, index) for leaf in tree)
+        rows = [take(leaf, index) for leaf in tree]
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        return _changed(tree, lambda leaf: take(leaf, index))
-    return tree
+    if isinstance(tree, Tensor):
+        return tree[index]
+    return _each(tree, take, index) if field_names(type(tree)) else tree
 
 
-def _changed(tree: Any, change: Callable[[Any], Any]) -> Any:
-    """A dataclass with each of its fields changed; they are checked already."""
-    other = object.__new__(type(tree))
-    for name in _names(type(tree)):
-        object.__setattr__(other, name, change(getattr(tree, name)))
+def changed(part: Any, changes: Mapping[str, Any]) -> Any:
+    """A dataclass with other values of some fields, which are checked already."""
+    if not _is_plain(type(part)):
+        return replace(part, **changes)
+    other = object.__new__(type(part))
+    for name in field_names(type(part)):
+        object.__setattr__(other, name, changes[name] if name in changes else getattr(part, name))
     return other
 
 
-@cache
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(kind))
+def _each(tree: Any, change: Callable[..., Any], *others: Any) -> Any:
+    """A dataclass with each of its fields changed; they are checked already."""
+    other = object.__new__(type(tree))
+    for name in field_names(type(tree)):
+        object.__setattr__(other, name, change(getattr(tree, name), *others))
+    return other
+
+
+@lru_cache(maxsize=4096)
+def field_names(kind: type) -> tuple[str, ...]:
+    """The names of a dataclass's fields; none of another class."""
+    return tuple(f.name for f in fields(kind)) if is_dataclass(kind) else ()
+
+
+@lru_cache(maxsize=4096)
+def _is_plain(kind: type) -> bool:
+    """Whether making a dataclass does nothing but set its fields; a user's may do anything."""
+    return kind.__module__.partition(".")[0] == "torchgco" and not hasattr(kind, "__post_init__")
 
 
 class LastTaken:
@@ -139,10 +156,8 @@ def copied(tree: Any) -> Any:
     if isinstance(tree, Tensor):
         return tree.clone()
     if isinstance(tree, tuple):
-        return tuple(copied(leaf) for leaf in tree)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        return _changed(tree, copied)
-    return tree
+        return tuple([copied(leaf) for leaf in tree])
+    return _each(tree, copied) if field_names(type(tree)) else tree
 
 
 def spread(values: Tensor, rows: Tensor) -> Tensor:
@@ -159,6 +174,6 @@ def put(tree: Any, index: Tensor, rows: Any) -> None:
     elif isinstance(tree, tuple):
         for leaf, new in zip(tree, rows, strict=True):
             put(leaf, index, new)
-    elif is_dataclass(tree) and not isinstance(tree, type):
-        for name in _names(type(tree)):
+    else:
+        for name in field_names(type(tree)):
             put(getattr(tree, name), index, getattr(rows, name))

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement, apart
 from torchgco.constraints.bounds import LOOSE
+from torchgco.native.codegen.dynamics import elements
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 
@@ -92,13 +93,13 @@ def transcribe(problem: Problem) -> Program:
     stages = [k * (n + m) for k in range(N + 1)]
     x = [variables[at : at + n] for at in stages]
     u = [variables[at + n : at + n + m] for at in stages[:-1]]
-    X, U = np.stack([_elements(z) for z in x])[None], np.stack([_elements(z) for z in u])[None]
+    X, U = np.stack([elements(z) for z in x])[None], np.stack([elements(z) for z in u])[None]
 
     at_knot: list[list[tuple[ca.SX, bool]]] = [[] for _ in range(N + 1)]  # rows, and whether each is an equality
     free = _free(problem)
-    at_knot[0] = [(row, True) for row, is_free in zip(_elements(x[0] - start), free, strict=True) if not is_free]
+    at_knot[0] = [(row, True) for row, is_free in zip(elements(x[0] - start), free, strict=True) if not is_free]
     for constraint, traced, p in zip(problem.constraints, constraints, own[2:], strict=True):
-        values = traced(_elements(p), X, U)[0]
+        values = traced(elements(p), X, U)[0]
         for k, rows in zip(_knots(constraint.knots, N), values, strict=True):
             at_knot[k] += [(row, constraint.sense == "equality") for row in rows]
     parameters = ca.vertcat(start, *own)
@@ -106,11 +107,11 @@ def transcribe(problem: Problem) -> Program:
 
     rows, equality, ahead = [], [], _ahead(problem, step, own[0], X, U)
     for k in range(N + 1):
-        gap = [(row, True) for row in _elements(x[k + 1] - ahead[k])] if k < N else []
+        gap = [(row, True) for row in elements(x[k + 1] - ahead[k])] if k < N else []
         rows += [row for row, _ in gap + at_knot[k]]
         equality += [is_equality for _, is_equality in gap + at_knot[k]]
     return Program(
-        variables, parameters, _column(cost(_elements(own[1]), X, U)), _column(rows), equality,
+        variables, parameters, _column(cost(elements(own[1]), X, U)), _column(rows), equality,
         [len(knot) for knot in at_knot], limits, free, sources,
     )  # fmt: skip
 
@@ -146,9 +147,9 @@ def _changes(problem: Problem) -> bool:
 def _ahead(problem: Problem, step: Traced, own: ca.SX, X: np.ndarray, U: np.ndarray) -> list[ca.SX]:
     """step(x_k, u_k) of each stage, from X (1, N+1, n) and U (1, N, m)."""
     if _changes(problem):
-        return [_column(after) for after in step(_elements(own), X[:, :-1], U)[0]]
+        return [_column(after) for after in step(elements(own), X[:, :-1], U)[0]]
     first = [_column(z[0, 0]) for z in (X, U)]
-    one = ca.Function("step", [*first, own], [_column(step(_elements(own), X[:, 0], U[:, 0])[0])])
+    one = ca.Function("step", [*first, own], [_column(step(elements(own), X[:, 0], U[:, 0])[0])])
     return [one(_column(x), _column(u), own) for x, u in zip(X[0], U[0], strict=False)]
 
 
@@ -184,14 +185,6 @@ def _limits(
 
 def _knots(knots: slice | Tensor, N: int) -> list[int]:
     return list(range(N + 1)[knots]) if isinstance(knots, slice) else [int(k) for k in knots]
-
-
-def _elements(column: ca.SX) -> np.ndarray:
-    """The scalars of a column, (size,) objects."""
-    elements = np.empty(column.numel(), dtype=object)
-    for i in range(column.numel()):
-        elements[i] = column[i]
-    return elements
 
 
 def _column(elements: Iterable) -> ca.SX:

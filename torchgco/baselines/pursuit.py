@@ -23,6 +23,7 @@ from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.chords import cleared, serving
+from torchgco.search.pursue import radius_of
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.infeasible import least_violated
@@ -174,11 +175,6 @@ class PathPursuit(Solver):
         if problem.obstacles:
             cleared(call, best, self.rounds, ADMITTED, once)
         return end
-
-
-def radius_of(problem: Problem) -> float:
-    """The largest radius of the vehicle in a batch of one, m; 0 without obstacles."""
-    return max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
 
 
 def region(scene: Scene, margin: float) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks
 from torchgco.base.shapes import Dimensions, check_shape, lead, tensor
 from torchgco.costs.base import Cost, add_blocks
+from torchgco.costs.in_free_time import QuadraticInFreeTime
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class QuadraticCost(Cost):
         diagonal = H is None and all(_is_diagonal(given, W) for given, W in weights)
         if diagonal:
             Q, R, Qf = (W.diagonal(dim1=-2, dim2=-1).contiguous() for W in (Q, R, Qf))
-        return BoundQuadratic(
+        found = BoundQuadratic(
             Q=Q,
             R=R,
             Qf=Qf,
@@ -63,6 +64,7 @@ class QuadraticCost(Cost):
             H=H,
             diagonal=diagonal,
         )
+        return (QuadraticInFreeTime.of(found) or found) if dims.free_time else found
 
 
 @dataclass(frozen=True)
@@ -108,9 +110,9 @@ class BoundQuadratic(Cost):
         def at_k(part: Tensor) -> Tensor:
             if not isinstance(k, int):
                 return part
-            part = part[:, k if part.shape[1] > 1 else 0]
+            at = k if part.shape[1] > 1 else 0
             # The axis of samples, if any, follows the batch axis.
-            return part if x.dim() == 2 else part.unsqueeze(1)
+            return part[:, at] if x.dim() == 2 else part[:, at : at + 1]
 
         ex, eu = x - at_k(self.x_ref), u - at_k(self.u_ref)
         value = 0.5 * ((ex * self._times(at_k(self.Q), ex)).sum(-1) + (eu * self._times(at_k(self.R), eu)).sum(-1))

@@ -24,6 +24,7 @@ from torchgco.missions.mission import CPU, Mission
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.planner import Planner
 from torchgco.problem.problem import Problem
+from torchgco.scenarios.base import generator
 from torchgco.scenarios.quadrotor import Forest
 from torchgco.scenarios.vehicle import Vehicle
 
@@ -148,10 +149,10 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             rows = mask.nonzero()[0]
         layouts = self._layouts_of(options)
         entropy = None if self._streams else np.random.SeedSequence().entropy
-        streams = self._streams or [stream(entropy, number) for number in self.ids]
+        streams = self._streams or [generator(entropy, number) for number in self.ids]
         for row in rows:
             if seeds[row] is not None:
-                streams[row] = stream(seeds[row], self.ids[row])
+                streams[row] = generator(seeds[row], self.ids[row])
         if not self._streams:
             rows = np.arange(self.num_envs)  # all have to be somewhere
         self._streams = streams
@@ -246,11 +247,6 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             final[row] = seen[row]
         infos = self._info(outcome, rows)
         return {"final_obs": final, "_final_obs": done.copy(), "final_info": infos, "_final_info": done.copy()}
-
-
-def stream(seed: Any, number: int) -> np.random.Generator:
-    """The draws of environment `number` under a seed."""
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(number,))))
 
 
 def _bonus(outcome: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from torchgco.base.autodiff import gradients
+from torchgco.base.autodiff import gradients, slope_along
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints.base import Constraint
@@ -265,9 +265,9 @@ def _body_bulge(body: BoundBody, problem: Problem, X: Tensor, U: Tensor) -> Tens
     if dynamics.integrator not in ("midpoint", "rk4"):
         return body.points.bulge(X)[0]
     field = lambda x: dynamics.field(x, U)
-    velocity = lambda x: torch.func.jvp(body.points.at, (x,), (field(x),))[1]
+    velocity = lambda x: slope_along(body.points.at, (x,), (field(x),))
     half = X[:, :-1] + 0.5 * dynamics.dt * field(X[:, :-1])
-    samples = [torch.func.jvp(velocity, (x,), (field(x),))[1][0] for x in (X[:, :-1], half, X[:, 1:])]
+    samples = [slope_along(velocity, (x,), (field(x),))[0] for x in (X[:, :-1], half, X[:, 1:])]
     a = torch.stack(samples)  # (3, N, P, d)
     change = a.diff(dim=0).norm(dim=-1).amax(0)
     return (dynamics.dt**2 / 8.0 * torch.ones_like(X[0, :-1, :1])) * (a.norm(dim=-1).amax(0) + change)

@@ -13,6 +13,7 @@ from torchgco.ilqr.riccati import BackwardPass
 from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.state import InnerState, PassEnd, State
+from torchgco.native.kept_descent import KeptDescent
 from torchgco.problem.problem import Problem
 
 
@@ -110,6 +111,10 @@ class Kernels(Protocol):
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
         """Iterations of every problem's inner solve, in place: one at least, `limit` at most."""
+        ...
+
+    def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:
+        """Inner solves of problems that stay packed; None: the caller makes them from `descend`."""
         ...
 
     def outer_passes(self, problem: Problem, s: State, how: Descent, **limits: Any) -> OuterPasses | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -24,6 +25,7 @@ from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
+from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
 from torchgco.native.structures import End, Options
 from torchgco.obstacles.spheres import BoundSpheres
@@ -64,7 +66,7 @@ class NativeKernels:
         return self.engine.value(lagrangian, X, U)
 
     def scale(self, problem: Problem) -> None:
-        if self.engine.cost is not None and "cost_scale" not in vars(problem):
+        if self.engine.cost is not None:
             slopes, H = self.engine.expand(problem, *problem.at_rest)
             object.__setattr__(problem, "cost_scale", problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1)))
 
@@ -87,10 +89,9 @@ class NativeKernels:
         return backward
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
-        state = {}
-        for name in ITERATED:
-            state[name] = getattr(s, name).clone(memory_format=torch.contiguous_format)
-            setattr(s, name, state[name])
+        state = {name: getattr(s, name).contiguous() for name in ITERATED}
+        for name, part in state.items():
+            setattr(s, name, part)
         out = self.engine.inner_solve(lagrangian, state, native_options(how), limit)
         converged, stuck, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
         ended = out["status"] == End.ENDED
@@ -109,6 +110,9 @@ class NativeKernels:
         state = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in given.items()}
         accepted = self.engine.lift(lagrangian, state, lifted.LIFTED_STEPS, lifted.GAIN)
         return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted)
+
+    def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:
+        return KeptDescent(self.engine, problem, native_options(how), phr) if self.engine.measures else None
 
     def outer_passes(self, problem: Problem, s: State, how: Descent, **limits: Any) -> NativeOuter | None:
         return NativeOuter(self.engine, native_options(how), problem, s, **limits) if self.engine.measures else None
@@ -135,7 +139,7 @@ class NativeKernels:
 def native_options(how: Descent) -> Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
-    ladder = torch.tensor(search.ladder(printed), dtype=torch.float64)
+    ladder = _numbers(*search.ladder(printed))
     return Options.complete(
         ladder=ladder, rungs=len(ladder), back=-1 if search.back is None else search.back, accept_last=printed,
         ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
@@ -145,3 +149,8 @@ def native_options(how: Descent) -> Options:
         regularisation_max=descent.REGULARISATION_MAX, damping=0.0 if printed else descent.DAMPING,
         damping_growth=descent.DAMPING_GROWTH, damping_decay=descent.DAMPING_DECAY, damp_below=how.damp_below,
     )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _numbers(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)

@@ -57,6 +57,9 @@ class TorchKernels:
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
         return iterate(how, s, lagrangian)
 
+    def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> None:
+        return None
+
     def outer_passes(self, problem: Problem, s: State, how: Descent, **limits: Any) -> None:
         return None
 

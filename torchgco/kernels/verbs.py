@@ -64,7 +64,8 @@ def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) ->
 
 def cost_unit(problem: Problem) -> Tensor:
     """`problem.cost_unit` (B,), computed without autodiff where compiled code can; the problem keeps its scale."""
-    kernels_of(problem).scale(problem)
+    if "cost_scale" not in vars(problem):
+        kernels_of(problem).scale(problem)
     return problem.cost_unit
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -25,6 +26,8 @@ class Multipliers:
     lam: tuple[Tensor, ...]
     mu: Tensor  # (B,)
 
+    blank: ClassVar[bool] = False  # whether they are `none`
+
     @classmethod
     def zero(cls, problem: Problem, mu: float) -> Multipliers:
         """lam = 0 and the same penalty for all."""
@@ -35,7 +38,9 @@ class Multipliers:
     def none(cls, problem: Problem, mu: Tensor) -> Multipliers:
         """lam = 0 that takes no memory and can't be written to, and penalties mu (B,)."""
         zero = problem.x0.new_zeros(())
-        return cls(tuple(zero.expand(problem.B, *shape) for shape in problem.row_shapes), mu)
+        made = cls(tuple(zero.expand(problem.B, *shape) for shape in problem.row_shapes), mu)
+        object.__setattr__(made, "blank", True)
+        return made
 
     def scaled(self, factor: Tensor) -> Multipliers:
         """The multipliers and penalties of the same problems with their costs times `factor` (B,)."""

@@ -54,6 +54,12 @@ def goal_tolerance(problem: Problem) -> Tensor | None:
     the edge of a large goal would return trajectories that a few more iterations make cheaper. A required goal's rows
     say what arrives: all that keeps them, as far as trajectories that count as feasible do.
     """
+    if "goal_tolerance" not in vars(problem):  # many steps of a solve ask for it
+        object.__setattr__(problem, "goal_tolerance", _goal_tolerance(problem))
+    return vars(problem)["goal_tolerance"]
+
+
+def _goal_tolerance(problem: Problem) -> Tensor | None:
     goal = problem.goal
     if goal is None:
         return None
@@ -68,7 +74,7 @@ def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
     near = goal_tolerance(problem)
     if near is None or problem.goal is None:
         return torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
-    return problem.goal.distance(X[:, -1, problem.position]) <= tolerances * near
+    return problem.goal.distance(X[:, -1, problem.position]) <= (near if tolerances == 1.0 else tolerances * near)
 
 
 def ranks_arrival(problem: Problem) -> bool:

@@ -85,10 +85,11 @@ class ThrustSum(Constraint):
 
     acceleration: Tensor
     mass: Annotated[float, Above(0, "kg")]
+    thrust: Tensor | None = None  # (B, N): m a_ref, N, once bound
 
     knots: Any = None
     sense: ClassVar[Sense] = "equality"
-    batched: ClassVar[tuple[str, ...]] = ("acceleration",)
+    batched: ClassVar[tuple[str, ...]] = ("acceleration", "thrust")
 
     def bind(self, dims: Dimensions) -> Self:
         check_options(self, "thrust_sum")
@@ -96,10 +97,17 @@ class ThrustSum(Constraint):
             raise InputError("thrust_sum.dynamics", "the tracking model with 7 states", f"{dims.n} states")
         check_shape(self.acceleration, (dims.B, dims.N), "thrust_sum.acceleration")
         check_tensor(self.acceleration, "thrust_sum.acceleration", dims.like)
-        return replace(self, knots=slice(1, dims.N + 1))
+        return replace(self, knots=slice(1, dims.N + 1), thrust=self.mass * self.acceleration)
+
+    def toward(self, acceleration: Tensor) -> None:
+        """Write another a_ref (B, N), m/s^2, into a bound part's own tensors, unchecked."""
+        assert self.thrust is not None
+        self.acceleration.copy_(acceleration)
+        torch.mul(acceleration, self.mass, out=self.thrust)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return (X[:, self.knots, 3:].sum(-1) - self.mass * self.acceleration).unsqueeze(-1)
+        assert self.thrust is not None
+        return (X[:, self.knots, 3:].sum(-1) - self.thrust).unsqueeze(-1)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n = X.shape[-1]

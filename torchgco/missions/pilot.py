@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgco.missions.log import SeenLog
 from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planning_problem import settled
 from torchgco.problem.problem import Problem
 
 SEED_STEP = 7_919  # between the seeds of two control steps
@@ -55,7 +56,7 @@ class KnownMap:
     """The planner where all obstacles are known from the start."""
 
     def __init__(self, planner: Planner, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> None:
-        self.planner, self.problem, self.seed, self.ids = planner, problem, seed, ids
+        self.planner, self.problem, self.seed, self.ids = planner, settled(problem), seed, ids
         self._posed = planner.problem(problem, x)  # the problems of the plans before
         self.knots, self.seen = problem.N + 1, list[SeenLog]()
 
@@ -72,7 +73,9 @@ class KnownMap:
 
     def take(self, index: Tensor) -> None:
         """See `Pilot`."""
-        self.problem, self._posed, self.ids = self.problem.take(index), self._posed.take(index), self.ids[index]
+        # Kernels for fewer vehicles may solve fewer side by side.
+        self.problem, self._posed = settled(self.problem.take(index)), settled(self._posed.take(index))
+        self.ids = self.ids[index]
 
     def parts(self) -> Mapping[str, Tensor]:
         """None: see `Pilot`."""

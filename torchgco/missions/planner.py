@@ -22,9 +22,11 @@ from torchgco.missions.planning_problem import (
     acceleration,
     airframe_of,
     biased,
+    continued,
     first_step,
     follows,
     planning_state,
+    settled,
 )
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
@@ -142,7 +144,7 @@ class Planner:
         x0, none = planning_state(x, airframe_of(problem.dynamics)), torch.zeros_like(x[:, :3])
         constraints = self._constraints(problem, 0.0, x, self._margin(x, None), none[:, 0])
         dynamics = problem.dynamics if self.estimation == 0 else biased(problem.dynamics, none)
-        return replace(problem, dynamics=dynamics, x0=x0, constraints=constraints)
+        return settled(replace(problem, dynamics=dynamics, x0=x0, constraints=constraints))
 
     def plan(
         self,
@@ -185,9 +187,9 @@ class Planner:
         bias = self.estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
         margin = self._margin(x, before)
-        depth = margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
+        depth = margin.unavoidable_depth(continued(whole, x0), t, U0)
         constraints = self._constraints(whole, t, x, margin, depth)
-        return now.started_at(x0, constraints, dynamics=dynamics), margin, bias, U0
+        return continued(now, x0, constraints, dynamics), margin, bias, U0
 
     def predicted(self, x: Tensor, plan: Plan) -> Tensor:
         """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -9,12 +10,13 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.tree import is_users
 from torchgco.constraints import ControlBounds
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning, pose_rates
 from torchgco.dynamics.rotors import QuadrotorThrusts
-from torchgco.kernels import open_loop
+from torchgco.kernels import current, open_loop
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.problem.problem import Problem
@@ -54,6 +56,24 @@ def biased(dynamics: Dynamics, bias: Tensor) -> BiasedPlanning:
     """The planning model with a bias (B, 3), m/s^2."""
     given = {f.name: getattr(dynamics, f.name) for f in fields(QuadrotorPlanning)}
     return BiasedPlanning(**given, bias=bias)
+
+
+def settled(problem: Problem) -> Problem:
+    """The problems of all plans of a loop, whose code is looked at here and not again: see `continued`.
+
+    Where a user's code is part of it, which may read what changes meanwhile, every plan looks again.
+    """
+    parts = problem.dynamics, problem.cost, *problem.constraints
+    return problem if any(map(is_users, parts)) else current(problem.renewed())
+
+
+def continued(
+    problem: Problem, x0: Tensor, constraints: Sequence[Constraint] | None = None, dynamics: Dynamics | None = None
+) -> Problem:
+    """Problems that may be `settled`, from other states x0 (B, n), with other parts of the same kinds and code."""
+    if problem.known.current:
+        return problem.moved_to(x0, constraints, dynamics)
+    return problem.started_at(x0, problem.constraints if constraints is None else constraints, dynamics=dynamics)
 
 
 def planning_state(x: Tensor, airframe: Airframe) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
@@ -15,12 +15,12 @@ from torchgco.constraints import StateBounds
 from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import Airframe, RotorTracking
-from torchgco.kernels import measured
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update_and_raise_penalty
+from torchgco.lagrangian.lagrangian import Multipliers, shifted, update_and_raise_penalty
 from torchgco.missions.constraints import RotorLimits, ThrustSum
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
-from torchgco.solvers.ilqr import ILQR, descend
+from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.repeated import RepeatedDescent
 
 RATES, THRUST = slice(10, 13), 13  # in the planning model's state: w and a
 FIRST_ROUNDS = 3  # inner solves of the first call
@@ -50,16 +50,21 @@ class Reference:
 class Tracking:
     """The commands of the tracker, and what its next call starts from."""
 
-    problem: Problem
+    solves: RepeatedDescent  # of the tracking problems, which have the numbers of the last call
     commands: Tensor  # (B, 4): rotor speeds, rpm
     violation: Tensor  # (B,): largest violation of the tracking problem, N
     U: Tensor  # (B, N, 4)
     multipliers: Multipliers
 
+    @property
+    def problem(self) -> Problem:
+        """The tracking problems of the last call."""
+        return self.solves.problem
+
     def take(self, index: Rows) -> Tracking:
         """The same for the vehicles in `index`."""
         tensors = take((self.commands, self.violation, self.U, self.multipliers), index)
-        return Tracking(self.problem.take(index), *tensors)
+        return Tracking(self.solves.take(index), *tensors)
 
 
 @dataclass(frozen=True)
@@ -104,15 +109,12 @@ class Tracker:
     def track(self, x: Tensor, reference: Reference, offset: float, before: Tracking | None = None) -> Tracking:
         """Commands for plants x (B, 17), `offset` s after the plan's first knot; `before` is the last result."""
         x_ref, acceleration = self._reference(x, reference, offset)
-        x0 = x[:, RATES.start :].contiguous()
         if before is None:
-            problem = self._problem(x0, x_ref, acceleration, reference.airframe)
+            solves = self._solves(x, x_ref, acceleration, reference.airframe)
         else:
-            cost, (thrust_sum, limits) = before.problem.cost, before.problem.constraints
-            assert isinstance(cost, BoundQuadratic) and isinstance(thrust_sum, ThrustSum)
-            sums = replace(thrust_sum, acceleration=acceleration)
-            problem = before.problem.started_at(x0, [sums, limits], cost.toward(x_ref))
-        reset = self.multipliers == "reset"
+            solves = before.solves
+            _write(solves, x, x_ref, acceleration)
+        problem, reset = solves.problem, self.multipliers == "reset"
         if before is None or reset:
             U = x.new_full((problem.B, self.stages, 4), reference.airframe.hover_speed)
             multipliers, rounds = Multipliers.zero(problem, self.penalty), FIRST_ROUNDS
@@ -120,10 +122,9 @@ class Tracker:
             U, multipliers, rounds = shifted(before.U), before.multipliers.shifted(), 1
         growth, rounds = (self.penalty_growth, self.outer_iterations) if reset else (1.0, rounds)
         for _ in range(rounds):
-            found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, self.inner.rules.phr), U)
-            U = found.U
-            multipliers = update_and_raise_penalty(problem, found.X, U, multipliers, growth, PENALTY_MAX)
-        return Tracking(problem, U[:, 0], measured(problem, found.X, U), U, multipliers)
+            X, U, violation = solves.solve(U, multipliers)
+            multipliers = update_and_raise_penalty(problem, X, U, multipliers, growth, PENALTY_MAX)
+        return Tracking(solves, U[:, 0], violation, U, multipliers)
 
     def _reference(self, x: Tensor, reference: Reference, offset: float) -> tuple[Tensor, Tensor]:
         """The states (B, N+1, 7) and thrust accelerations (B, N) at knots 1..N that are tracked."""
@@ -131,13 +132,26 @@ class Tracker:
         thrusts = rates.new_full((*rates.shape[:2], 4), reference.airframe.hover_thrust)
         return torch.cat((rates, thrusts), dim=-1), acceleration[:, 1:].contiguous()
 
-    def _problem(self, x0: Tensor, x_ref: Tensor, acceleration: Tensor, frame: Airframe) -> Problem:
-        """The tracking problems of Table 5 from states x0 (B, 7)."""
-        b = frame.thrust_coefficient
+    def _solves(self, x: Tensor, x_ref: Tensor, acceleration: Tensor, frame: Airframe) -> RepeatedDescent:
+        """Solves of the tracking problems of Table 5 for plants x (B, 17)."""
+        x0, b = x[:, RATES.start :].clone(), frame.thrust_coefficient
         weight = [1.0] * 3 + [b * b] * 4
         cost = QuadraticCost(weight, [self.effort * b * b] * 4, weight, x_ref, [frame.hover_speed] * 4)
         lower, upper = [-math.inf] * 3 + [frame.thrust_min] * 4, [math.inf] * 3 + [frame.thrust_max] * 4
         limits = RotorLimits(frame) if self.limits == "commands" else StateBounds(lower, upper)
         model = RotorTracking(self.dt, airframe=frame)
         problem = Problem(model, cost, [ThrustSum(acceleration, frame.mass), limits], x0, self.stages)
-        return problem.renewed()  # nobody else holds its parts: no call has to look whether they have changed
+        # Nobody else holds its parts: no call has to look whether they have changed.
+        return RepeatedDescent(self.inner, problem.renewed())
+
+
+def _write(solves: RepeatedDescent, x: Tensor, x_ref: Tensor, acceleration: Tensor) -> None:
+    """Write the numbers of another call into the tracking problems."""
+    problem = solves.problem
+    cost, thrust_sum = problem.cost, problem.constraints[0]
+    assert isinstance(cost, BoundQuadratic) and isinstance(thrust_sum, ThrustSum)
+    problem.x0.copy_(x[:, RATES.start :])
+    cost.x_ref.copy_(x_ref[:, :-1])
+    cost.xf_ref.copy_(x_ref[:, -1])
+    thrust_sum.toward(acceleration)
+    solves.refresh(0)

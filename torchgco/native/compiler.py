@@ -339,15 +339,19 @@ def _held() -> Iterator[None]:
 
 
 def _end_all(started: Sequence[subprocess.Popen[str]]) -> None:
-    for one in (*started, *(begun.process for begun in _begun.values() if begun.owner == os.getpid())):
-        _end(one)
+    for one in _kill_all(started):
+        one.wait()
     _begun.clear()
 
 
-def _end(process: subprocess.Popen[str]) -> None:
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+def _kill_all(started: Sequence[subprocess.Popen[str]]) -> list[subprocess.Popen[str]]:
+    """Kill what is started and the compilers that have begun, without waiting for their ends; returns them."""
+    every = [*started, *(begun.process for begun in list(_begun.values()) if begun.owner == os.getpid())]
+    for one in every:
+        if one.returncode is None:
+            with suppress(ProcessLookupError):
+                os.killpg(one.pid, signal.SIGKILL)
+    return every
 
 
 @contextmanager
@@ -355,7 +359,9 @@ def _ending_by_sigterm(started: Sequence[subprocess.Popen[str]]) -> Iterator[Non
     """In this block a SIGTERM that nobody handles, as in a study's workers, ends what is started by then first."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        _end_all(started)
+        _kill_all(
+            started
+        )  # a handler may not wait: what it interrupts may hold the lock of a process that is waited for
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 

@@ -43,6 +43,7 @@ from torchgco.native.structures import STRUCTURES, Kind, array
 from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
+NO_MEMORY = "native kernels: no memory"
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -135,9 +136,10 @@ class Engine:
 
     def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,) of trajectories."""
-        cost, merit = X.new_empty(2, len(X))
+        B = lagrangian.problem.B
+        cost, merit = X.new_empty(B), X.new_empty(B)
         packed = self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=cost, merit=merit)
-        self._run("tgco_value", len(X), packed)
+        self._run("tgco_value", B, packed)
         return cost, merit
 
     def gains(
@@ -202,21 +204,20 @@ class Engine:
         B = lagrangian.problem.B
         out = {name: _flags(B) for name in ("status", "converged", "refused", "lost")}
         out |= {name: torch.zeros(B, dtype=torch.float64) for name in ("alpha", "used")}
-        replicas = LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
-        packed = self.terms(lagrangian, None, **state, **out, options=options, limit=limit, replicas=replicas)
+        packed = self.terms(lagrangian, None, **state, **out, options=options, limit=limit, replicas=replicas_of(B))
         self._run("tgco_ilqr", B, packed)
         return out
 
     def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
         """The largest violation (B,) of trajectories, of problems that the library `measures`; of obstacles alone?"""
-        worst, name = X.new_empty(len(X)), "tgco_penetration" if obstacles else "tgco_violation"
-        self._run(name, len(X), self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
+        worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
+        self._run(name, problem.B, self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
         return worst
 
     def chords(self, problem: Problem, X: Tensor, scale: float) -> Tensor:
         """The smallest distance (B,) of the lines between knots from spheres with radii times `scale`; or infinity."""
-        U, least = X.new_zeros(len(X), problem.N, problem.m), X.new_empty(len(X))
-        self._run("tgco_chords", len(X), self.packed(problem, X=X.contiguous(), U=U, merit=least, gain=scale))
+        U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
+        self._run("tgco_chords", problem.B, self.packed(problem, X=X.contiguous(), U=U, merit=least, gain=scale))
         return least
 
     def outer_loop(self, outer: c.Outer, B: int) -> None:
@@ -256,10 +257,10 @@ class Engine:
         """The problem with multipliers, penalties and guide."""
         multipliers = lagrangian.multipliers
         rows = self._fixed(lagrangian.problem)[1]
-        if best is not None or not all(map(_is_blank, multipliers.lam)):
+        if best is not None or not multipliers.blank:
             rows = [constraint.copy() for constraint in rows]
-            for row, lam in zip(rows, multipliers.lam, strict=True):
-                row.lam = None if _is_blank(lam) else lam.contiguous()
+            for row, lam in zip(rows, () if multipliers.blank else multipliers.lam, strict=not multipliers.blank):
+                row.lam = lam.contiguous()
             for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
                 row.best = lam
         own = {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
@@ -268,11 +269,16 @@ class Engine:
     def _fixed(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
         if "packed" not in vars(problem):
-            object.__setattr__(problem, "packed", self._made(problem))
+            made = None if problem.one is None else self._fixed(problem.one)
+            if made is None or any(row.map_of for row in made[1]):  # which maps C reads is a number of each problem
+                made = self._made(problem)
+            object.__setattr__(problem, "packed", made)
         return vars(problem)["packed"]
 
     def _model(self, problem: Problem) -> c.Problem:
         """The model's part of it; that of the last problem where this one has the same dynamics."""
+        if problem.one is not None:
+            return self._model(problem.one)
         if "model_packed" not in vars(problem):
             known, B, packed = problem.known.model
             if known is not problem.dynamics or B != problem.B:  # what problems share stays the same object in a subset
@@ -289,20 +295,29 @@ class Engine:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
         rows, packed = self._constraints(problem), self._model(problem).copy()
         packed.constraints, packed.constraint = len(rows), rows
-        cost, shared = self.cost, self.shared.cost
-        packed.cost_data = quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, shared)
-        packed.bounded = int(self.cost is None and is_bounded(problem.cost))
+        packed.cost_data, packed.bounded = self._cost(problem)
         return packed, rows
 
+    def _cost(self, problem: Problem) -> tuple[list[c.Array], int]:
+        """The cost's arrays, and whether it is `bounded`; those of the last problem where this one has the same."""
+        known, B, own = problem.known.cost
+        if known is not problem.cost or B != problem.B:
+            if self.cost is None:
+                own = quadratic_arrays(problem.cost), int(is_bounded(problem.cost))
+            else:
+                own = cost_arrays(problem, self.cost, self.shared.cost), 0
+            problem.known.cost = problem.cost, problem.B, own
+        return own
+
     def _constraints(self, problem: Problem) -> list[c.Constraint]:
-        """The rows without multipliers; those of the last problem where this one differs in its cost alone."""
-        known, rows = problem.known.packed
-        if known is problem.constraints:
-            return rows
-        rows = []
+        """The rows without multipliers; of each constraint those of the last problem where this one has the same."""
+        packed, rows = problem.known.packed, []
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
-            rows.append(constraint_of(constraint, shape, self.row_numbers(problem, i), problem))
-        problem.known.packed = problem.constraints, rows
+            known, B, row = packed.get(i, (None, 0, None))
+            if known is not constraint or B != problem.B:
+                row = constraint_of(constraint, shape, self.row_numbers(problem, i), problem)
+                packed[i] = constraint, problem.B, row
+            rows.append(row)
         return rows
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
@@ -315,6 +330,11 @@ class Engine:
         return {**own, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
 
 
+def replicas_of(B: int) -> int:
+    """How many lanes share the line search of each of B problems."""
+    return LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
+
+
 def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:
     """Call a function of a library on `count` problems, in whole groups, by as many threads as PyTorch uses.
 
@@ -323,14 +343,16 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure, first
     """
     if count == 0:
         return
-    groups = -(-count // group)
-    threads = torch.get_num_threads()
+    groups, threads = -(-count // group), torch.get_num_threads()
+    if groups == 1 or threads == 1:
+        if not function(ctypes.byref(argument), ctypes.c_int64(first), ctypes.c_int64(first + count)):
+            raise MemoryError(NO_MEMORY)
+        return
     parts = min(threads, groups)
     edges = [first + group * (groups * i // parts) for i in range(parts)] + [first + count]
     spans = [(ctypes.byref(argument), ctypes.c_int64(a), ctypes.c_int64(b)) for a, b in pairwise(edges)]
-    done = [function(*spans[0])] if parts == 1 else _at_once(function, spans, _helpers(threads - 1))
-    if not all(done):
-        raise MemoryError("native kernels: no memory")
+    if not all(_at_once(function, spans, _helpers(threads - 1))):
+        raise MemoryError(NO_MEMORY)
 
 
 def _at_once(function: Any, spans: list[tuple[Any, ...]], helpers: ThreadPoolExecutor) -> list[int]:
@@ -360,11 +382,6 @@ def _measured(part: Constraint) -> bool:
     if part.row_radii is not None:
         return type(innermost(part)).violation in (NormBounds.violation, SpheresInFreeTime.violation)
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
-
-
-def _is_blank(lam: Tensor) -> bool:
-    """Whether multipliers are `Multipliers.none`: one zero for all."""
-    return not any(lam.stride()) and lam.numel() > 0 and float(lam[0, 0, 0]) == 0.0
 
 
 def _flags(B: int) -> Tensor:

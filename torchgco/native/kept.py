@@ -13,43 +13,30 @@ from torch import Tensor
 
 from torchgco.lagrangian.lagrangian import later
 from torchgco.native import structures as c
-from torchgco.native.codegen.cost import cost_arrays
 from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import run
 from torchgco.native.interior import InteriorEngine
-from torchgco.native.packing import constraint_of, quadratic_arrays, shared_fields
-from torchgco.native.shared import Shared
+from torchgco.native.kept_problem import KeptProblem
 from torchgco.problem.problem import Problem
 
 
-class Kept:
-    """The interior point's library with problems whose numbers lie where it reads them.
+class Kept(KeptProblem):
+    """Kept problems for the interior point.
 
     Args:
         kernels: of the problems' form.
-        problem: what is kept. Numbers that C reads as they are, such as the references of a quadratic cost and the
-            centres of spheres, are those of the problem's own tensors: written there in place, they count at once.
+        problem: see `KeptProblem`.
         options: the fields of `structures.Interior` that don't change.
     """
 
     def __init__(self, kernels: InteriorEngine, problem: Problem, **options: Any) -> None:
+        super().__init__(kernels.engine, problem)
         B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
-        self.engine, self.problem = kernels.engine, problem
-        self._read: Shared | None = None  # what functions have captured, when C was last given it
         self.library, self.lanes = kernels.library, kernels.lanes
-        self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
-        self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
         self.gains = like.new_zeros(B, N, m, n + 1)
         self.status, self.iterations = torch.zeros(B, dtype=torch.int32), torch.zeros(B, dtype=torch.int64)
         self.barrier = like.new_zeros(B)
-        self._numbers = [self._own_numbers(i) for i in range(len(problem.constraints))]
-        rows = [self._row(i, numbers) for i, numbers in enumerate(self._numbers)]
-        self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(self.engine.shared))
-        self._model = self._model_array()
-        self._cost = self._cost_arrays()
-        self.packed.fill({"parameters": self._model, "cost_data": self._cost})
-        self.packed.fill({"X": self.X, "U": self.U, "gains": self.gains})
-        self.packed.fill({"status": self.status, "iterations": self.iterations})
+        self.packed.fill({"gains": self.gains, "status": self.status, "iterations": self.iterations})
         self.rolled = self.X.clone(), self.U.clone()  # trajectories of the controls with their feedback
         self.worst = like.new_zeros(B)
         # The same memory by NumPy, which takes a small share of PyTorch's time for a few numbers.
@@ -139,58 +126,6 @@ class Kept:
             else:
                 part[:] = part[:, at]
 
-    @property
-    def is_outdated(self) -> bool:
-        """Whether tensors that functions capture may have other numbers than C."""
-        captured = self.engine.captured
-        return captured.is_mixed or not captured.is_still(self._read)
-
-    def refresh_captured(self) -> bool:
-        """Read what functions capture again; whether the library computes with it as it is now."""
-        self._read = self.engine.captured.read()
-        if self._read is None:
-            return False
-        self.engine.shared.take_over(self._read)
-        # Some of these numbers may be a knot's own, and problems' own ones computed from what was captured.
-        for i in self.engine.functions:
-            self.refresh_constraint(i)
-        self.refresh_cost()
-        self.refresh_model()
-        return True
-
-    def refresh_constraint(self, i: int) -> None:
-        """Read the numbers of constraint i again, after its tensors have changed."""
-        new = self._own_numbers(i)
-        arrays = [name for name, value in new.items() if isinstance(value, c.Array)]
-        _copy([self._numbers[i][name] for name in arrays], [new[name] for name in arrays])
-
-    def refresh_cost(self) -> None:
-        """The same of the cost."""
-        _copy(self._cost, self._cost_arrays())
-
-    def refresh_model(self) -> None:
-        """The same of the dynamics."""
-        _copy([self._model], [self._model_array()])
-
-    def _row(self, i: int, numbers: dict[str, Any]) -> c.Constraint:
-        problem = self.problem
-        row = constraint_of(problem.constraints[i], problem.row_shapes[i], numbers, problem)
-        row.lam = self.lam[i]
-        return row
-
-    def _own_numbers(self, i: int) -> dict[str, Any]:
-        return self.engine.row_numbers(self.problem, i)
-
-    def _cost_arrays(self) -> list[c.Array]:
-        cost, problem = self.engine.cost, self.problem
-        return quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, self.engine.shared.cost)
-
-    def _model_array(self) -> c.Array:
-        model, problem = self.engine.model, self.problem
-        if model.count == 0:
-            return c.Array()
-        return c.array(model.numbers(problem.B, problem.dynamics, self.engine.shared.model), knots=True)
-
 
 def _spans(rows: np.ndarray) -> list[tuple[int, int]]:
     """The first and the last place, plus one, of each run of rows that are marked, (B,) bool."""
@@ -205,11 +140,3 @@ def _moved(knots: Sequence[int], by: int) -> np.ndarray | None:
     at = np.array(later(knots, by), dtype=np.intp)
     last = len(at) - 1
     return None if by <= last and np.array_equal(at, np.minimum(np.arange(by, by + len(at)), last)) else at
-
-
-def _copy(old: list[c.Array], new: list[c.Array]) -> None:
-    """Write the numbers of arrays into the memory of others, which keep their places and shapes."""
-    for before, after in zip(old, new, strict=True):
-        for there, here in zip(before.kept, after.kept, strict=True):
-            if there.data_ptr() != here.data_ptr():
-                there.copy_(here)

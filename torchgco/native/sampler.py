@@ -8,12 +8,12 @@ from torch import Tensor
 from torchgco.base.draws import words
 from torchgco.eager.sampling import Sampling
 from torchgco.native import structures
-from torchgco.native.codegen.source import SAMPLER
+from torchgco.native.codegen.source import LANES, SAMPLER
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import array
 from torchgco.problem.problem import Problem
 
-REALS = {torch.float64: ("double", 8), torch.float32: ("float", 16)}  # type and lanes in C
+REALS = {torch.float64: ("double", LANES), torch.float32: ("float", 2 * LANES)}  # type and lanes in C
 
 
 class Sampler:

@@ -209,6 +209,13 @@ def picked(values: Tensor, at: Tensor) -> Tensor:
     return values.gather(1, index.expand(*at.shape, *values.shape[2:]))
 
 
+def places_of(kept: Tensor) -> Tensor:
+    """Places (B, M') of the true ones of (B, M), in their order, -1 after them; at least one column."""
+    count = max(1, int(kept.sum(-1).max()))
+    order = (~kept).to(torch.int8).argsort(dim=-1, stable=True)[:, :count]
+    return order.masked_fill(~kept.gather(1, order), -1)
+
+
 def marked(lengths: Tensor, absent: Tensor) -> Tensor:
     """Lengths or squares (B, M) as C reads them: `ABSENT` stands for those of absent obstacles."""
     return torch.where(absent, ABSENT, lengths)

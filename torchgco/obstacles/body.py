@@ -16,7 +16,7 @@ from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import CONTACT_FACTOR, TOUCH
 from torchgco.obstacles.attitude import Attitude, attitude_of
-from torchgco.obstacles.base import Obstacles, Solids
+from torchgco.obstacles.base import Obstacles, Solids, places_of
 
 if TYPE_CHECKING:
     from torchgco.constraints.base import Constraint
@@ -244,6 +244,8 @@ class BoundBody(Obstacles):
     sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
     moving = property(lambda self: self.inner.moving)  # type: ignore[assignment]
     radii = property(lambda self: torch.stack([ball.vehicle_radius for ball in self.balls], dim=-1))  # (B, P), m
+    # Of the smallest ball about the position that holds the body, (B,), m.
+    reach = property(lambda self: (self.points.offsets.norm(dim=-1) + self.radii).amax(-1))
     calls_function = property(lambda self: self.points.attitude.calls_function)
 
     def __repr__(self) -> str:
@@ -286,9 +288,28 @@ class BoundBody(Obstacles):
 
     def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
         """As of all obstacles, of states that change evenly between the knots."""
-        part, X = self.finer(X)
+        near = self._nearest(X, share)
+        part, X = (self if near is None else self.chosen(near)).finer(X)
         found = [ball.chord_clearance(P, share) for ball, P in part.each(X)]
         return (torch.stack(found, dim=-1) - part.points.bulge(X).amax(1)).amin(-1)
+
+    def _nearest(self, X: Tensor, share: float) -> Tensor | None:
+        """Places (B, M') of those that may be the nearest to a ball on its way along X; None of a kind that can't say.
+
+        A ball is no farther from an obstacle than at a knot, and no nearer than its reach around the position is.
+        """
+        inner, p = self.inner, X[..., self.position]
+        bars = inner.moving or inner.stops is not None or inner.absent.numel() == 0
+        if bars or type(inner).chosen is Obstacles.chosen:
+            return None
+        out = self.points.offsets.norm(dim=-1)
+        away = inner.signed_distance(p, p.new_zeros(p.shape[1])).amin(1) + inner.vehicle_radius.unsqueeze(-1)  # (B, M)
+        half = 0.5 * p.diff(dim=1).norm(dim=-1).amax(-1)  # a point of the way is so near to a knot
+        least = away - ((out + self.radii).amax(-1) + half).unsqueeze(-1)
+        most = away + share * inner.margins + ((out - self.radii).amin(-1) + share * self.radii.amax(-1)).unsqueeze(-1)
+        limit = most.amin(-1) + self.points.bulge(X).flatten(1).amax(-1)
+        kept = ~(least > limit.unsqueeze(-1)) & ~inner.absent  # NaN may be near
+        return places_of(kept)
 
     def finer(self, X: Tensor) -> tuple[BoundBody, Tensor]:
         """The same obstacles for X (B, PIECES N + 1, n), with `PIECES` steps in place of each of X (B, N+1, n).

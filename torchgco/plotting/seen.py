@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil
-from pathlib import Path
-
 import numpy as np
-from matplotlib.animation import PillowWriter
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
@@ -19,11 +15,10 @@ from torchgco.base.errors import InputError
 from torchgco.missions.log import MissionLog, SeenLog
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.course import VEHICLE_COLOUR, Course, draw_contacts, handles
-from torchgco.plotting.style import DPI, INK, PALETTE, legend, tidy
+from torchgco.plotting.style import INK, PALETTE, legend, tidy
 
 CELLS = ("unknown", "known to be free", "known to be occupied")
 SHADES = ListedColormap(["#9A9A9A", "#F4F4F4", "#3B3B3B"])
-SEEN_FPS = 10
 
 
 def seen_figure(log: MissionLog, b: int, course: Course, step: int, reach: float = np.nan) -> Figure:
@@ -45,31 +40,6 @@ def seen_figure(log: MissionLog, b: int, course: Course, step: int, reach: float
     touched = len(course.contacts(_track(log, b, int(log.steps()[b]) - 1), log.period)) > 0
     legend(figure, [*_handles(), *handles(course, touched)])
     return figure
-
-
-def seen_animation(
-    log: MissionLog, b: int, course: Course, path: Path, reach: float = np.nan, frames: int = 80
-) -> Path:
-    """Write a GIF of mission b with at most so many pictures of `seen_figure`.
-
-    Raises:
-        InputError: as `seen_figure`.
-    """
-    steps = int(log.steps()[b])
-    seen = _seen(log, b, steps - 1)
-    figure = seen_figure(log, b, course, 0, reach)
-    (ax,), writer, state = figure.axes, PillowWriter(fps=SEEN_FPS), np.zeros(seen.shape, np.uint8)
-    every = max(1, ceil((steps - 1) / (frames - 1)))
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # the axes stay where they are
-    with writer.saving(figure, str(path), DPI):
-        for step, (cells, new) in enumerate(seen.changes[:steps]):
-            state.reshape(-1)[cells] = new
-            if step % every == 0 or step == steps - 1:
-                ax.clear()
-                _draw(ax, log, b, course, step, state, reach)
-                writer.grab_frame()
-    return path
 
 
 def _seen(log: MissionLog, b: int, step: int) -> SeenLog:

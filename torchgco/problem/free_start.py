@@ -65,3 +65,15 @@ def checked_horizon(horizon: Any, x0: Tensor, N: int) -> Tensor:
     if not bool(((given >= 1) & (given <= N)).all()):
         raise InputError("horizon", expected, given.tolist())
     return given.to(torch.int64)
+
+
+def clear_starts(constraints: Sequence[Constraint], x0: Tensor, free: Tensor | None, position: slice | None) -> Tensor:
+    """Which starts x0 (B, n) lie outside the obstacles, (B,) bool.
+
+    Those that hold at later knots than 1 don't count: a vehicle may leave them. Nor does a guess of a free start.
+    """
+    clear = torch.ones_like(x0[:, 0], dtype=torch.bool)
+    for constraint in constraints:
+        if constraint.holds_at(0) or constraint.holds_at(1):
+            clear &= constraint.start_is_clear(x0)
+    return clear if free is None or position is None else clear | free[:, position].any(dim=-1)

@@ -14,6 +14,7 @@ from torchgco.base.shapes import MISTAKES, Dimensions, tensor
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import resolve_knots
 from torchgco.costs.base import Cost
+from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.obstacles.spheres import BoundSpheres
 
 A_CLOCK = "time as a state of the model's own, whose derivative is 1, says what it is"
@@ -136,6 +137,8 @@ def check_served(problem: Any) -> None:
         raise InputError("cost", "a sum over stages where the time is free", f"{type(cost).__name__}.total")
     if _depends_on_stage(problem):
         raise InputError("cost", f"the same cost at all stages where the time is free; {A_CLOCK}", "one per stage")
+    if isinstance(cost, QuadraticInFreeTime) and problem.time.count > 1:
+        raise InputError("time.segments", "None where x_ref follows the time", f"{problem.time.count} segments")
     for i, part in enumerate(problem.constraints):
         if getattr(part, "moving", False):
             if not isinstance(part, BoundSpheres):
@@ -152,8 +155,9 @@ def _depends_on_stage(problem: Any) -> bool:
     x = problem.x0 + 1e-3 * (1.0 + problem.x0.abs()) * scattered(problem.x0)
     u = problem.x0.new_zeros(problem.B, problem.m)
     X, U = (z.unsqueeze(1).expand(-1, problem.N, -1).contiguous() for z in (x, u + 1e-3 * (1.0 + 0.5 * scattered(u))))
+    cost = problem.cost.of_errors if isinstance(problem.cost, QuadraticInFreeTime) else problem.cost
     try:
-        value = problem.cost.stage(X, U, torch.arange(problem.N, device=X.device))
+        value = cost.stage(X, U, torch.arange(problem.N, device=X.device))
     except MISTAKES:
         return False  # what is wrong there is told elsewhere
     first = value[:, :1]

@@ -123,7 +123,7 @@ class Goal(PerElement):
 
     def distance(self, p: Tensor) -> Tensor:
         """Distances (B, ...) of points p (B, ..., d) from the centre, m."""
-        center = self.position.view(-1, *([1] * (p.dim() - 2)), p.shape[-1])
+        center = self.position if p.dim() == 2 else self.position.view(-1, *([1] * (p.dim() - 2)), p.shape[-1])
         return (p - center).square().sum(-1).sqrt()
 
 

@@ -20,6 +20,7 @@ from torchgco.base.shapes import Dimensions, check_shape, lead
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.costs.base import Cost, WrappedCost
+from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.obstacles.base import Obstacles
@@ -256,7 +257,8 @@ def _cost(problem: Problem, time: FreeTime) -> Cost:
     seconds = time.weight * dt
     pin = PIN * torch.where(seconds > 0, seconds, dt)
     idle = None if time.count == 1 else 1.0 - _switches(time, problem.N)  # type: ignore[operator]
-    return _Cost(problem.cost, problem.n, problem.m, seconds, pin, idle)
+    kind = _QuadraticCost if isinstance(problem.cost, QuadraticInFreeTime) else _Cost
+    return kind(problem.cost, problem.n, problem.m, seconds, pin, idle)
 
 
 @dataclass(frozen=True)
@@ -277,16 +279,32 @@ class _Cost(WrappedCost):
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         tau = x[..., self.n]
-        value = tau * self.cost.stage(x[..., : self.n], u[..., : self.m], k) + lead(self.seconds, tau) * tau
+        value = tau * self._stage(x[..., : self.n], u[..., : self.m], k, tau) + lead(self.seconds, tau) * tau
         if self.idle is None:
             return value
         return value + lead(self.pin, tau) * _of_stages(self.idle, k, tau) * (u[..., self.m] - 1.0).square()
+
+    def _stage(self, x: Tensor, u: Tensor, k: int | Tensor, tau: Tensor) -> Tensor:
+        return self.cost.stage(x, u, k)
 
     def terminal(self, x: Tensor) -> Tensor:
         return self.cost.terminal(x[..., : self.n])
 
     def goal(self, x0: Tensor) -> None:
         """The problem has its goal already."""
+
+
+@dataclass(frozen=True)
+class _QuadraticCost(_Cost):
+    """The same of a quadratic cost whose references follow the time."""
+
+    cost: QuadraticInFreeTime
+
+    def _stage(self, x: Tensor, u: Tensor, k: int | Tensor, tau: Tensor) -> Tensor:
+        return self.cost.stage_at(x, u, k, tau)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self.cost.terminal_at(x[..., : self.n], x[..., self.n])
 
 
 def _bounds(whole: Problem, time: FreeTime, n: int) -> list[Constraint]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
-from torchgco.base.tree import Rows, cast, is_users
+from torchgco.base.tree import Rows, cast, field_names, is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -22,7 +22,7 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import as_given, bound, remember
 from torchgco.problem.border import check_code
-from torchgco.problem.free_start import checked_horizon, chooses_position, moved_inside, start_mask
+from torchgco.problem.free_start import checked_horizon, chooses_position, clear_starts, moved_inside, start_mask
 from torchgco.problem.free_time import FreeTime, check_served
 from torchgco.problem.given import Given, place, replaced
 from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
@@ -69,6 +69,7 @@ class Problem:
 
     known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
     given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
+    one: ClassVar[Problem | None] = None  # the single problem that all of these are; None: they are no such copies
 
     def __post_init__(self) -> None:
         fields_given = as_given({f.name: getattr(self, f.name) for f in fields(self)})
@@ -106,7 +107,8 @@ class Problem:
         first = 0 if chooses_position(self.free_start, model.position) else 1
         goal, dt = self.goal and self.goal.place, getattr(model, "dt", None)
         names = tuple(getattr(model, "state_names", ()))
-        return Dimensions(len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon, names)
+        parts = len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon, names
+        return Dimensions(*parts, free_time=self.time is not None)
 
     def __repr__(self) -> str:
         return summary(self)
@@ -167,11 +169,8 @@ class Problem:
 
     @cached_property
     def start_is_clear(self) -> Tensor:
-        """Whether each problem starts outside its obstacles, (B,) bool."""
-        clear = torch.ones(self.B, dtype=torch.bool, device=self.x0.device)
-        for constraint in self.constraints:
-            clear &= constraint.start_is_clear(self.x0)
-        return clear
+        """Whether each problem starts outside its obstacles, (B,) bool; see `free_start.clear_starts`."""
+        return clear_starts(self.constraints, self.x0, self.free_start, self.dynamics.position)
 
     @cached_property
     def cost_scale(self) -> CostScale:
@@ -260,6 +259,8 @@ class Problem:
             "time": None if self.time is None else self.time.take(index),
         }
         part = self._with(parts, known=self.known)
+        if self.B == 1 or self.one is not None:
+            object.__setattr__(part, "one", self.one or self)
         if self.given is not None:
             object.__setattr__(part, "given", self.given.followed(self, lambda whole: whole.take(index)))
         return part
@@ -351,6 +352,17 @@ class Problem:
             check_code(dims, started.x0, pair(dynamics, "dynamics"), pair(cost, "cost"), new)
         return started
 
+    def moved_to(self, x0: Tensor, constraints: Sequence[Constraint] | None, dynamics: Dynamics | None) -> Self:
+        """`started_at` by parts of the same kinds, code and shapes (None: those before), unchecked."""
+        dims, parts = self._dimensions(x0, dynamics), dict[str, Any]()
+        if dynamics is not None:
+            parts["dynamics"] = dynamics.bind(dims)
+        if constraints is not None:
+            rows = [part.bind(dims) for part in without_goal(self.goal, dims, constraints)]
+            parts["constraints"] = with_goal(self.goal, rows, dims)
+        parts["x0"] = moved_inside(x0, self.free_start, parts.get("constraints", self.constraints))
+        return self._with(parts, known=self.known)
+
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
         names = "dynamics", "cost", "constraints", "x0", "goal", "time"
@@ -359,8 +371,8 @@ class Problem:
     def _with(self, parts: dict[str, object], known: Known | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
         copy = object.__new__(type(self))
-        for f in fields(self):
-            object.__setattr__(copy, f.name, parts.get(f.name, getattr(self, f.name)))
+        for name in field_names(type(self)):
+            object.__setattr__(copy, name, parts[name] if name in parts else getattr(self, name))
         object.__setattr__(copy, "known", Known() if known is None else known)
         return copy
 

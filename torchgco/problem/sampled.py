@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import jvp
 
+from torchgco.base.autodiff import slope_along
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import Quantity, controls_of, states_of
 from torchgco.problem.between import between
 
 TIME_COLUMN = "t [s]"
+RATE_OF_POSITION, SECOND_RATE = "d{}/dt", "d2{}/dt2"  # of the position, where states have the usual names
 ROUNDING = 1e-9  # of a sample: an end this close after one is that sample's
 
 
@@ -19,8 +22,8 @@ def sampled(dynamics: Dynamics | None, X: Tensor, U: Tensor, t: Tensor, rate: fl
     """Columns by label: times, states, controls, and what the model knows beside them.
 
     Controls hold from their knot to the next one; the last row has the last ones. Of models that integrate a
-    derivative, states between the knots are the integrator's, and of their position come the acceleration and, where no
-    state has these names, the velocity. Of others there are straight lines between the knots.
+    derivative, states between the knots are the integrator's, and of their position come the acceleration and, where it
+    isn't a state, the velocity. Of others there are straight lines between the knots.
 
     Args:
         dynamics: None: not known, and numbers stand for names.
@@ -41,7 +44,8 @@ def sampled(dynamics: Dynamics | None, X: Tensor, U: Tensor, t: Tensor, rate: fl
     columns = {TIME_COLUMN: t[k] + h}
     columns |= {one.label: x[:, i] for i, one in enumerate(named[0])}
     if dynamics is not None:
-        columns |= _of_position(dynamics, x, u, k, {one.name for one in named[0]}) | dynamics.derived(x, u)
+        states = {one.name.partition(" [")[0]: x[:, i] for i, one in enumerate(named[0])}  # a unit may stand in a name
+        columns |= _of_position(dynamics, x, u, k, states) | dynamics.derived(x, u)
     columns |= {one.label: u[:, i] for i, one in enumerate(named[1])}
     return {label: values.detach().cpu().numpy() for label, values in columns.items()}
 
@@ -61,17 +65,25 @@ def _places(t: Tensor, rate: float | None) -> tuple[Tensor, Tensor, Tensor]:
     return k, h, t[k + 1] - t[k]
 
 
-def _of_position(dynamics: Dynamics, x: Tensor, u: Tensor, k: Tensor, taken: set[str]) -> dict[str, Tensor]:
-    """Velocity and acceleration of the position, (T,) each, of models that integrate a derivative."""
+def _of_position(
+    dynamics: Dynamics, x: Tensor, u: Tensor, k: Tensor, states: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Velocity and acceleration of the position, (T,) each, of models that integrate a derivative.
+
+    Their names are `vx` and `ax`; where states have such names, but are something else, in the vehicle's axes for
+    instance, `dx/dt` and `d2x/dt2`.
+    """
     at = dynamics.position
     if at is None or at.stop - at.start > 3 or not dynamics.is_integrated:
         return {}
     model, x, u = dynamics.at(k), x.unsqueeze(0), u.unsqueeze(0)
     rates = model.field(x, u)
-    change = jvp(lambda z: model.field(z, u), (x,), (rates,))[1]
+    change = slope_along(lambda z: model.field(z, u), (x,), (rates,))
     columns = {}
-    for kind, unit, values in (("v", "m/s", rates), ("a", "m/s^2", change)):
-        names = [f"{kind}{letter}" for letter in "xyz"[: at.stop - at.start]]
-        if not taken & set(names):
-            columns |= {f"{name} [{unit}]": values[0, :, at.start + i] for i, name in enumerate(names)}
+    for name, other, unit, values in (("v{}", RATE_OF_POSITION, "m/s", rates), ("a{}", SECOND_RATE, "m/s^2", change)):
+        own = {name.format(axis): values[0, :, at.start + i] for i, axis in enumerate("xyz"[: at.stop - at.start])}
+        if all(torch.allclose(states[key], own[key]) for key in own if key in states):
+            columns |= {f"{key} [{unit}]": own[key] for key in own if not own.keys() & states.keys()}
+        else:
+            columns |= {f"{other.format(key[-1])} [{unit}]": values for key, values in own.items()}
     return columns

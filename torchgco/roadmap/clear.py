@@ -10,9 +10,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from torchgco.maps.ways import length
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.mapped import CLOSE_UNITS, Price, even, in_each, in_one, length, one_of_each_class, ways_of
+from torchgco.roadmap.mapped import CLOSE_UNITS, Price, even, in_each, in_one, one_of_each_class, ways_of
 from torchgco.roadmap.search import HOPS
 
 ROOMY = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide

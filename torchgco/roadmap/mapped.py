@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import on_cpu, take
+from torchgco.maps.ways import length
 from torchgco.roadmap import blocks as searched
 from torchgco.roadmap.blocks import Blocks, blocks_of
 from torchgco.roadmap.geometry import Inflated, Scene
@@ -394,10 +395,6 @@ def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf
         if length(path) > (1.0 - LITTLE) * before:
             break
     return path
-
-
-def length(path: Array) -> float:
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
 def _dense(path: Array, step: float) -> Array:

@@ -86,12 +86,13 @@ class Roadmap:
             for course in self._courses(scene, some, first, count, library, known or Known()):
                 corners[place[course.rows]] = torch.stack(course.paths[:count], dim=1)
                 found[place[course.rows]] = course.found
-        some = (scene.obstacles.sizes > 0.0).any(-1) & (scene.start != scene.goal).any(-1)
-        low, high = scene.obstacles.region(scene.start, scene.goal)
-        some &= torch.isfinite(high - low).all(-1)  # else no lattice covers it
-        lost = (~found & some[rows]).nonzero().flatten()
-        if lost.numel() > 0:
-            corners[lost], found[lost] = paths_in_maps(scene.take(rows[lost]), count, self.max_overlap)
+        if not bool(found.all()):
+            some = (scene.obstacles.sizes > 0.0).any(-1) & (scene.start != scene.goal).any(-1)
+            low, high = scene.obstacles.region(scene.start, scene.goal)
+            some &= torch.isfinite(high - low).all(-1)  # else no lattice covers it
+            lost = (~found & some[rows]).nonzero().flatten()
+            if lost.numel() > 0:
+                corners[lost], found[lost] = paths_in_maps(scene.take(rows[lost]), count, self.max_overlap)
         return corners, found
 
     def clear_path(self, scene: Scene) -> tuple[Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -13,6 +14,7 @@ from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import Cost
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles, Solids
+from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
@@ -49,6 +51,17 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     gates = gates_of(problem)
     centers = None if gates is None else gates.centers
     return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost, centers)
+
+
+def around_body(problem: Problem, scene: Scene) -> Scene | None:
+    """The same scene as the ball meets it that holds the body; None without a body, and among maps."""
+    bodies = [part for part in problem.obstacles if isinstance(part, BoundBody)]
+    if not bodies or scene.obstacles.maps:
+        return None
+    more = torch.stack([part.reach - part.inner.vehicle_radius for part in bodies]).amax(0).unsqueeze(-1)
+    kinds = scene.obstacles.kinds
+    grown = [replace(part, radii=torch.where(part.absent, part.radii, part.radii + more)) for part in kinds]
+    return replace(scene, obstacles=Inflated(*grown))
 
 
 def has_paths(problem: Problem) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Scenario(ABC):
         raise NotImplementedError(f"{type(self).__name__} overrides _draw_one or draw")
 
 
-def generator(seed: int, number: int) -> np.random.Generator:
+def generator(seed: Any, number: int) -> np.random.Generator:
     """The stream of layout `number` under `seed`: counter-based, independent of every other number's."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(number,))))
 
@@ -86,6 +86,8 @@ class Family(Scenario):
     stages: checks.Stages
     dt: checks.TimeStep
 
+    zeros: ClassVar[int] = 0  # states after the position, at rest; none where what these are is the model's to say
+
     def __post_init__(self) -> None:
         check_options(self, "scenario")
         if not self.name:
@@ -94,13 +96,17 @@ class Family(Scenario):
             object.__setattr__(self, field.name, checks.plain(getattr(self, field.name)))
 
     @property
+    def dimension(self) -> int:
+        """That of its start."""
+        return len(self.start)
+
+    @property
     def states(self) -> int:
         """n."""
-        return len(self._at_rest(self.start))
+        return self.dimension + self.zeros
 
-    @abstractmethod
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        """The vehicle's state (n,) at rest in `position` (d,), or the position where that is the model's to say."""
+        return np.array([*position, *[0.0] * self.zeros])
 
     def _layout(self, **obstacles: Any) -> Layouts:
         """One layout with these fields of Layouts; without `centers` there are no spheres."""

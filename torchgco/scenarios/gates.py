@@ -146,17 +146,9 @@ class Race(Family):
             raise InputError("scenario.time_least", f"at most scenario.time_most, {self.time_most}", self.time_least)
 
     @property
-    def dimension(self) -> int:
-        """3."""
-        return 3
-
-    @property
     def states(self) -> int:
         """n of the model that races: its controls are thrusts of rotors."""
         return 13
-
-    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        return np.array(position, np.float64)
 
     def draw(self, ids: Sequence[int], seed: int) -> Layouts:
         """The layouts numbered `ids` (each >= 0) under `seed` (>= 0), in that order: 0 is the track as it is."""

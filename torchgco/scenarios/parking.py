@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -51,13 +50,7 @@ class Parking(Family):
     width: checks.Size = 1.8
     kerb: checks.Length = 0.25
 
-    @property
-    def dimension(self) -> int:
-        """2."""
-        return 2
-
-    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        return np.array([*position, 0.0, 0.0, 0.0])
+    zeros: ClassVar[int] = 3
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         within = np.array([*self.start_within, self.start_turn])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -39,6 +39,8 @@ class Planar(Family):
     control_lower: Bound | tuple[Bound, Bound] | None = -10.0
     control_upper: Bound | tuple[Bound, Bound] | None = 10.0
 
+    zeros: ClassVar[int] = 4
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for field in ("control_lower", "control_upper"):
@@ -48,14 +50,6 @@ class Planar(Family):
         lower, upper = self.control_lower, self.control_upper
         if lower is not None and upper is not None and np.greater(lower, upper).any():
             raise InputError("scenario.control_lower", f"at most control_upper, {upper}", lower)
-
-    @property
-    def dimension(self) -> int:
-        """2."""
-        return 2
-
-    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        return np.array([*position, 0.0, 0.0, 0.0, 0.0])
 
     def _layout(self, **obstacles: Any) -> Layouts:
         return super()._layout(control_lower=self.control_lower, control_upper=self.control_upper, **obstacles)

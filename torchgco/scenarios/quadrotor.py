@@ -33,17 +33,9 @@ class Quadrotor(Family):
     dt: checks.TimeStep = 0.05
 
     @property
-    def dimension(self) -> int:
-        """3."""
-        return 3
-
-    @property
     def states(self) -> int:
         """n of the model that flies among them."""
         return PLANNING_STATES
-
-    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        return np.array(position, np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)

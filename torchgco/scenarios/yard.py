@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,13 +42,7 @@ class Yard(Family):
     region: checks.Region2 = ((-3.5, 3.5), (-2.5, 2.5))
     clearance: checks.Length = 1.5
 
-    @property
-    def dimension(self) -> int:
-        """2."""
-        return 2
-
-    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        return np.array([*position, 0.0, 0.0])
+    zeros: ClassVar[int] = 2
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         keep_clear = ((self.start, self.clearance), (self.goal, self.clearance))

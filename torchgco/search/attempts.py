@@ -47,6 +47,10 @@ class Best:
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
         self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced
 
+    def of(self, rows: Tensor) -> SolveEnd:
+        """How the best attempts of problems `rows` (b,), ascending, have ended: to be read, not to be kept."""
+        return self.end if rows.numel() == self.call.problem.B else take(self.end, rows)
+
     def arrived(self, tolerances: float = 1.0) -> Tensor:
         """Whether each problem's best trajectory is feasible and ends within `tolerances` goal tolerances, (B,)."""
         if tolerances not in self._arrived:
@@ -93,7 +97,7 @@ class Best:
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
         """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""
         problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
-        old = take(self.end, rows)
+        old = self.of(rows)
         preferred = is_preferred(problem, new.best, old.best, limit)
         self._spare(problem, rows, preferred, old, new)
         self.replace(rows, preferred, new.best, new)
@@ -102,6 +106,8 @@ class Best:
         """Remember those of two trajectories that lose by their cost alone to one that touches between two knots."""
         limit = self.solver.violation_tolerance
         fits = (old.best.violation <= limit) & (new.best.violation <= limit)
+        if not bool(fits.any()):
+            return
         fits &= ~leaves_goal(problem, new.best.X, old.best.X) & ~leaves_goal(problem, old.best.X, new.best.X)
         if not bool(fits.any()):
             return
@@ -129,9 +135,10 @@ class Best:
             self.record.passes[-1][2].extend(self.call.rows[rows].tolist())
         self.worked[rows] = True
         chosen = where.nonzero().flatten()
-        self._arrived.clear()
-        put(self.end.best, rows[chosen], take(trajectories, chosen))
-        self.end.status[rows[chosen]] = new.status[chosen]
+        if chosen.numel() > 0:
+            self._arrived.clear()
+            put(self.end.best, rows[chosen], take(trajectories, chosen))
+            self.end.status[rows[chosen]] = new.status[chosen]
         for name in ("iterations", "outer", "guided"):
             getattr(self.end, name)[rows] += getattr(new, name)
 

@@ -108,7 +108,7 @@ class ClearChords(Row):
         Returns where they did, and their clearances.
         """
         best, problem = search.best, search.call.problem.take(rows)
-        old, limit = take(best.end.best, rows), search.solver.violation_tolerance
+        old, limit = best.of(rows).best, search.solver.violation_tolerance
         serves, found, clearance = serving(problem, new.best, old, least, limit)
         best.replace(rows, serves, found, new)
         return serves, clearance

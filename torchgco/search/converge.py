@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status, is_over
-from torchgco.base.tree import put, take
+from torchgco.base.tree import put
 from torchgco.kernels import chord_clearance, is_convex
 from torchgco.lagrangian.quality import is_preferred, leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -115,7 +115,7 @@ class Converge(Row):
     def _continue(self, search: Search, rows: Tensor) -> None:
         if rows.numel() > 0:
             call = replace(search.call.take(rows), callback=None)  # a few iterations: not worth a report
-            self._keep(search, rows, continued(search.interior, call, take(search.best.end.best, rows)))
+            self._keep(search, rows, continued(search.interior, call, search.best.of(rows).best))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.
@@ -123,7 +123,7 @@ class Converge(Row):
         Better are those that arrive, that are clear between knots or touch less there, or that cost less.
         """
         problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
-        old, new = take(search.best.end.best, rows), end.best
+        old, new = search.best.of(rows).best, end.best
         arrives = ~leaves_goal(problem, new.X, old.X)
         near = new.cost <= old.cost + WORTH * old.cost.abs()
         serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
@@ -143,7 +143,7 @@ def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
     A result is better that is feasible where the best isn't, or cheaper by more than a stationary trajectory may leave
     to save.
     """
-    old, new = take(search.best.end.best, rows), end.best
+    old, new = search.best.of(rows).best, end.best
     admitted = search.interior.admitted(search.call.problem)
     # A solve that failed counts as lost where it violates by more than those that succeed.
     solved = is_over(search.best.end.status[rows])

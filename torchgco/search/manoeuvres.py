@@ -21,8 +21,8 @@ from torchgco.roadmap.scene import scales, scene_of
 from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
 from torchgco.search.chords import EXTRA
-from torchgco.search.directly import solved
 from torchgco.search.poses import ARC_LENGTH, Poses, clear_at
+from torchgco.search.solved_candidates import solved
 from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
 
 GROWTH_ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before

@@ -19,7 +19,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.kernels import chord_clearance, cost_unit, measured
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.state import Iterate, SolveEnd
-from torchgco.obstacles.base import Obstacles, Solids
+from torchgco.obstacles.base import Obstacles, Solids, places_of
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import gates_of
@@ -41,13 +41,13 @@ class Nearby:
     """
 
     def __init__(self, given: Call, places: list[Tensor | None]) -> None:
-        self.given, self.places = given, places
-        parts = zip(given.problem.constraints, places, strict=True)
+        parts = list(zip(given.problem.constraints, places, strict=True))
+        self.given, self.places = given, [None if at is None else _rows(part, at) for part, at in parts]
         constraints = tuple(c if at is None or not isinstance(c, Obstacles) else c.chosen(at) for c, at in parts)
         problem = _among(given.problem, constraints)
         warm = given.warm
         if warm is not None:
-            warm = replace(warm, lam=tuple(map(_gathered, warm.lam, places)))
+            warm = replace(warm, lam=tuple(map(_gathered, warm.lam, self.places)))
         self.call = replace(given, problem=problem, warm=warm)
 
     @classmethod
@@ -71,13 +71,13 @@ class Nearby:
         known = [part for part in kept if part is not None]
         if not known or problem.B == 0:
             return None
-        present = [~part.absent for part in problem.constraints if isinstance(part, Obstacles)]
+        present = [~part.inscribed.absent for part in problem.constraints if isinstance(part, Obstacles)]
         few = torch.stack([part.sum(-1) for part in known]).sum(0)
         every = torch.stack([part.sum(-1) for part in present]).sum(0)
         worth = (few < every) & (few <= (1.0 - share) * every)
         if not bool(worth.any()):
             return None
-        return cls(call, [None if part is None else _places(part | ~worth.unsqueeze(-1)) for part in kept])
+        return cls(call, [None if part is None else places_of(part | ~worth.unsqueeze(-1)) for part in kept])
 
     def solution(self, found: Solution) -> Solution:
         """The solution with multipliers, all zero, of the obstacles that were left out."""
@@ -143,12 +143,22 @@ def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:
 
 
 def _kept(part: Obstacles, near: Callable[[Obstacles, Solids], Tensor | None]) -> Tensor | None:
-    """Which obstacles (B, M) are near; None for a kind that can't say, and for a body, which extends beyond."""
+    """Which obstacles (B, M) are near; None for a kind that can't say. A body counts as the ball that holds it."""
     solids = part.inflated()
-    bars = isinstance(part, BoundBody) or type(part).chosen is Obstacles.chosen
-    if bars or solids is None or solids.absent.shape[1] == 0:
+    if type(part.inscribed).chosen is Obstacles.chosen or solids is None or solids.absent.shape[1] == 0:
         return None
+    if isinstance(part, BoundBody):
+        more = part.reach - part.inner.vehicle_radius
+        solids = replace(solids, radii=torch.where(solids.absent, solids.radii, solids.radii + more.unsqueeze(-1)))
     return near(part, solids)
+
+
+def _rows(part: Constraint, at: Tensor) -> Tensor:
+    """The rows of obstacles at places (B, M'), of each ball in turn where they are those of a body; -1 stays."""
+    if not isinstance(part, BoundBody):
+        return at
+    M = part.inner.absent.shape[1]
+    return torch.cat([torch.where(at < 0, at, at + i * M) for i in range(len(part.balls))], dim=1)
 
 
 def _on_the_way(problem: Problem, solids: Solids) -> Tensor | None:
@@ -176,13 +186,6 @@ def _beside(p: Tensor, solids: Solids) -> Tensor:
         away = (p[:, :, None, a] - solids.centers[:, None, :, a]).abs()
         near = near & ~(away > (reach[..., a] + margin.unsqueeze(-1)).unsqueeze(1))  # NaN counts as near
     return near.any(1)
-
-
-def _places(kept: Tensor) -> Tensor:
-    """Places (B, M') of the true ones of (B, M), in their order, -1 after them; at least one column."""
-    count = max(1, int(kept.sum(-1).max()))
-    order = (~kept).to(torch.int8).argsort(dim=-1, stable=True)[:, :count]
-    return order.masked_fill(~kept.gather(1, order), -1)
 
 
 def _gathered(lam: Tensor, at: Tensor | None) -> Tensor:

@@ -14,17 +14,18 @@ import torch
 from torch import Tensor
 
 from torchgco.kernels import open_loop
+from torchgco.maps.ways import length
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.lattice import Array
-from torchgco.roadmap.mapped import even, length
+from torchgco.roadmap.mapped import even
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.search import HOPS
 from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
-from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Paths
 from torchgco.search.proposals import Part
+from torchgco.search.solved_candidates import BOTH, in_order, solved
 from torchgco.search.steering import Steered, Tracks, driven, speed_limit, steered
 
 PURSUED_AT_ONCE = 16  # problems: bounds the memory
@@ -79,7 +80,7 @@ def _driven(part: Part, b: int) -> tuple[list[Array], Array]:
     none = np.empty((0, one.N, one.m))
     if vehicle is None:
         return [], none
-    step = FINE * (_radius(one) or 0.5 * R)
+    step = FINE * (radius_of(one) or 0.5 * R)
     ways = [smoothed(evenly(way, step), ROUNDED / FINE) for way in _ways(part, b) if length(way) > 0.0]
     if not ways:
         return [], none
@@ -100,8 +101,8 @@ def _ways(part: Part, b: int) -> list[Array]:
     return [way[np.append(True, np.any(way[1:] != way[:-1], axis=1))] for way in corners]
 
 
-def _radius(problem: Problem) -> float:
-    """The largest radius of the vehicle in a batch of one, m; 0 where it is a point."""
+def radius_of(problem: Problem) -> float:
+    """The largest radius of the vehicle in a batch of one, m; 0 where it is a point, and without obstacles."""
     return max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
 
 

@@ -17,17 +17,19 @@ from torch import Tensor
 from torchgco.base.options import Count, check_options
 from torchgco.kernels import open_loop
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.known import Known
 from torchgco.roadmap.roadmap import Roadmap
+from torchgco.roadmap.scene import around_body
 from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
 from torchgco.search.converge import mapped
-from torchgco.search.directly import BOTH, in_order, solved
 from torchgco.search.following import Follow, Free, Paths
 from torchgco.search.manoeuvres import MANOEUVRES_TEXT as MANOEUVRES
 from torchgco.search.manoeuvres import manoeuvre
 from torchgco.search.proposals import Part
 from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
 from torchgco.search.row import Row
+from torchgco.search.solved_candidates import BOTH, in_order, solved
 
 TRACKED_AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
 # Tracked candidates lie a small part of R inside an obstacle, from where the interior point leads out of it again; from
@@ -48,7 +50,8 @@ class Tube(Row):
     A car with a `Body` is solved from manoeuvres of its whole pose first (`manoeuvre`).
     In maps, a vehicle that drives along its heading is steered along ways that keep clear of them first (`pursue`).
     Where that doesn't arrive, and for all others, paths are tracked; among these is one that keeps clear of a map's
-    obstacles, with its corners averaged. A vehicle that can turn on the spot follows each from rest and after either
+    obstacles, with its corners averaged, and among spheres and boxes one of the ball that holds a body, which has room
+    along all of it. A vehicle that can turn on the spot follows each from rest and after either
     turn: else it reverses along much of a way behind it. The first pace is that of the trajectory without obstacles,
     the last takes the whole horizon; the others lie evenly between.
     Candidates count where they end feasible and at the goal.
@@ -121,6 +124,9 @@ class Tube(Row):
         paths = part.seek(every, (ROADMAP,), self.num_paths)
         if part.scene.gates is None:
             paths = paths.joined(*ROADMAP.clear_path(part.scene))
+            wide = around_body(problem, part.scene)
+            if wide is not None:
+                paths = paths.joined(*ROADMAP.paths(wide, 1, every, Known()))
         starts, usable = _starts(problem, rest)
         live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(PACES, dim=1)
         starts = starts.repeat_interleave(PACES, dim=1).repeat(1, paths.corners.shape[1], 1, 1)

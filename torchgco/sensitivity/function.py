@@ -88,15 +88,8 @@ class Solved(torch.autograd.Function):
         return Forward.apply(ctx.system, *tangents[2:], *ctx.saved_tensors)  # type: ignore[return-value]
 
 
-class Forward(torch.autograd.Function):
-    """Tangents of X, U, multipliers and costs from those of the residual's parts; of the parts, too, as `Adjoint`."""
-
-    @staticmethod
-    def forward(
-        system: System, x: Tensor, u: Tensor, gaps: Tensor, rows: Tensor, lagrangian: Tensor, *parts: Tensor
-    ) -> tuple[Tensor, ...]:
-        X, U, _, lam = system.once(x, u, gaps, rows)
-        return X, U, lam, lagrangian.clone()
+class Last(torch.autograd.Function):
+    """A function whose derivatives would be second ones."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -105,6 +98,21 @@ class Forward(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> NoReturn:
         raise RuntimeError(NO_SECOND)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> NoReturn:
+        raise RuntimeError(NO_SECOND)
+
+
+class Forward(Last):
+    """Tangents of X, U, multipliers and costs from those of the residual's parts; of the parts, too, as `Adjoint`."""
+
+    @staticmethod
+    def forward(
+        system: System, x: Tensor, u: Tensor, gaps: Tensor, rows: Tensor, lagrangian: Tensor, *parts: Tensor
+    ) -> tuple[Tensor, ...]:
+        X, U, _, lam = system.once(x, u, gaps, rows)
+        return X, U, lam, lagrangian.clone()
 
 
 class Adjoint(torch.autograd.Function):
@@ -141,7 +149,7 @@ class Adjoint(torch.autograd.Function):
         return (*system.solve(X, U, None, lam), cost.clone()), (0,) * 5
 
 
-class Fixed(torch.autograd.Function):
+class Fixed(Last):
     """The residual's parts, for gradients at which they are held: a derivative that leads here is a second one."""
 
     generate_vmap_rule = True
@@ -149,15 +157,3 @@ class Fixed(torch.autograd.Function):
     @staticmethod
     def forward(*parts: Tensor) -> tuple[Tensor, ...]:
         return tuple(part.view_as(part) for part in parts)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> NoReturn:
-        raise RuntimeError(NO_SECOND)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> NoReturn:
-        raise RuntimeError(NO_SECOND)

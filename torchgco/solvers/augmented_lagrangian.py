@@ -356,11 +356,12 @@ class OuterLoop:
             put(self.result, state.rows, ended)
         self.stopped += int((status == STOPPED).sum())
 
-    def report(self, passes: int, rows: Tensor, left: int, state: State) -> None:
-        """The progress of a pass, for the callback."""
+    def report(self, passes: int, rows: Tensor, waiting: int, before: State, state: State | None) -> None:
+        """The progress of a pass, for the callback; `state` is that of the problems that run on, if any."""
         if self.call.callback is not None:
-            total = self.call.problem.B
-            self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, state))
+            now = take(before, slice(0, 0)) if state is None else state
+            total, left = self.call.problem.B, now.rows.numel() + waiting
+            self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, now))
 
 
 def run_all(work: OuterLoop, rows: Tensor, slots: int) -> None:
@@ -372,21 +373,24 @@ def run_all(work: OuterLoop, rows: Tensor, slots: int) -> None:
     waiting = rows[slots:]
     state, status = work.begin(rows[:slots])
     work.regroup(state.rows)
-    state, waiting = _replaced(work, state, status, waiting)
+    running, waiting = _replaced(work, state, status, waiting)
     passes = 0
-    while state.rows.numel() > 0:
-        worked = state.rows.clone()  # a copy: slots are refilled in place
-        state, waiting = _replaced(work, state, work.advance(state), waiting)
+    while running is not None:
+        state, worked = running, running.rows.clone()  # a copy: slots are refilled in place
+        running, waiting = _replaced(work, state, work.advance(state), waiting)
         passes += 1
-        work.report(passes, worked, state.rows.numel() + waiting.numel(), state)
+        work.report(passes, worked, waiting.numel(), state, running)
 
 
-def _replaced(work: OuterLoop, state: State, status: Tensor, waiting: Tensor) -> tuple[State, Tensor]:
-    """The state with ended problems replaced by waiting ones, or removed; and the rows still waiting."""
+def _replaced(work: OuterLoop, state: State, status: Tensor, waiting: Tensor) -> tuple[State | None, Tensor]:
+    """The state with ended problems replaced by waiting ones, or removed; and the rows still waiting.
+
+    None where no problem runs on.
+    """
     while True:
         ended = (status != Status.RUNNING).nonzero().flatten()
         if ended.numel() == 0:
-            return state, waiting
+            return (state if status.numel() > 0 else None), waiting
         work.end(state, ended, status[ended])
         status = status.clone()
         status[ended] = Status.RUNNING
@@ -396,6 +400,8 @@ def _replaced(work: OuterLoop, state: State, status: Tensor, waiting: Tensor) ->
             waiting = waiting[news:]
             put(state, ended[:news], begun)
             status[ended[:news]] = refused
+        if news == 0 and ended.numel() == status.numel():
+            return None, waiting
         if ended.numel() > news:
             stays = torch.ones_like(status, dtype=torch.bool)
             stays[ended[news:]] = False

@@ -117,10 +117,12 @@ class Call:
         return math.inf if self.deadline is None else max(0.0, self.deadline - time.monotonic())
 
     def take(self, index: Rows) -> Self:
-        """The same call for the problems in `index`."""
+        """The same call for the problems in `index`; itself for all of them in their order."""
+        part = self.problem.take(index)
+        if part is self.problem:
+            return self
         warm = None if self.warm is None else take(self.warm, index)
         U0, ids, rows, outer, X0 = take((self.U0, self.ids, self.rows, self.outer, self.X0), index)
-        part = self.problem.take(index)
         return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline, X0)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:

@@ -29,12 +29,11 @@ HIDES = (
 
 def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
     """The statuses (B,) of problems that can't start, with rollouts X (B, N+1, n); RUNNING for the others."""
-    status = torch.full((problem.B,), int(Status.RUNNING), device=X.device)
-    if start_is_clear is not None:
-        status[~start_is_clear] = Status.INVALID_START
-    # NaN compares as clear of every obstacle, so this test comes last.
+    # NaN compares as clear of every obstacle, so finiteness decides first.
     finite = torch.isfinite(merit) & torch.isfinite(X).flatten(1).all(-1)
-    status[~finite] = Status.NON_FINITE
+    status = torch.where(finite, int(Status.RUNNING), int(Status.NON_FINITE))
+    if start_is_clear is not None:
+        status = torch.where(finite & ~start_is_clear, int(Status.INVALID_START), status)
     return status
 
 

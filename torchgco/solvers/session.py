@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import TraceWarning
 from torchgco.base.status import STOPPED, Status, is_over
-from torchgco.base.tree import is_users, put, spread, take
+from torchgco.base.tree import Rows, is_users, put, spread, take
 from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import kernels_of, reproducible
 from torchgco.lagrangian.lagrangian import Lagrangian
@@ -61,8 +61,8 @@ class Session:
             slots: problems whose gains are computed together; None: all.
         """
         problem, best = self.call.problem, end.best
-        everyone = torch.arange(problem.B, device=best.X.device)
-        parts = [self._optimality(best, rows) for rows in everyone.split(slots or max(1, problem.B))]
+        size = slots or max(1, problem.B)
+        parts = [self._optimality(best, slice(at, at + size)) for at in range(0, max(1, problem.B), size)]
         K, d, left = (torch.cat(column) for column in zip(*parts, strict=True))
         found, unlike = self._by_users_model(self.trajectories(end, lambda rows: K[rows]))
         left = torch.where(unlike, left.clamp(min=1.0), left)
@@ -76,10 +76,12 @@ class Session:
         ended = torch.where(finite | (ended == Status.INVALID_START), ended, int(Status.NON_FINITE))
         status = final_status(ended, left, found.violation, tolerance, constrained)
         user = self.given.problem
-        gave_up = torch.stack([status == reason for reason in GAVE_UP]).any(0)
-        status = torch.where(gave_up & covered_goals(user), int(Status.INFEASIBLE), status)
+        covered = covered_goals(user)
+        if bool(covered.any()):
+            gave_up = torch.stack([status == reason for reason in GAVE_UP]).any(0)
+            status = torch.where(gave_up & covered, int(Status.INFEASIBLE), status)
         falls = falls_without_end(user, self.given.U0, found, left, tolerance)
-        status[falls] = Status.UNBOUNDED
+        status = torch.where(falls, int(Status.UNBOUNDED), status)
         return Solution(
             found.X, found.U, K, d, found.multipliers, found.cost, found.violation, status,
             end.iterations, end.outer, end.guided,
@@ -123,6 +125,6 @@ class Session:
         cost, worst = user.cost.total(X, U), violation(user.constraints, X, U)
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
-    def _optimality(self, best: Iterate, rows: Tensor) -> Optimality:
+    def _optimality(self, best: Iterate, rows: Rows) -> Optimality:
         part = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, self.rules.phr)
         return optimality(part, best.X[rows], best.U[rows])

@@ -6,7 +6,9 @@ whenever they are asked for, and a problem's own numbers for each problem. Only 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,12 @@ from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
+# What moves numbers and computes none.
+PICKING = {f"aten.{name}" for name in (
+    "index", "index_select", "select", "slice", "unsqueeze", "squeeze", "view", "reshape", "expand", "detach", "alias",
+    "clone", "permute", "transpose", "t", "unbind", "split", "cat", "stack",
+)}  # fmt: skip
+PROBED = 3  # problems for which a function is asked which numbers it takes
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
 
@@ -173,6 +181,11 @@ class Traced:
         """
         if not self._own:
             return torch.zeros(len(index), 0, dtype=torch.float64, device=index.device)
+        if self.picks is not None:
+            rows = [self._captured[slot].double() for slot in self._named]
+            rows = [row.expand(len(index), *row.shape[1:]) if len(row) == 1 else row[index] for row in rows]
+            flat = [row.reshape(len(row), math.prod(row.shape[1:])) for row in rows]
+            return torch.cat(flat, dim=1)[:, self.picks.to(index.device)].detach()
 
         def one(i: Tensor) -> Tensor:
             computed = self._computed(i.unsqueeze(0))
@@ -182,6 +195,53 @@ class Traced:
             return torch.func.vmap(one)(index)
         except RuntimeError:  # an operation that vmap can't batch
             return torch.stack([one(i) for i in index])
+
+    @cached_property
+    def picks(self) -> Tensor | None:
+        """Where each of the `count` numbers stands in a problem's row of its own tensors, (count,) int64.
+
+        These are the ones at the places `named`, in turn. None where a number is computed, or chosen by others.
+        """
+        operations = _needed(self._plain, *self._own)
+        at = {slot for one in operations if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
+        chosen = at & (_followers(operations, [self._index, *self._named]) - {self._index})
+        if not _followers(operations, self._named).issuperset(self._own):
+            return None
+        if chosen or not self._named or any(name_of(one.function) not in PICKING for one in operations):
+            return None
+        others = self._captured.keys() & {slot for one in operations for slot in one.inputs} - self._named.keys()
+        own = {slot: self._captured[slot] for slot in self._named}
+        rows = {slot: PROBED if slot in self._indexed else 1 for slot in own}
+        odd = any(part.dim() == 0 or (len(part) > 1 and rows[slot] == 1) for slot, part in own.items())
+        if odd or any(slot.dtype.is_floating_point for slot in others):
+            return None
+        sizes = {slot: math.prod(part.shape[1:]) for slot, part in own.items()}
+        known: dict[Slot, Any] = {slot: self._captured[slot] for slot in others}
+        total, first, row_of = sum(sizes.values()), 0, list[int]()  # row_of: 1 for numbers of a problem's own row
+        for slot, part in own.items():
+            places = torch.arange(first, first + sizes[slot], dtype=torch.float64)
+            numbers = total * torch.arange(rows[slot]).unsqueeze(-1) + places
+            known[slot] = numbers.reshape(rows[slot], *part.shape[1:]).to(part.device)
+            row_of, first = row_of + [int(rows[slot] > 1)] * sizes[slot], first + sizes[slot]
+        try:
+            found = torch.stack([self._picked(operations, known, i) for i in range(PROBED)])
+        except (RuntimeError, IndexError):  # other shapes than these
+            return None
+        if not bool((found[0] < total).all()):
+            return None
+        moved = total * torch.tensor(row_of)[found[0]]
+        return found[0] if torch.equal(found, found[0] + torch.arange(PROBED).unsqueeze(-1) * moved) else None
+
+    def _picked(self, operations: list[Operation], known: dict[Slot, Any], i: int) -> Tensor:
+        some = next(iter(known.values()))
+        known = {**known, self._index: torch.full((1,), i, dtype=torch.int64, device=some.device)}
+        replay_all(operations, known)
+        return torch.cat([known[slot].flatten().long().cpu() for slot in self._own])
+
+    @property
+    def named(self) -> list[int]:
+        """The places of the tensors in `own` that the function reads."""
+        return list(self._named.values())
 
     def rebound(self, own: Sequence[Tensor], B: int) -> Traced | None:
         """The same function of B problems with other tensors in the place of its `own`; None: trace it again.
@@ -197,6 +257,7 @@ class Traced:
             # The row of a single problem stands for all of its repetitions.
             is_spread = _one_row(tensor) and not was_row
             tensors.append(tensor.expand(B, *tensor.shape[1:]) if is_spread else tensor)
+        _ = self.picks  # once for all copies
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
         copy._captured = self._captured | {slot: tensors[place] for slot, place in self._named.items()}

@@ -59,6 +59,8 @@ def test_fortran_order_and_other_numbers(tmp_path: Path) -> None:
     ("a.xyz", b"2,0477;0,8897;-1,5103\n", "commas beside other separators; for decimal commas: sed"),
     ("a.xyz", b"640 480\n1 2 3\n4 5 6\n", "2 in the first line, which may be a heading, and 3 in the last"),
     ("a.xyz", b"2 0 1\n0,5 1,5 2\n", "commas beside other separators"),
+    ("a.xyz", b"0,1, 0,2, 0,3\n", "commas beside other separators"),
+    ("a.xyz", b"1,2,3\n0.1,,0.3,7\n", "a line without one of its first numbers"),
     ("a.xyz", b"nan nan nan\n", "none of them finite"),
     ("a.xyz", b"1 2 3e8\n", "coordinates within 1e\\+07 m, got .*3e\\+08"),
     ("a.npy", b"", "an npy file"),

@@ -162,6 +162,25 @@ def test_seams_of_textures_and_normals_open_no_mesh(tmp_path: Path) -> None:
     assert isinstance(grid, OccupancyGrid) and grid.is_occupied.all()
 
 
+@pytest.mark.parametrize("first", range(8))
+def test_a_wall_whose_door_is_cut_out_of_one_face_is_refused(first: int, tmp_path: Path) -> None:
+    """Divided into a fan of triangles the face would cover its door; a face without inner corners is read."""
+    wall = [(0, 0), (1.5, 0), (1.5, 1.5), (2.5, 1.5), (2.5, 0), (4, 0), (4, 2), (0, 2)]
+    corners = "".join(f"v {x} 0.05 {z}\n" for x, z in wall[first:] + wall[:first])
+    (tmp_path / "a.obj").write_text(corners + "f 1 2 3 4 5 6 7 8\n")
+    with pytest.raises(InputError, match="faces with inner corners"):
+        read(tmp_path / "a.obj", resolution=0.25)
+
+
+def test_faces_of_many_corners_are_read(tmp_path: Path) -> None:
+    around = [(1 + np.cos(k), 1 + np.sin(k)) for k in np.linspace(0, 2 * np.pi, 9)[:-1]]
+    corners = "".join(f"v {x} {y} {z}\n" for z in (0, 2) for x, y in around)
+    sides = "".join(f"f {k + 1} {(k + 1) % 8 + 1} {(k + 1) % 8 + 9} {k + 9}\n" for k in range(8))
+    (tmp_path / "a.obj").write_text(f"{corners}f 8 7 6 5 4 3 2 1\nf 9 10 11 12 13 14 15 16\n{sides}")
+    grid = read(tmp_path / "a.obj", resolution=0.1)
+    assert grid.occupied[10, 10].all() and not grid.occupied[0, 0].any()
+
+
 def test_an_open_mesh_is_a_surface(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     vertices = [[0, 0, 0], [4, 0, 0], [4, 3, 2], [0, 3, 2]]

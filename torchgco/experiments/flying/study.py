@@ -33,6 +33,7 @@ from torchgco.experiments.results.identity import (
     closed_loop,
     difference,
     digest,
+    files_of,
     layout_digests,
     settings_of,
 )
@@ -177,10 +178,12 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
             raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
     rivals = _rivals(configuration, recompose)
     solvers = {name: setup.solver if held is configuration else solver_of(held) for name, held in rivals.items()}
+    plant = None if setup.mission is None else setup.mission.plant
+    decided = {**configuration, **files_of(configuration, getattr(plant, "files", ()))}
     manifest = Manifest(
-        configuration={"version": VERSION, **configuration},
+        configuration={"version": VERSION, **decided},
         solvers={name: settings_of(held) for name, held in rivals.items()},
-        layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
+        layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(decided)),
     )
     return _Study(setup, plan, layouts, solvers, manifest)
 

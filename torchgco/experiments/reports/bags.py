@@ -15,7 +15,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError
 from torchgco.obstacles.attitude import QUATERNION
-from torchgco.problem.sampled import TIME_COLUMN
+from torchgco.problem.sampled import RATE_OF_POSITION, SECOND_RATE, TIME_COLUMN
 
 Storage = Literal["mcap", "sqlite3"]
 FRAME, BODY = "map", "base_link"
@@ -71,8 +71,8 @@ class _Messages:
         self.nanoseconds = [round(value * NANO) for value in t.tolist()]
         self.p = _stacked(columns, position)
         self.q = _attitudes(columns, len(t))
-        self.v = _or_slope(columns, [f"v{axis} [m/s]" for axis in "xyz"], self.p, t)
-        self.a = _or_slope(columns, [f"a{axis} [m/s^2]" for axis in "xyz"], self.v, t)
+        self.v = _or_slope(columns, "m/s", (RATE_OF_POSITION, "v{}"), self.p, t)
+        self.a = _or_slope(columns, "m/s^2", (SECOND_RATE, "a{}"), self.v, t)
         self.w = _stacked(columns, SPINS) if SPINS[0] in columns else _turning(columns, t)  # in the body's axes
         self.w_world = _turned(self.q, self.w)
         self.turning = _slope(self.w_world, t)
@@ -133,11 +133,14 @@ def _stacked(columns: Mapping[str, np.ndarray], labels: Sequence[str]) -> np.nda
 
 
 def _or_slope(
-    columns: Mapping[str, np.ndarray], labels: Sequence[str], values: np.ndarray, t: np.ndarray
+    columns: Mapping[str, np.ndarray], unit: str, names: Sequence[str], values: np.ndarray, t: np.ndarray
 ) -> np.ndarray:
-    """The columns that are there, (T, 3); without the first one, how `values` change."""
-    known = [label for label in labels if label in columns]
-    return _stacked(columns, known) if labels[0] in known else _slope(values, t)
+    """The columns of the first of these names that is there, (T, 3); without any, how `values` change."""
+    for name in names:
+        known = [label for axis in "xyz" if (label := f"{name.format(axis)} [{unit}]") in columns]
+        if known:
+            return _stacked(columns, known)
+    return _slope(values, t)
 
 
 def _slope(values: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -133,6 +133,9 @@ def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:
     if rate is not None:
         u = u[np.clip(np.searchsorted(t[:, 0], at + 1e-9, side="right") - 1, 0, len(u) - 1)]  # they hold
     rates = np.gradient(x[:, VELOCITY], t[:, 0], axis=0) if len(t) > 1 else np.zeros((1, 3))
+    x = x.copy()
+    q = x[:, ATTITUDE_STATES]  # a view; q and -q are the same attitude: neighbours are to have the same sign
+    q[1:] *= np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0).cumprod()[:, None]
     x, rates = _between(at, t[:, 0], x), _between(at, t[:, 0], rates)
     x[:, ATTITUDE_STATES] /= np.linalg.norm(x[:, ATTITUDE_STATES], axis=1, keepdims=True)
     columns: dict[str, Any] = {TIME_COLUMN: at}

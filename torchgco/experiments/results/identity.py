@@ -1,20 +1,23 @@
 """The identity of studies, layouts and solvers: the content of study.json.
 
-Results depend on the version, the seed, the layouts, the planning model, the settings of the solvers and the
-arithmetic of the device. How a study is cut into batches and processes changes no bit of them (CONTRIBUTING, "The
-batch contract") and is no part of its identity.
+Results depend on the version, the seed, the layouts, the planning model, the settings of the solvers, the files of a
+plant and the arithmetic of the device. How a study is cut into batches and processes changes no bit of them
+(CONTRIBUTING, "The batch contract") and is no part of its identity.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
+from torchgco.experiments.results.files import checksum
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
 from torchgco.scenarios.layouts import BINDS, BOXES, GATES, SINES, TIME
@@ -26,7 +29,8 @@ OVERRULED = {
     "start": "start", "goal": "goal", "radius": "vehicle_radius", "goal_radius": "goal_radius", "stages": "stages",
     "control_lower": "control_lower", "control_upper": "control_upper",
 }  # fmt: skip
-CLOSED_LOOP = ("mission", "plant")  # nodes of missions
+READ_FILES = "files"  # what a configuration's files hold, see `files_of`
+CLOSED_LOOP = ("mission", "plant", READ_FILES)  # nodes of missions
 GROUPS = ("scenario", "model", "device", *CLOSED_LOOP)
 DIGITS = 16  # hexadecimal, of a digest: 64 bits
 EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same float
@@ -53,6 +57,20 @@ def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> di
 def closed_loop(configuration: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a configuration that missions add; empty without them."""
     return {name: configuration[name] for name in CLOSED_LOOP if configuration.get(name) is not None}
+
+
+def files_of(configuration: Mapping[str, Any], further: Iterable[Any] = ()) -> dict[str, dict[str, str]]:
+    """Digests of the files that a plant is made of, by their paths, as a node `READ_FILES`; empty where there are none.
+
+    A path alone doesn't say which vehicle flies: a file may be edited between two runs.
+
+    Args:
+        further: files that those files name in turn, see `MujocoPlant.files`.
+    """
+    named = [value for value in flat({"plant": configuration.get("plant") or {}}).values() if isinstance(value, str)]
+    paths = {path: os.path.expanduser(path) for path in (*named, *map(str, further))}
+    held = {path: checksum(Path(there))[:DIGITS] for path, there in paths.items() if os.path.isfile(there)}
+    return {READ_FILES: held} if held else {}
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from io import BytesIO
 
 import numpy as np
@@ -14,6 +15,7 @@ MESH_FILE = "a mesh of triangles, stl, obj or ply"
 LONGEST_EDGE = 0.5  # of a cell: triangles are divided until no edge is longer
 MOST_PIECES = 2**25  # triangles after this
 MOST_ASKED = 2**26  # angles of triangles
+FOLDED = 1e-4  # rad
 
 
 def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> OccupancyGrid:
@@ -24,7 +26,8 @@ def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> O
         solid: whether the inside is occupied, too; None: where the surface is closed.
 
     Raises:
-        InputError: no such mesh, too fine a grid, a surface that isn't closed where `solid` is asked for.
+        InputError: no such mesh, too fine a grid, faces with inner corners, a surface that isn't closed where `solid`
+            is asked for.
     """
     source.needs("resolution", resolution, "the side of a cell, m, for a mesh")
     assert resolution is not None
@@ -52,6 +55,8 @@ def _loaded(source: Source) -> tuple[np.ndarray, np.ndarray, bool]:
         mesh = trimesh.load_mesh(BytesIO(raw), file_type=kind, force="mesh", skip_materials=True)
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and normals cut surfaces along their seams
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+        polygons = len(faces) > _declared(kind, raw)
+        folded = polygons and _is_folded(vertices, faces, mesh.face_adjacency_angles)
         closed = bool(mesh.is_watertight)
         if closed and not mesh.is_winding_consistent:
             trimesh.repair.fix_winding(mesh)
@@ -60,8 +65,36 @@ def _loaded(source: Source) -> tuple[np.ndarray, np.ndarray, bool]:
         source.refuse(MESH_FILE, f"vertices of {vertices.shape[-1]} coordinates")
     if not len(faces) or not np.isfinite(vertices).all():
         source.refuse(MESH_FILE, f"{len(faces):,} faces" if not len(faces) else "vertices that aren't finite")
+    if folded:
+        source.refuse("triangles (Blender: Triangulate Faces)", "faces with inner corners, which overlap as triangles")
     check_far(source, vertices)
     return vertices, faces, closed
+
+
+def _declared(kind: str, raw: bytes) -> float:
+    """How many faces a file has, before trimesh divides those with more corners into fans of triangles."""
+    if kind == "obj":
+        return len(re.findall(rb"(?m)^[ \t]*f[ \t]", raw))
+    found = re.search(rb"(?m)^element[ \t]+face[ \t]+(\d+)", raw) if kind == "ply" else None
+    return int(found[1]) if found else math.inf
+
+
+def _is_folded(vertices: np.ndarray, faces: np.ndarray, angles: np.ndarray) -> bool:
+    """Whether triangles of a face with an inner corner lie on each other: neighbours, or those of a fan.
+
+    Args:
+        angles: between the normals of neighbours, rad.
+    """
+    if (angles > np.pi - FOLDED).any():
+        return True
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    goes_on = (faces[1:, 0] == faces[:-1, 0]) & (faces[1:, 1] == faces[:-1, 2])
+    fan = np.concatenate(([0], (~goes_on).cumsum()))
+    whole = np.zeros((fan[-1] + 1, 3))
+    np.add.at(whole, fan, normals)
+    lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(whole[fan], axis=1)
+    return bool(((normals * whole[fan]).sum(1) < -np.cos(FOLDED) * lengths).any())
 
 
 def _enclosed(source: Source, cells: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -14,17 +14,22 @@ XYZ = "points as text, a line of 2 or 3 numbers or more each"
 SEPARATORS = re.compile(rb"[,; \t]+")
 COMMENT = re.compile(rb"#[^\n]*")
 NOT_BY_COMMA = re.compile(rb"[0-9.][; \t]+[-+.0-9]")  # between two numbers of a line
+MIXED = re.compile(rb"(?m)^(?=[^\n]*[0-9.],[-+.0-9])[^\n]*[0-9.],[ \t]+[-+.0-9]")
+EMPTY_FIELD = re.compile(rb"(?m)^(?:[^,;\n]*[,;]){0,2}[ \t]*[,;]")  # of the first three
 
 
 def read_xyz(source: Source) -> np.ndarray:
     """The first three numbers of each line, or both where lines have two; `#` begins a comment.
 
-    Numbers are separated by spaces, tabs, commas or semicolons. Commas beside other separators are refused, as they may
-    stand for decimal points. Further columns, such as colours, aren't read.
+    Numbers are separated by spaces, tabs, commas or semicolons. Refused are commas beside other separators, or with and
+    without a space after them in a line, as they may stand for decimal points, and lines without one of the first
+    numbers. Further columns, such as colours, aren't read.
     """
     text = COMMENT.sub(b"", source.bytes(XYZ, MOST_TEXT))
-    if b"," in text and NOT_BY_COMMA.search(text):
+    if b"," in text and (NOT_BY_COMMA.search(text) or MIXED.search(text)):
         source.refuse(XYZ, "commas beside other separators; for decimal commas: sed 's/,/./g' FILE > POINTS.xyz")
+    if EMPTY_FIELD.search(text):
+        source.refuse(XYZ, "a line without one of its first numbers")
     first = next((line for line in map(_bare, BytesIO(text)) if line), None)
     if first is None:
         source.refuse(XYZ, "no line of numbers")

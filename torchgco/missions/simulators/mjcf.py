@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from xml.etree import ElementTree
 
 from torchgco.dynamics.quadrotor import Airframe
 
 THIN = 0.1  # of a radius: heights and thicknesses that are drawn
+FOLDERS = "meshdir", "texturedir", "assetdir"  # attributes of a compiler, relative to the file
 ROTOR_CORNERS = (
     (1, 1),
     (1, -1),
@@ -51,6 +53,24 @@ def mjcf(airframe: Airframe, timestep: float = 0.005, mass: float | None = None)
         )  # fmt: skip
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def files_named(path: Path) -> list[Path]:
+    """The files that a file of MJCF names, and those that these name: includes, meshes, textures; that are there."""
+    found, left = list[Path](), [path]
+    while left:
+        file = left.pop()
+        try:
+            root = ElementTree.parse(file).getroot()
+        except (OSError, ElementTree.ParseError):  # no XML: a mesh, say
+            continue
+        compilers = [dict(compiler.attrib) for compiler in root.iter("compiler")]
+        folders = ["", *(held[name] for held in compilers for name in FOLDERS if name in held)]
+        for name in dict.fromkeys(named for part in root.iter() if (named := part.attrib.get("file"))):
+            places = (file.parent / folder / name for folder in folders)
+            new = [place for place in places if place.is_file() and place not in (path, *found)]
+            found, left = [*found, *new], [*left, *new]
+    return found
 
 
 def _add(parent: ElementTree.Element, tag: str, /, **values: object) -> ElementTree.Element:

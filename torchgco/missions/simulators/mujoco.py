@@ -13,7 +13,7 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.simulators.each import EachPlant, imported
-from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, mjcf
+from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, files_named, mjcf
 
 LONGEST_STEP = 0.005  # s, of a time step of MuJoCo in a model that we write
 SIDEWAYS = 1e-6  # share of a thrust that an actuator may push across the body's z axis
@@ -48,6 +48,11 @@ class MujocoPlant(EachPlant):
         _mujoco()
         if self.names_own("model"):
             self._quadrotor((0.0, 0.0, 0.0))
+
+    @property
+    def files(self) -> list[Path]:
+        """What is read beside `model` itself: includes and meshes that it names."""
+        return [] if self.model is None else files_named(Path(self.model).expanduser())
 
     def _quadrotor(self, deviation: tuple[float, float, float]) -> _Quadrotor:
         if self.model is None:

@@ -1,5 +1,7 @@
 /* The terms of one knot of the iterate beside its cost: constraints and guide. */
 
+#define SAFE 1.000001 /* more than rounding: of the distance up to which a ball may touch a sphere */
+
 #if DIM > 0
 static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
@@ -12,22 +14,81 @@ static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows 
     return total;
 }
 
+/* Adds the derivatives of row j. */
+static inline void sphere_expand(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V lam, V *g, V *H) {
+    V away[DIM], rho, slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam, &rho);
+    for (int a = 0; a < DIM; a++) {
+        SUBTRACT(g[POSITION + a], SET(2.0) * slope, away[a]);
+        for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], SET(4.0) * rho * away[a], away[b]);
+    }
+}
+
 static inline void spheres_expand(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
     const V *lam = rows->lam + con->place[k] * con->rows;
-    V c[BLOCK], away[DIM], rho;
+    V c[BLOCK];
     for (int64_t first = 0; first < con->rows; first += BLOCK) {
         int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
         if (!spheres(con, rows, first, last, k, x, c)) continue;
         for (int64_t j = first; j < last; j++) {
             if (!any(~(c[j - first] <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
-            V slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam[j], &rho);
-            for (int a = 0; a < DIM; a++) {
-                SUBTRACT(g[POSITION + a], SET(2.0) * slope, away[a]);
-                for (int b = a; b < DIM; b++)
-                    ADD(H[(POSITION + a) * S + POSITION + b], SET(4.0) * rho * away[a], away[b]);
-            }
+            sphere_expand(s, con, rows, j, k, x, lam[j], g, H);
         }
+    }
+}
+
+/* Of the spheres of a body, in order, those that a ball may touch in any lane at knot k, or that have a multiplier. */
+static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V *centers, int64_t *near) {
+    const Constraint *con = s->of->constraint + i;
+    const Rows *rows = s->rows + i;
+    const V *lam = rows->lam + con->place[k] * con->rows;
+    int64_t P = con->balls, each = con->rows / P, count = 0;
+    int pushed = any(rows->pushed[con->place[k]]);
+    V middle[DIM], reach = SET(0.0);
+    for (int a = 0; a < DIM; a++) {
+        middle[a] = SET(0.0);
+        for (int b = 0; b < P; b++) middle[a] += SET(1.0 / P) * centers[b * DIM + a];
+    }
+    for (int b = 0; b < P; b++) {
+        V square = SET(0.0);
+        for (int a = 0; a < DIM; a++) {
+            V away = centers[b * DIM + a] - middle[a];
+            ADD(square, away, away);
+        }
+        reach = tgco_maximum(reach, square);
+    }
+    reach = tgco_sqrt(reach);
+    for (int64_t j = 0; j < each; j++) {
+        V square = SET(0.0), limit = SET(SAFE) * (rows->widest[j] + reach);
+        for (int a = 0; a < DIM; a++) {
+            V away = middle[a] - rows->bound[j * DIM + a];
+            if (con->velocities.data) SUBTRACT(away, SET(k * con->dt), rows->velocities[j * DIM + a]);
+            ADD(square, away, away);
+        }
+        int adds = any((rows->widest[j] >= SET(0.0)) & ~(square >= limit * limit)); /* NaN may touch */
+        for (int64_t b = 0; pushed && !adds && b < P; b++) adds = any(lam[b * each + j] != SET(0.0));
+        if (adds) near[count++] = j;
+    }
+    return count;
+}
+
+static inline V near_value(const Lanes *s, const Ball *ball, int64_t k, const int64_t *near, int64_t count, V total) {
+    const V *lam = ball->rows.lam + ball->con.place[k] * ball->con.rows;
+    V away[DIM];
+    for (int64_t i = 0; i < count; i++)
+        total += worth(s, 0, sphere(&ball->con, &ball->rows, near[i], k, ball->x, away), lam[near[i]]);
+    return total;
+}
+
+static inline void near_expand(
+    const Lanes *s, const Ball *ball, int64_t k, const int64_t *near, int64_t count, V *g, V *H) {
+    const V *lam = ball->rows.lam + ball->con.place[k] * ball->con.rows;
+    V away[DIM];
+    for (int64_t i = 0; i < count; i++) {
+        V c = sphere(&ball->con, &ball->rows, near[i], k, ball->x, away);
+        if (any(~(c <= SET(0.0)) | (lam[near[i]] != SET(0.0))))
+            sphere_expand(s, &ball->con, &ball->rows, near[i], k, ball->x, lam[near[i]], g, H);
     }
 }
 #endif
@@ -37,11 +98,13 @@ static inline void spheres_expand(
 __attribute__((noinline)) static V body_value(const Lanes *s, int64_t i, int64_t k, const V *x, V total) {
     const Constraint *con = s->of->constraint + i;
     V centers[con->balls * DIM];
+    int64_t near[con->rows / con->balls + 1], count = 0;
     Ball ball;
     ball_centers(s, i, k, x, centers);
+    if (con->kind_of_balls == SPHERES && !(count = spheres_near(s, i, k, centers, near))) return total;
     for (int b = 0; b < con->balls; b++) {
         ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
-        if (ball.con.kind == SPHERES) total = spheres_value(s, &ball.con, &ball.rows, k, ball.x, total);
+        if (ball.con.kind == SPHERES) total = near_value(s, &ball, k, near, count, total);
         else if (ball.con.kind == BOXES) total = boxes_value(s, &ball.con, &ball.rows, k, ball.x, total);
         else total = field_value(s, &ball.con, &ball.rows, k, ball.x, total);
     }
@@ -52,16 +115,18 @@ __attribute__((noinline)) static void body_expand(const Lanes *s, int64_t i, int
     const Constraint *con = s->of->constraint + i;
     V centers[con->balls * DIM], e[con->balls * DIM * S], own[POSITION + DIM], square[(POSITION + DIM) * S];
     const int *columns = 0;
+    int64_t near[con->rows / con->balls + 1], some = 0;
     int count = -1;
     Ball ball;
     ball_centers(s, i, k, x, centers);
+    if (con->kind_of_balls == SPHERES && !(some = spheres_near(s, i, k, centers, near))) return;
     for (int b = 0; b < con->balls; b++) {
         ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
         for (int a = POSITION; a < POSITION + DIM; a++) {
             own[a] = SET(0.0);
             for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
         }
-        if (ball.con.kind == SPHERES) spheres_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
+        if (ball.con.kind == SPHERES) near_expand(s, &ball, k, near, some, own, square);
         else if (ball.con.kind == BOXES) boxes_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
         else field_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
         if (adds_nothing(own + POSITION, square + POSITION * S)) continue;

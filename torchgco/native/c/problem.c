@@ -33,6 +33,7 @@ static int64_t lay_out(Lanes *s, V *memory) {
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
         rows.stops = cut(&m, length(&c->stops, 1)); rows.radii = cut(&m, length(&c->radii, c->knots));
         rows.lift = cut(&m, length(&c->lift, c->knots));
+        if (c->balls > 0) rows.widest = cut(&m, c->squares.size / c->balls);
         rows.pushed = (I *)cut(&m, c->knots);
         for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;
@@ -61,6 +62,17 @@ static int64_t *in_order(int64_t first, int64_t last) {
 
 static void finish(Lanes *s) { free(s->memory); free(s->rows); }
 
+/* Find the largest radii of a body's spheres in a lane. */
+static void widen(const Rows *rows, const Constraint *c, int lane) {
+    int64_t each = c->squares.size / c->balls;
+    for (int64_t j = 0; j < each; j++) {
+        double square = ABSENT;
+        for (int64_t b = 0; b < c->balls; b++)
+            if (rows->squares[b * each + j][lane] > square) square = rows->squares[b * each + j][lane];
+        rows->widest[j][lane] = square < 0 ? ABSENT : sqrt(square);
+    }
+}
+
 /* Load problem e into a lane: first state, model, cost, and the numbers of its constraints. */
 static void enter_problem(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
@@ -73,6 +85,7 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
         const Constraint *c = p->constraint + i;
         fill(s->rows[i].bound, &c->bound, c->knots, lane, e);
         fill(s->rows[i].squares, &c->squares, 1, lane, e);
+        if (c->balls > 0) widen(s->rows + i, c, lane);
         fill(s->rows[i].velocities, &c->velocities, 1, lane, e);
         fill(s->rows[i].stops, &c->stops, 1, lane, e);
         fill(s->rows[i].radii, &c->radii, c->knots, lane, e);

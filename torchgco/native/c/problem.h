@@ -15,6 +15,7 @@
 /* A constraint's multipliers and numbers. */
 typedef struct {
     V *lam, *bound, *squares, *velocities, *radii, *stops, *lift;
+    V *widest; /* of a body among spheres: the largest inflated radius of each, ABSENT without one */
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
     const float *map[LANES]; /* of a FIELD: each lane's map */
 } Rows;

@@ -76,6 +76,15 @@ class KnotSource:
         """Whether some of the numbers differ from problem to problem."""
         return bool((self.places < self.span.traced.count).any())
 
+    @cached_property
+    def picks(self) -> Tensor | None:
+        """Where each of a knot's numbers stands among those of a problem's own tensors, (K|1, count) int64.
+
+        None where one of them is computed, or isn't a problem's own.
+        """
+        found = self.span.traced.picks if self._is_own else None
+        return None if found is None or bool((self.places >= len(found)).any()) else found[self.places]
+
     def numbers(self, B: int, own: Sequence[Tensor], shared: Tensor, again: Callable[[], Span]) -> Tensor:
         """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `own`.
 

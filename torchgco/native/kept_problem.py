@@ -1,0 +1,127 @@
+"""Problems whose numbers lie where C reads them, from call to call: only numbers are written again."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchgco.native import structures as c
+from torchgco.native.codegen.cost import cost_arrays
+from torchgco.native.engine import Engine
+from torchgco.native.packing import constraint_of, kind_of, quadratic_arrays, shared_fields
+from torchgco.native.shared import Shared
+from torchgco.native.structures import Kind
+from torchgco.problem.problem import Problem
+from torchgco.tracing import own_tensors
+
+
+class KeptProblem:
+    """Problems packed once, with iterates of their own.
+
+    Args:
+        engine: of the problems' form.
+        problem: what is kept. Numbers that C reads as they are, such as the references of a quadratic cost and the
+            centres of spheres, are those of the problem's own tensors: written there in place, they count at once.
+
+    Attributes:
+        X, U, lam: iterates (B, N+1, n), (B, N, m), and multipliers of every constraint (B, K, p).
+        packed: the structure that C reads.
+    """
+
+    def __init__(self, engine: Engine, problem: Problem) -> None:
+        B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
+        self.engine, self.problem = engine, problem
+        self._read: Shared | None = None  # what functions have captured, when C was last given it
+        self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
+        self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
+        self._numbers = [self._own_numbers(i) for i in range(len(problem.constraints))]
+        rows = [self._row(i, numbers) for i, numbers in enumerate(self._numbers)]
+        self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(engine.shared))
+        self._model = self._model_array()
+        self._cost = self._cost_arrays()
+        self.packed.fill({"parameters": self._model, "cost_data": self._cost, "X": self.X, "U": self.U})
+        self._copied = {i: found for i in engine.functions if (found := self._copies(i)) is not None}
+
+    @property
+    def is_outdated(self) -> bool:
+        """Whether tensors that functions capture may have other numbers than C."""
+        captured = self.engine.captured
+        return captured.is_mixed or not captured.is_still(self._read)
+
+    def refresh_captured(self) -> bool:
+        """Read what functions capture again; whether the library computes with it as it is now."""
+        self._read = self.engine.captured.read()
+        if self._read is None:
+            return False
+        self.engine.shared.take_over(self._read)
+        # Some of these numbers may be a knot's own, and problems' own ones computed from what was captured.
+        for i in self.engine.functions:
+            self.refresh_constraint(i)
+        self.refresh_cost()
+        self.refresh_model()
+        return True
+
+    def refresh_constraint(self, i: int) -> None:
+        """Read the numbers of constraint i again, after its tensors have changed."""
+        if i in self._copied:
+            there, here, places = self._copied[i]
+            there[:] = here[:, places]
+            return
+        new = self._own_numbers(i)
+        arrays = [name for name, value in new.items() if isinstance(value, c.Array)]
+        _copy([self._numbers[i][name] for name in arrays], [new[name] for name in arrays])
+
+    def refresh_cost(self) -> None:
+        """The same of the cost."""
+        _copy(self._cost, self._cost_arrays())
+
+    def refresh_model(self) -> None:
+        """The same of the dynamics."""
+        _copy([self._model], [self._model_array()])
+
+    def _copies(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Of traced rows all of whose numbers are some of one tensor's: where C reads them (B, K|1, count), the tensor
+        (B, size), and their places in it; None of others.
+        """
+        picks, part = self.engine.functions[i].picks, self.problem.constraints[i]
+        if picks is None or picks.numel() == 0 or kind_of(part) is not Kind.FUNCTION or part.row_radii is not None:
+            return None
+        first, every = 0, own_tensors(part)
+        for own in (every[place] for place in self.engine.functions[i].span.traced.named):
+            size = math.prod(own.shape[1:])
+            if first <= int(picks.min()) and int(picks.max()) < first + size:
+                (there,) = self._numbers[i]["bound"].kept
+                fits = own.is_contiguous() and len(own) == self.problem.B == len(there) and own.dtype == torch.float64
+                return (there.numpy(), own.reshape(len(own), -1).numpy(), (picks - first).numpy()) if fits else None
+            first += size
+        return None
+
+    def _row(self, i: int, numbers: dict[str, Any]) -> c.Constraint:
+        problem = self.problem
+        row = constraint_of(problem.constraints[i], problem.row_shapes[i], numbers, problem)
+        row.lam = self.lam[i]
+        return row
+
+    def _own_numbers(self, i: int) -> dict[str, Any]:
+        return self.engine.row_numbers(self.problem, i)
+
+    def _cost_arrays(self) -> list[c.Array]:
+        cost, problem = self.engine.cost, self.problem
+        return quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, self.engine.shared.cost)
+
+    def _model_array(self) -> c.Array:
+        model, problem = self.engine.model, self.problem
+        if model.count == 0:
+            return c.Array()
+        return c.array(model.numbers(problem.B, problem.dynamics, self.engine.shared.model), knots=True)
+
+
+def _copy(old: list[c.Array], new: list[c.Array]) -> None:
+    """Write the numbers of arrays into the memory of others, which keep their places and shapes."""
+    for before, after in zip(old, new, strict=True):
+        for there, here in zip(before.kept, after.kept, strict=True):
+            if there.data_ptr() != here.data_ptr():
+                there.copy_(here)
