@@ -1,0 +1,74 @@
+"""The model of the racing drone, its commands, its gates and its estimate of the thrust, beside slow, obvious maths."""
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from benchmarks.outside.drone_racing_model import (
+    GRAVITY,
+    OPENING,
+    OUTER,
+    RISE,
+    Strength,
+    axis,
+    commanded,
+    frames,
+    rates,
+    tilt_state,
+)
+
+
+def test_tilts_and_their_rates_are_those_of_a_turning_body() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        start, spin, h = Rotation.from_euler("xyz", rng.uniform(-0.8, 0.8, 3)), rng.uniform(-4.0, 4.0, 3), 1e-5
+        later, sooner = (start * Rotation.from_rotvec(sign * h * spin) for sign in (1, -1))
+        a, b, *turn = tilt_state(start.as_quat(), spin)
+        np.testing.assert_allclose(axis(torch.tensor([a, b])).numpy(), start.as_matrix()[:, 2], atol=1e-12)
+        change = (tilt_state(later.as_quat(), spin)[:2] - tilt_state(sooner.as_quat(), spin)[:2]) / (2 * h)
+        np.testing.assert_allclose(turn, change, atol=1e-6)
+
+
+def test_a_commanded_tilt_is_the_same_at_any_heading() -> None:
+    tilt = np.array([0.5, -0.7])
+    for heading in (0.0, 0.6, -1.4):
+        R = Rotation.from_euler("xyz", commanded(tilt, heading)).as_matrix()
+        np.testing.assert_allclose(R[:, 2], axis(torch.from_numpy(tilt)).numpy(), atol=1e-12)
+
+
+def test_a_drone_hovers_and_falls() -> None:
+    x = torch.zeros(11, dtype=torch.float64)
+    x[10] = GRAVITY
+    u = torch.tensor([0.0, 0.0, GRAVITY], dtype=torch.float64)
+    assert float(rates(x, u).abs().max()) < 1e-12
+    x[10] = 0.0
+    assert rates(x, 0 * u)[3:6].tolist() == [0.0, 0.0, -GRAVITY]
+
+
+def test_frames_leave_the_opening_and_stand_on_the_floor() -> None:
+    turn = Rotation.from_euler("xyz", [0.0, 0.0, 0.7])
+    center = np.array([1.0, 2.0, 0.7])
+    centers, halves, quaternions = frames(center[None], turn.as_quat()[None])
+    back = Rotation.from_quat(np.roll(quaternions, -1, axis=-1)).inv()
+    rng = np.random.default_rng(0)
+    for reach, free in ((OPENING, True), (OUTER, False)):
+        side = rng.uniform(-reach, reach, (400, 2))
+        points = center + turn.apply(np.c_[np.zeros(400), side])
+        inside = np.stack(
+            [(np.abs(r.apply(points - c)) <= h).all(1) for r, c, h in zip(back, centers, halves, strict=True)]
+        )
+        expected = np.abs(side).max(1) >= OPENING
+        assert (inside[:4].any(0) == expected).all() and (not expected.any()) == free
+    assert centers[4, 2] + halves[4, 2] == center[2] - OUTER
+
+
+def test_the_thrust_is_learnt_from_velocities() -> None:
+    rng, strength, up = np.random.default_rng(1), Strength(), np.array([0.0, 0.0, 1.0])
+    lift, period = 0.0, 0.02
+    for _ in range(100):
+        command, before = rng.uniform(6.0, 14.0), lift
+        steps = command + (before - command) * np.exp(-RISE * np.linspace(0.0, period, 201))
+        lift = steps[-1]
+        push = 0.9 * float(np.mean(0.5 * (steps[1:] + steps[:-1]))) * up + rng.normal(0.0, 0.3, 3)
+        strength.flown(command, period, push, up, counts=True)
+    assert abs(strength.share - 0.9) < 0.015 and abs(strength.lift - lift) < 1e-9
