@@ -59,9 +59,9 @@ def around_body(problem: Problem, scene: Scene) -> Scene | None:
     if not bodies or scene.obstacles.maps:
         return None
     more = torch.stack([part.reach - part.inner.vehicle_radius for part in bodies]).amax(0).unsqueeze(-1)
-    kinds = scene.obstacles.kinds
-    grown = [replace(part, radii=torch.where(part.absent, part.radii, part.radii + more)) for part in kinds]
-    return replace(scene, obstacles=Inflated(*grown))
+    spheres, boxes, _ = scene.obstacles
+    wider = lambda part: replace(part, radii=torch.where(part.absent, part.radii, part.radii + more))
+    return replace(scene, obstacles=Inflated(wider(spheres), None if boxes is None else wider(boxes)))
 
 
 def has_paths(problem: Problem) -> bool:
