@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -58,7 +57,6 @@ class Refine:
         check_options(self, "refine")
 
 
-@lru_cache(maxsize=64)
 def inner_solver(iterations: int, share: float = 1.0) -> ILQR:
     """The inner solver of candidates, with a share of their tolerance."""
     return ILQR(tolerance=share * CANDIDATE_TOLERANCE, max_iterations=iterations, line_search=LINE_SEARCH)
