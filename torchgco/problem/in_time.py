@@ -257,8 +257,10 @@ def _cost(problem: Problem, time: FreeTime) -> Cost:
     seconds = time.weight * dt
     pin = PIN * torch.where(seconds > 0, seconds, dt)
     idle = None if time.count == 1 else 1.0 - _switches(time, problem.N)  # type: ignore[operator]
-    kind = _QuadraticCost if isinstance(problem.cost, QuadraticInFreeTime) else _Cost
-    return kind(problem.cost, problem.n, problem.m, seconds, pin, idle)
+    sizes = problem.n, problem.m
+    if isinstance(problem.cost, QuadraticInFreeTime):
+        return _QuadraticCost(problem.cost, *sizes, seconds, pin, idle)
+    return _Cost(problem.cost, *sizes, seconds, pin, idle)
 
 
 @dataclass(frozen=True)
