@@ -63,13 +63,6 @@ def moved(text: str, folder: Path) -> str:
     return FILED.sub(move, text)
 
 
-def read(file: Path) -> str:
-    """A filed table as Markdown, as it was before it was moved."""
-    with file.open(newline="") as opened:
-        head, *rows = ([cell.replace("|", "\\|") for cell in row] for row in csv.reader(opened))
-    return markdown(head, rows)
-
-
 def interval(hits: int, n: int, digits: int = 0) -> str:
     """The 95 % Wilson interval of a rate, in percent."""
     low, high = (100 * end for end in wilson(int(hits), int(n)))
