@@ -13,8 +13,6 @@ from pathlib import Path
 from benchmarks.lib.provenance import provenance
 from torchgco.experiments.statistics.statistics import wilson
 
-INTERVALS = "95 % Wilson intervals in percent"
-SET_UP = "set-up excluded"
 FILED = re.compile(r"^<!-- file (\S+) -->\n((?:\|.*\n?)+)", re.MULTILINE)
 
 
@@ -93,12 +91,12 @@ def measured(how: str, *notes: str) -> str:
     """The line above a table.
 
     Args:
-        how: number of problems, seed, kind of time.
+        how: number of problems, seed, and what departs from the protocol of benchmarks/README.md.
         notes: further parts of the line; "CasADi" gets its version.
     """
     casadi = provenance("cpu")["casadi"]
     more = [f"CasADi {casadi}" if note == "CasADi" else note for note in notes]
-    return "; ".join([f"{origin('Measured')}, {how}, {machine()}, shared", *more]) + "."
+    return "; ".join([f"{origin('Measured')}, {how}, {machine()}", *more]) + "."
 
 
 def put(page: Path, name: str, text: str) -> None:
