@@ -12,9 +12,10 @@ from benchmarks.families import general, general_peers
 from benchmarks.families.general_problems import FAMILIES
 from benchmarks.families.general_starts import STARTS, digest, judged, starts
 from benchmarks.families.general_tables import FAMILY_HEAD, SET_HEAD, better, references_of, within, worse
+from tests.slow import mostly
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", mostly(FAMILIES, "springs30_long"))
 def test_a_family_is_drawn_by_its_seed(name: str) -> None:
     family = FAMILIES[name]
     drawn, same, other = (family.drawn(seed) for seed in (7, 7, 8))
