@@ -72,7 +72,10 @@ class Pilot:
         obs = {name: np.asarray(value, dtype=float) for name, value in obs.items()}
         x = self._state(obs)
         passed = int(obs["target_gate"])
-        track = Track(obs["gates_pos"], obs["gates_quat"], obs["obstacles_pos"], obs["obstacles_visited"] > 0)
+        track = Track(
+            obs["gates_pos"], obs["gates_quat"], obs["obstacles_pos"], obs["obstacles_visited"] > 0,
+            obs["gates_visited"] > 0,
+        )  # fmt: skip
         if passed >= 0:
             self._plan(track, x, passed)
         times = self.t + PERIOD * np.arange(AHEAD + 1)
@@ -109,15 +112,23 @@ class Pilot:
         new = known != self.known
         at_gate = min((passed - self.plan.passed + 1) * STAGES, len(self.plan.t) - 1)
         to_gate = self.plan.t[at_gate] - self.t
-        often = SOON if self.plan.eased else OFTEN
+        often = SOON if self.plan.speed > self.limits.speed else OFTEN
         if self.t - self.planned < RETRY - 1e-9 and self.lost:
             return
         if not new and (self.t - self.planned < often - 1e-9 or to_gate < CLOSE):
             return
         found = again(self.plan, track, x, self.t, passed, self.strength.share, self.limits)
         self.planned, self.lost = self.t, found is None
-        if found is not None:
+        if found is not None and (new or self._soon(found)):
             self.plan, self.known = found, known
+
+    def _soon(self, found: Plan) -> bool:
+        """Whether a plan ends about when the present one does: what solves end with may be a detour.
+
+        One within slower limits than the present plan's may take as much longer as these are slower.
+        """
+        slower = max(self.plan.speed / found.speed, 1.0)
+        return found.t[-1] - self.t <= slower * (self.plan.t[-1] - self.t) + SOON
 
 
 def nominal_plan(config: Any, limits: Limits) -> Plan:
@@ -125,6 +136,7 @@ def nominal_plan(config: Any, limits: Limits) -> Plan:
     track = Track(
         np.array([g["pos"] for g in config.gates]), quaternions(np.array([g["rpy"] for g in config.gates])),
         np.array([o["pos"] for o in config.obstacles]), np.zeros(len(config.obstacles), bool),
+        np.zeros(len(config.gates), bool),
     )  # fmt: skip
     x = np.zeros(STATES)
     x[POSITION], x[LIFT] = config.drones[0]["pos"], GRAVITY

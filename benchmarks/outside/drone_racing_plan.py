@@ -29,6 +29,7 @@ from torchgco import (
     Capsules,
     ControlBounds,
     FreeTime,
+    FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
     Gates,
@@ -43,6 +44,15 @@ from torchgco.solvers.timing import of_user
 STAGES, STAGE = 24, 0.04  # of a leg; s, a stage where the factor of time is 1
 WALLS = np.array([[-2.9, -2.9, 0.1], [2.9, 2.9, 2.4]])  # m
 ADMITTED = 1e-3  # m, violation of a plan that is flown
+# Level 2 moves gates by up to 0.15 m along x and y, 0.21 m in all, and shows them from 0.7 m on in the plane. At the
+# careful speed these 0.7 m take 0.55 s, in which `MODEL` moves 0.21 m aside and stops there (within `Limits`). Where a
+# gate that isn't seen may come into sight, the speed has to be careful already.
+DISPLACED = 0.21  # m
+CAREFUL_SPEED = 0.7 / 0.55  # m/s
+SIGHT = 0.7 + DISPLACED  # m
+DECELERATION = 9.1  # m/s^2, at the tilt of `Limits`
+ROUNDING_AREA = 0.1  # m^2, of the corner where the bound begins
+ANY_SPEED = 100.0  # m/s: bounds nothing
 MODEL = FunctionDynamics(rates, STATES, CONTROLS, STAGE, "rk4", POSITION)
 
 
@@ -50,6 +60,17 @@ def smoothness(x: Tensor, u: Tensor) -> Tensor:
     """Cost per second of commands apart from the state: without it, controls that don't matter are anything."""
     off = (u[..., :2] - x[..., TILT]).square().sum(-1)
     return 0.05 * off + 0.002 * (u[..., 2] - x[..., LIFT]).square()
+
+
+def haste(x: Tensor, near: Tensor, careful: Tensor) -> Tensor:
+    """Rows (..., 1), m/s: how much faster than careful, (..., 1), m/s, within `SIGHT` of a gate at (..., 2), m.
+
+    Farther away the bound on v^2 grows so that braking by `DECELERATION` keeps it; the corner between is rounded.
+    """
+    far = (x[..., :2] - near).square().sum(-1, keepdim=True) - SIGHT**2
+    beyond = 0.5 * (far + (far.square() + ROUNDING_AREA**2).sqrt())
+    slack = x[..., VELOCITY].square().sum(-1, keepdim=True) - careful.square() - DECELERATION / SIGHT * beyond
+    return 0.5 * slack / careful
 
 
 @dataclass(frozen=True)
@@ -60,6 +81,7 @@ class Track:
     turns: np.ndarray  # (G, 4), [x, y, z, w]
     poles: np.ndarray  # (P, 3), m: their tops
     seen: np.ndarray  # (P,) bool: poles that were measured; the others may be elsewhere
+    met: np.ndarray  # (G,) bool: gates that were measured
 
 
 @dataclass(frozen=True)
@@ -73,6 +95,7 @@ class Limits:
     half: float = 0.05  # m, half the width of the squares in which gates are crossed
     tilt: float = 0.75  # rad, commanded and flown
     lift: tuple[float, float] = (0.35, 1.5)  # times the weight
+    careful: float = CAREFUL_SPEED  # m/s, where a gate that isn't seen may come into sight
 
 
 # What is tried where there is no plan within the usual limits, as where a gate is seen late.
@@ -92,7 +115,7 @@ class Plan:
     U: np.ndarray
     passed: int  # gates before the first leg
     gates: np.ndarray  # (G, 3), m: where they were when it was made
-    eased: bool = False  # whether the usual limits had no plan
+    speed: float  # m/s, the most that its limits allow
     solution: torchgco.Solution | None = field(default=None, repr=False)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,6 +154,7 @@ def posed(track: Track, x: np.ndarray, passed: int, share: float, limits: Limits
         ControlBounds([-limits.tilt, -limits.tilt, low], [limits.tilt, limits.tilt, high]),
         StateBounds(*states),
         NormBounds(("x", [3, 4, 5]), upper=speed),
+        _careful(track, x, passed, limits),
         Gates(centers, normals=turned(track.turns[passed:])[..., 0], half_widths=limits.half,
               knots=[*firsts, N - 1]),
         *([] if limits.room is None else [Boxes(boxes, halves, limits.room, rotations)]),
@@ -138,6 +162,18 @@ def posed(track: Track, x: np.ndarray, passed: int, share: float, limits: Limits
     ]  # fmt: skip
     time = FreeTime(0.01, 4.0, guess=1.0, segments=firsts or None)
     return Problem(MODEL, FunctionCost(smoothness), rows, [x.tolist()], N, time=time)
+
+
+def _careful(track: Track, x: np.ndarray, passed: int, limits: Limits) -> FunctionConstraint:
+    """The bound on the speed on the way to gates that aren't seen; in x (n,) the drone may be faster already."""
+    centers, now = track.gates[passed:, :2], float(x[VELOCITY] @ x[VELOCITY])
+    most = np.where(track.met[passed:], ANY_SPEED, limits.careful)
+    beyond = max(float(((x[:2] - centers[0]) ** 2).sum()) - SIGHT**2, 0.0)
+    most[0] = max(most[0], 1.02 * max(now - DECELERATION / SIGHT * beyond, 0.0) ** 0.5)
+    knots = np.arange(len(centers) * STAGES + 2)
+    legs = np.clip((knots - 1) // STAGES, 0, len(centers) - 1)
+    values = {"near": centers[legs][None], "careful": most[legs][None, :, None]}
+    return FunctionConstraint(haste, name="haste", knot_values=values)
 
 
 # A way through the nominal track, m, leg by leg: the first guess of the first plan. Each leg ends in a gate.
@@ -165,7 +201,7 @@ def first(track: Track, x: np.ndarray, limits: Limits) -> Plan:
     found = torchgco.solve(problem, torch.from_numpy(U0)[None], solver, X0=torch.from_numpy(X0)[None])
     if not float(found.violation[0]) <= ADMITTED:
         raise RuntimeError(f"no plan through the nominal track: {found.statuses[0].name}, {found.violation}")
-    return Plan(found.t[0].numpy(), found.X[0].numpy(), found.U[0].numpy(), 0, track.gates, solution=found)
+    return Plan(found.t[0].numpy(), found.X[0].numpy(), found.U[0].numpy(), 0, track.gates, limits.speed, found)
 
 
 def _along(way: Sequence[Sequence[Sequence[float]]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -197,7 +233,7 @@ def again(
         found = _from_guess(problem, torch.from_numpy(X0)[None], torch.from_numpy(U0)[None])
         if float(found.violation[0]) <= ADMITTED:
             t, X, U = now + found.t[0].numpy(), found.X[0].numpy(), found.U[0].numpy()
-            return Plan(t, X, U, passed, track.gates, bounds is not limits, found)
+            return Plan(t, X, U, passed, track.gates, bounds.speed, found)
     return None
 
 

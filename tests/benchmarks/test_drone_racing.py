@@ -1,9 +1,13 @@
 """The model of the racing drone, its commands, its gates and its estimate of the thrust, beside slow, obvious maths."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import torchgco
 from benchmarks.outside.drone_racing_model import (
     GRAVITY,
     OPENING,
@@ -16,6 +20,20 @@ from benchmarks.outside.drone_racing_model import (
     rates,
     tilt_state,
 )
+from benchmarks.outside.drone_racing_plan import (
+    CAREFUL_SPEED,
+    DECELERATION,
+    DISPLACED,
+    MODEL,
+    ROUNDING_AREA,
+    SIGHT,
+    Limits,
+    Track,
+    haste,
+    posed,
+    smoothness,
+)
+from torchgco import ControlBounds, FreeTime, FunctionConstraint, FunctionCost, InteriorPoint, Problem
 
 
 def test_tilts_and_their_rates_are_those_of_a_turning_body() -> None:
@@ -72,3 +90,53 @@ def test_the_thrust_is_learnt_from_velocities() -> None:
         push = 0.9 * float(np.mean(0.5 * (steps[1:] + steps[:-1]))) * up + rng.normal(0.0, 0.3, 3)
         strength.flown(command, period, push, up, counts=True)
     assert abs(strength.share - 0.9) < 0.015 and abs(strength.lift - lift) < 1e-9
+
+
+def moving(at: list[float], speed: float) -> torch.Tensor:
+    x = torch.zeros(1, 11, dtype=torch.float64)
+    x[0, :3], x[0, 3], x[0, 10] = torch.tensor(at), speed, GRAVITY
+    return x
+
+
+def test_near_gates_that_are_not_seen_the_speed_is_bounded_and_braking_in_time_keeps_the_bound() -> None:
+    gate, careful = torch.tensor([[1.0, 0.0]]).double(), torch.tensor([[CAREFUL_SPEED]]).double()
+    rounded = (DECELERATION / SIGHT * ROUNDING_AREA / 2) / (
+        2 * CAREFUL_SPEED
+    )  # the most that the rounded corner adds, at the edge
+    for height in (0.3, 1.5):  # gates are seen by their distance in the plane
+        near = haste(moving([1.0, 0.0, height], CAREFUL_SPEED + 0.1), gate, careful)
+        assert 0.08 < float(near) < 0.12
+        edge = haste(moving([1.0 - SIGHT, 0.0, height], CAREFUL_SPEED), gate, careful)
+        np.testing.assert_allclose(float(edge), -rounded, rtol=1e-6)
+    for far in (0.05, 0.2, 0.5):
+        braked = (CAREFUL_SPEED**2 + 2 * DECELERATION * far) ** 0.5
+        assert float(haste(moving([1.0 - SIGHT - far, 0.0, 1.0], braked), gate, careful)) <= 0.0
+
+
+def test_the_bound_is_that_of_the_leg_to_a_gate_that_is_not_seen_and_not_below_the_speed_now() -> None:
+    gates = np.array([[0.5, 0.0, 1.0], [3.0, 0.0, 1.0]])
+    track = Track(gates, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.array([[9.0, 9.0, 1.5]]), np.array([True]),
+                  np.array([False, False]))  # fmt: skip
+    x = moving([0.0, 0.0, 1.0], 2.0)[0].numpy()
+    for met, expected in (([False, False], (2.04, CAREFUL_SPEED)), ([True, False], (100.0, CAREFUL_SPEED))):
+        problem = posed(replace(track, met=np.array(met)), x, 0, 1.0, Limits())
+        (row,) = (part for part in problem.constraints if getattr(part, "name", "") == "haste")
+        bounds = np.ravel(vars(row)["knot_values"]["careful"])
+        np.testing.assert_allclose(bounds[[1, 24, 25, -1]], np.repeat(expected, 2))
+
+
+@pytest.mark.slow
+def test_at_the_careful_speed_a_gate_that_is_displaced_can_still_be_met() -> None:
+    limits, N = Limits(), 24
+    rows = [
+        ControlBounds([-limits.tilt, -limits.tilt, limits.lift[0] * GRAVITY],
+                      [limits.tilt, limits.tilt, limits.lift[1] * GRAVITY]),
+        FunctionConstraint(lambda x: x[..., 6:8].square() - limits.tilt**2),
+        FunctionConstraint(lambda x: torch.stack((x[..., 1] - DISPLACED, x[..., 4]), -1), "equality", knots=[N]),
+    ]  # fmt: skip
+    start = moving([0.0, 0.0, 1.0], CAREFUL_SPEED)
+    problem = Problem(MODEL, FunctionCost(smoothness), rows, start, N, time=FreeTime(0.01, 4.0, guess=0.6))
+    guess = torch.tensor([0.0, 0.0, GRAVITY]).double().repeat(1, N, 1)
+    found = torchgco.solve(problem, guess, InteriorPoint(tolerance=1e-5))
+    assert found.statuses[0].name == "CONVERGED"
+    assert abs(0.7 / CAREFUL_SPEED - float(found.t[0, -1])) < 0.01
