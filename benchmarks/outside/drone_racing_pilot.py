@@ -22,7 +22,7 @@ from benchmarks.outside.drone_racing_model import (
     tilt_state,
     turned,
 )
-from benchmarks.outside.drone_racing_plan import STAGES, Limits, Plan, Track, again, first
+from benchmarks.outside.drone_racing_plan import STAGES, Limits, Plan, Track, again, as_soon, first
 from torchgco import ControlBounds, FunctionDynamics, Problem, QuadraticCost
 
 PERIOD, AHEAD = 0.02, 15  # s; periods
@@ -119,16 +119,8 @@ class Pilot:
             return
         found = again(self.plan, track, x, self.t, passed, self.strength.share, self.limits)
         self.planned, self.lost = self.t, found is None
-        if found is not None and (new or self._soon(found)):
+        if found is not None and (new or as_soon(found, self.plan, self.t, SOON)):
             self.plan, self.known = found, known
-
-    def _soon(self, found: Plan) -> bool:
-        """Whether a plan ends about when the present one does: what solves end with may be a detour.
-
-        One within slower limits than the present plan's may take as much longer as these are slower.
-        """
-        slower = max(self.plan.speed / found.speed, 1.0)
-        return found.t[-1] - self.t <= slower * (self.plan.t[-1] - self.t) + SOON
 
 
 def nominal_plan(config: Any, limits: Limits) -> Plan:

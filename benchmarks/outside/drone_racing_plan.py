@@ -237,6 +237,15 @@ def again(
     return None
 
 
+def as_soon(found: Plan, before: Plan, now: float, slack: float) -> bool:
+    """Whether a plan ends about when the plan before does, to a slack, s: what a solve ends with may be a detour.
+
+    One within slower limits than the plan before may take as much longer as these are slower.
+    """
+    slower = max(before.speed / found.speed, 1.0)
+    return bool(found.t[-1] - now <= slower * (before.t[-1] - now) + slack)
+
+
 def _from_guess(problem: Problem, X0: Tensor, U0: Tensor, barrier: float = 1e-3) -> torchgco.Solution:
     """One solve from a guess and its times, as `torchgco.solve` makes it, but without others after one that fails."""
     assert problem.time is not None

@@ -28,7 +28,9 @@ from benchmarks.outside.drone_racing_plan import (
     ROUNDING_AREA,
     SIGHT,
     Limits,
+    Plan,
     Track,
+    as_soon,
     haste,
     posed,
     smoothness,
@@ -123,6 +125,16 @@ def test_the_bound_is_that_of_the_leg_to_a_gate_that_is_not_seen_and_not_below_t
         (row,) = (part for part in problem.constraints if getattr(part, "name", "") == "haste")
         bounds = np.ravel(vars(row)["knot_values"]["careful"])
         np.testing.assert_allclose(bounds[[1, 24, 25, -1]], np.repeat(expected, 2))
+
+
+def test_a_detour_does_not_replace_a_plan_that_still_holds() -> None:
+    def plan(end: float, speed: float) -> Plan:
+        return Plan(np.array([1.0, end]), np.zeros((2, 11)), np.zeros((1, 3)), 0, np.zeros((1, 3)), speed)
+
+    kept, fast = plan(3.0, 2.0), plan(3.0, 4.0)
+    assert as_soon(plan(3.05, 2.0), kept, 1.0, 0.1) and as_soon(plan(2.0, 4.0), kept, 1.0, 0.1)
+    assert not as_soon(plan(3.2, 2.0), kept, 1.0, 0.1) and not as_soon(plan(3.2, 4.0), kept, 1.0, 0.1)
+    assert as_soon(plan(5.0, 2.0), fast, 1.0, 0.1) and not as_soon(plan(5.2, 2.0), fast, 1.0, 0.1)
 
 
 @pytest.mark.slow
