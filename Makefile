@@ -14,9 +14,9 @@
 #              make paper: the paper's figures, tables and missions by our solvers, in benchmarks/results/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
 #              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); robustness: those of wrong input, kills and
-#              random examples, with tables of what was tried and of mutants; versions: the tests of the wheel with the oldest and the
-#              newest dependencies, in environments of their own (ARGS=oldest for one line); lint, types: the static checks;
-#              clean: remove environments, caches and builds
+#              random examples, with tables of what was tried; versions: the tests of the wheel with the oldest and the newest
+#              dependencies, in environments of their own (ARGS=oldest for one line); lint, types: the static checks; clean:
+#              remove environments, caches and builds
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -50,10 +50,10 @@ study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
 
 test: $(DEV)
-	$(BIN)/python -m pytest -n auto $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 test-all: $(DEV)
-	$(BIN)/python -m pytest -n auto -m "not slurm" $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slurm" $(ARGS)
 
 test-slurm: $(DEV)
 	$(BIN)/python -m pytest -m slurm $(ARGS)

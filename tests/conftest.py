@@ -4,9 +4,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import omegaconf.base
 import pytest
@@ -14,6 +16,7 @@ import torch
 import yaml
 
 from torchgco import kernels
+from torchgco.experiments.config import build
 from torchgco.native.compiler import find_compiler
 
 ROOT = Path(__file__).parents[1]
@@ -41,6 +44,23 @@ def _parse_once() -> None:
 
 
 _parse_once()
+
+
+def _compose_once() -> None:
+    """The tests compose some configurations many times: what conf/ alone decides is composed once, and copied."""
+    slow = build.compose_config
+
+    @cache
+    def known(words: tuple[str, ...], folder: str) -> dict[str, Any]:
+        return slow(words)
+
+    def quick(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> dict[str, Any]:
+        return slow(overrides, searchpath) if searchpath else deepcopy(known(tuple(overrides), os.getcwd()))
+
+    build.compose_config = quick
+
+
+_compose_once()
 # Without a C compiler PyTorch's kernels solve, many times slower: these folders and files, whose tests are of native
 # kernels or of many solves, are skipped then.
 COMPILED = (

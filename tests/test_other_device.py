@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchgco
 from tests.other_device import OTHER, SecondDevice
+from tests.slow import mostly
 from torchgco import (
     GCO,
     ILQR,
@@ -104,7 +105,7 @@ def solved(problem: Problem, U0: Tensor, solver: Any = LOCAL) -> tuple[Solution,
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("kind", ["map", "states"])
+@pytest.mark.parametrize("kind", mostly(["map", "states"], "map"))
 def test_what_solve_checks_before_and_after_stays_on_the_device(kind: str) -> None:
     """Horizons, contact between knots, scales, explanations: the solver itself has tests of its own."""
 

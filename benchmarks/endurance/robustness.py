@@ -1,9 +1,8 @@
 """python -m benchmarks.endurance.robustness: what was tried against the library, and how often.
 
 Runs the tests of wrong input, damaged files, killed processes, batches and known answers, the slow ones too, and counts
-the cases and the random examples in them (some minutes on two cores); then tries mutants of the solver (mutation.py; an
-hour or more the first time, --mutants 0 for none). With --write the tables go into benchmarks/results/robustness.md and
-mutation.md. --bombs measures the small files that promise much alone (a minute).
+the cases and the random examples in them (some minutes on two cores). With --write the tables go into
+benchmarks/results/robustness.md. --bombs measures the small files that promise much alone (a minute).
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-from benchmarks.endurance import mutation
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.page import filed, put_between
 from benchmarks.lib.provenance import provenance
@@ -122,8 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.endurance.robustness", description=(__doc__ or "").split("\n")[0]
     )
-    parser.add_argument("--write", action="store_true", help="put the tables into results/*.md")
-    parser.add_argument("--mutants", type=int, default=60, help="of each language, for benchmarks.endurance.mutation")
+    parser.add_argument("--write", action="store_true", help="put the tables into results/robustness.md")
     parser.add_argument("--bombs", action="store_true", help="the small files that promise much alone")
     options, more = parser.parse_known_args(arguments)
     right = put_bombs(options.write)
@@ -143,8 +140,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(text)
     if options.write:
         put_between(PAGE, "<!-- robustness -->", "<!-- end robustness -->", text)
-    if options.mutants > 0:
-        mutation.main(["--each", str(options.mutants), *(["--write"] if options.write else [])])
     return 0 if right and all(end in ("passed", "skipped") for _, end in cases) else 1
 
 

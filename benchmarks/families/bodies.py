@@ -97,7 +97,7 @@ def text(count: int, seed: int) -> str:
 
 
 main = Command(
-    __doc__, "bodies", text, "{count} drawn starts each, seed {seed}, processor time of one thread",
+    __doc__, "bodies", text, "{count} drawn starts each, seed {seed}",
     count=(64, "starts of each scene"), seed=(3, "of the starts"),
 )  # fmt: skip
 

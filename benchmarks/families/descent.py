@@ -231,7 +231,7 @@ def text(count: int, seed: int, stages: int, nominal: list[float]) -> str:
 
 
 main = Command(
-    __doc__, "free_time", text, "{count} drawn starts, seed {seed}, {stages} stages, processor time of one thread",
+    __doc__, "free_time", text, "{count} drawn starts, seed {seed}, {stages} stages",
     "CasADi", mark="descent", count=(64, "starts"), seed=(7, "of the starts"), stages=(60, "of each descent"),
     nominal=([40.0, 60.0, 90.0], "times of the problem, s"),
 )  # fmt: skip

@@ -154,7 +154,7 @@ def main(words: Sequence[str] | None = None) -> int:
     trap_rows = traps()
     print(markdown(TRAP_HEAD, trap_rows))
     if asked.write:
-        how = f"{asked.problems} drawn cars of seed {asked.seed}, each solved alone, processor time of one thread"
+        how = f"{asked.problems} drawn cars of seed {asked.seed}, each solved alone"
         put(RESULTS / "discs.md", "cars", f"{measured(how)}\n\n{markdown(HEAD, rows)}")
         put(RESULTS / "discs.md", "traps", f"{measured('each solved alone')}\n\n{markdown(TRAP_HEAD, trap_rows)}")
     return 0

@@ -91,13 +91,13 @@ def main(words: Sequence[str] | None = None) -> int:
         rows += [row_of(f"seed {seed}, {what}", flights, name) for name in solvers]
         print(markdown(HEAD, rows[-len(solvers) :]), flush=True)
     if asked.write:
-        how = f"{asked.layouts} plans of each seed, each solved alone, processor time of one thread"
+        how = f"{asked.layouts} plans of each seed, each solved alone"
         put(RESULTS / "floors.md", "plans", f"{measured(how)}\n\n{markdown(HEAD, rows)}")
     if asked.maps is not None:
         flown = [row for one in MAPS if (asked.maps / one.file).is_file() for row in map_rows(asked.maps, one, solvers)]
         print(markdown(MAP_HEAD, flown), flush=True)
         if asked.write:
-            how = "each solved alone, processor time of one thread"
+            how = "each solved alone"
             put(RESULTS / "floors.md", "maps", f"{measured(how)}\n\n{short(markdown(MAP_HEAD, flown))}\n\n{sources()}")
     if asked.picture is not None:
         draw(asked.picture, asked.seeds[1], solvers)

@@ -333,7 +333,7 @@ def text(count: int, seed: int, stages: list[int], margin: float, tracks: int) -
 
 
 main = Command(
-    __doc__, "free_time", text, "{count} drawn carts, {tracks} moved tracks, seed {seed}, processor time of one thread",
+    __doc__, "free_time", text, "{count} drawn carts, {tracks} moved tracks, seed {seed}",
     "CasADi", count=(64, "carts"), seed=(7, "of carts and tracks"), stages=([20, 80], "of each leg of the race"),
     margin=(1e-3, "of the gates' radius in a plan that is aimed, m"), tracks=(0, "races with moved gates"),
 )  # fmt: skip

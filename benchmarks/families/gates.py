@@ -186,8 +186,7 @@ main = Command(
     "gates",
     text,
     "layouts of seed {seed}, at most {count}, for at most {minutes} minutes; IPOPT on the first {beside} of them; "
-    "{tracks} tracks moved by seed {moved}, the worst of these; a margin of 1 mm where a plan is aimed; processor time "
-    "of one thread",
+    "{tracks} tracks moved by seed {moved}, the worst of these; a margin of 1 mm where a plan is aimed",
     "CasADi",
     count=(64, "layouts"),
     seed=(12, "of the layouts; constants were chosen on others"),

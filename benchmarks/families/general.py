@@ -23,7 +23,6 @@ from benchmarks.families.general_starts import digest, judged
 from benchmarks.lib import ROOT
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
-from benchmarks.lib.page import INTERVALS, SET_UP
 from benchmarks.lib.provenance import provenance
 from torchgco import Problem, Solution, presets, solve
 from torchgco.solvers.contracts import Solver
@@ -99,7 +98,7 @@ def table(
 
 main = Command(
     __doc__, "general", table,
-    "seed {seed}, processor time with one thread, at most {seconds} s per solve", INTERVALS, SET_UP, "CasADi",
+    "seed {seed}, at most {seconds} s per solve", "CasADi",
     solvers=(["gco"], "presets by name"), sets=(list(SETS), "1 classics, 2 obstacles, 3 constraints, 4 scale", SETS),
     families=(list(FAMILIES), "which", FAMILIES), seed=(0, "of the problems"), seconds=(30, "limit of a solve"),
     restart=(0, "seconds of IPOPT from each result, to see whether it is a local minimum; 0: it isn't started"),

@@ -15,7 +15,7 @@ from benchmarks.families.general_problems import FAMILIES, SETS
 from benchmarks.families.general_problems_base import Family
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
-from benchmarks.lib.page import SET_UP, filed, markdown, shown
+from benchmarks.lib.page import filed, markdown, shown
 from torchgco import InteriorPoint, Solution, solve
 from torchgco.kernels import use_native
 
@@ -71,7 +71,7 @@ def cells(own: pd.DataFrame) -> list[object]:
 
 
 main = Command(
-    __doc__, "general", table, "seed {seed}, batches of {batch}", SET_UP, mark="eager",
+    __doc__, "general", table, "seed {seed}, batches of {batch}", mark="eager",
     sets=(list(SETS), "1 classics, 2 obstacles, 3 constraints, 4 scale", SETS),
     families=(list(FAMILIES), "which", FAMILIES), seed=(0, "of the problems"), batch=(8, "problems at once"),
 )  # fmt: skip

@@ -16,7 +16,7 @@ from benchmarks.families.general_problems_base import Family
 from benchmarks.families.general_starts import judged
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
-from benchmarks.lib.page import SET_UP, chosen, filed, markdown, share, shown
+from benchmarks.lib.page import chosen, filed, markdown, share, shown
 from torchgco import certify, solve
 
 EXACT, USUAL = "gco_exact", "gco"
@@ -75,7 +75,7 @@ def shortfalls(rows: pd.DataFrame) -> str:
 
 
 main = Command(
-    __doc__, "general", table, "seed {seed}, processor time with one thread, least of {rounds}", SET_UP, mark="exact",
+    __doc__, "general", table, "seed {seed}, least of {rounds}", mark="exact",
     sets=(list(SETS), "1 classics, 2 obstacles, 3 constraints, 4 scale", SETS),
     families=(list(FAMILIES), "which", FAMILIES), seed=(0, "of the problems"), rounds=(2, "of solves, for their times"),
 )  # fmt: skip

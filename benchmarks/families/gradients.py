@@ -243,7 +243,7 @@ def summary(kinds: Sequence[Sequence[Any]]) -> str:
 
 
 main = Command(
-    __doc__, "gradients", text, "{count} drawn layouts, seed {seed}, processor time of one thread",
+    __doc__, "gradients", text, "{count} drawn layouts, seed {seed}",
     count=(256, "layouts of forest30"), seed=(7, "of the layouts"),
 )  # fmt: skip
 

@@ -65,7 +65,7 @@ def main(words: Sequence[str] | None = None) -> int:
         rows += [row_of(name, cells, held) for cells, held in flights.groupby("cells", sort=False)]
         print(markdown(HEAD, rows[-len(asked.cells) :]), flush=True)
     if asked.write:
-        how = f"{asked.count} worlds of each kind, seed {asked.seed}, processor time of one thread"
+        how = f"{asked.count} worlds of each kind, seed {asked.seed}"
         put(RESULTS / "maps.md", "maps", f"{measured(how)}\n\n{short(markdown(HEAD, rows))}")
     return 0
 

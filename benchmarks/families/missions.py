@@ -178,10 +178,7 @@ def _periods(words: list[str], seed: int, count: int = 1) -> list[np.ndarray]:
 
 def _origin(done: str) -> str:
     origin = provenance("cpu")
-    return (
-        f"{done} on {origin['date']} at commit {origin['commit']}, seed 0, 95 % Wilson intervals in percent; one\n"
-        f"thread, {origin['processor']}, shared."
-    )
+    return f"{done} on {origin['date']} at commit {origin['commit']}, seed 0, {origin['processor']}."
 
 
 def _flown(asked: argparse.Namespace) -> str:

@@ -122,7 +122,7 @@ def text(count: int, seed: int) -> str:
 
 
 main = Command(
-    __doc__, "free_time", text, "{count} drawn layouts, seed {seed}, processor time of one thread", mark="moving",
+    __doc__, "free_time", text, "{count} drawn layouts, seed {seed}", mark="moving",
     count=(64, "layouts"), seed=(7, "of the layouts"),
 )  # fmt: skip
 

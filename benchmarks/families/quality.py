@@ -19,7 +19,7 @@ import pandas as pd
 from benchmarks.lib import ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, FAMILIES, Family
-from benchmarks.lib.page import INTERVALS, crossed, filed, interval, machine, markdown, origin, put, share, shown
+from benchmarks.lib.page import crossed, filed, interval, machine, markdown, origin, put, share, shown
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.judging.judge import SUCCESS_VIOLATION
@@ -47,7 +47,7 @@ def main(words: Sequence[str] | None = None) -> int:
         parts = (crossed(text, "family", "solver", cell) for cell in ("success", "median seconds"))
         text = filed("ladder", text, *(f"{title}:\n\n{part}" for title, part in zip(SHORT, parts, strict=True)))
     if set(asked.families) == set(FAMILIES) and asked.write:
-        name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}, shared and busy."
+        name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}."
         put(ROOT / "benchmarks" / PAGES[name], name, f"{head}\n\n{text}")
     return 0
 
@@ -121,7 +121,7 @@ def _rate(row: dict[str, float], name: str) -> str:
 def source(asked: Namespace, group: str) -> str:
     """How a run flew, as the beginning of the line above its table; `group` is what layouts are drawn for."""
     layouts = f"{asked.fresh} drawn layouts per {group}" if asked.fresh else "the public layouts"
-    return f"{origin('Flown')}, {layouts}, seed {asked.seed}, {INTERVALS}; one thread per process"
+    return f"{origin('Flown')}, {layouts}, seed {asked.seed}"
 
 
 if __name__ == "__main__":

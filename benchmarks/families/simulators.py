@@ -20,7 +20,7 @@ from statistics import median
 import torch
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import INTERVALS, machine, markdown, origin, put, share
+from benchmarks.lib.page import machine, markdown, origin, put, share
 from torchgco import Airframe, compose, presets
 from torchgco.missions import Mission, Outcome, Planner, endings
 from torchgco.missions.identification import identify, record
@@ -145,7 +145,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if count > 0:
             missions = flown(case, False, count, asked.outputs)
             rows.append(row(case, f"`{case.base}`" if case.both else "itself", missions))
-    text = f"{origin('Flown')}, seed {SEED}, {INTERVALS}; one thread, {machine()}, shared.\n\n{markdown(HEAD, rows)}"
+    text = f"{origin('Flown')}, seed {SEED}, {machine()}.\n\n{markdown(HEAD, rows)}"
     print(text)
     if asked.write:
         put(RESULTS / "simulators.md", mark, text)

@@ -49,7 +49,7 @@ def main(words: Sequence[str] | None = None) -> int:
         save(figure(summary), RESULTS / "transition.png")
         head = (
             f"{origin('Flown')}, n layouts per point, seed {asked.seed}; 95 % Wilson intervals in the figure; "
-            f"{machine()}, shared."
+            f"{machine()}."
         )
         put(RESULTS / "transition.md", "transition", f"{head}\n\n![Rates](transition.png)\n\n{short(table(summary))}")
     return 0

@@ -188,7 +188,7 @@ def main(words: Sequence[str] | None = None) -> int:
     counts = {name: asked.count or (CASES[name].long if asked.long else CASES[name].count) for name in asked.cases}
     flown = [fly(name, count, asked.outputs) for name, count in counts.items()]
     trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*flown, strict=True))
-    head = f"{origin('Flown')}, seed 0, 95 % Wilson intervals in percent; one thread, {machine()}, shared."
+    head = f"{origin('Flown')}, seed 0, {machine()}."
     kind = "unknown-long" if asked.long else "unknown"
     blocks = {
         "worlds": f"{head}\n\n{short(kind, table(trials, log), misses(trials, log))}",

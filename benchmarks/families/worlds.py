@@ -46,7 +46,7 @@ def main(words: Sequence[str] | None = None) -> int:
         print(markdown(HEAD, new), flush=True)
         rows += new
     if asked.write and set(asked.worlds) == set(WORLDS):
-        head = f"{source(asked, 'world')}, two processes, {machine()}, shared."
+        head = f"{source(asked, 'world')}, two processes, {machine()}."
         if not asked.fresh:
             head += _peers_source(rows_of(asked.peers))
         name, file = ("drawn", "worlds-drawn") if asked.fresh else ("worlds", "worlds")
@@ -119,10 +119,7 @@ def _peers_source(peers: pd.DataFrame) -> str:
     limit, version, date, commit = (
         ", ".join(peers[name].astype(str).unique()) for name in ("limit", "version", "date", "commit")
     )
-    return (
-        f" FATROP, IPOPT and acados: {version}, flown on {date} at commit {commit}, processor time of one thread, at "
-        f"most {limit} s per problem."
-    )
+    return f" FATROP, IPOPT and acados: {version}, flown on {date} at commit {commit}, at most {limit} s per problem."
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ class Command:
         doc: the docstring of its module, see `parser_of`.
         name: of its page below results.
         text: the table in Markdown, and what follows it; called with the options by name.
-        how: number of problems, seed, kind of time; the names of options in braces give their values.
+        how: as of `page.measured`; the names of options in braces give their values.
         notes: further parts of the line above the table; "CasADi" gets its version.
         mark: name of the marks there, with options as in `how`; None: that of the page.
         options: default and help of each, and `choices` as a third; a sequence takes several values.

@@ -13,8 +13,6 @@ from pathlib import Path
 from benchmarks.lib.provenance import provenance
 from torchgco.experiments.statistics.statistics import wilson
 
-INTERVALS = "95 % Wilson intervals in percent"
-SET_UP = "set-up excluded"
 FILED = re.compile(r"^<!-- file (\S+) -->\n((?:\|.*\n?)+)", re.MULTILINE)
 
 
@@ -63,13 +61,6 @@ def moved(text: str, folder: Path) -> str:
     return FILED.sub(move, text)
 
 
-def read(file: Path) -> str:
-    """A filed table as Markdown, as it was before it was moved."""
-    with file.open(newline="") as opened:
-        head, *rows = ([cell.replace("|", "\\|") for cell in row] for row in csv.reader(opened))
-    return markdown(head, rows)
-
-
 def interval(hits: int, n: int, digits: int = 0) -> str:
     """The 95 % Wilson interval of a rate, in percent."""
     low, high = (100 * end for end in wilson(int(hits), int(n)))
@@ -100,12 +91,12 @@ def measured(how: str, *notes: str) -> str:
     """The line above a table.
 
     Args:
-        how: number of problems, seed, kind of time.
+        how: number of problems, seed, and what departs from the protocol of benchmarks/README.md.
         notes: further parts of the line; "CasADi" gets its version.
     """
     casadi = provenance("cpu")["casadi"]
     more = [f"CasADi {casadi}" if note == "CasADi" else note for note in notes]
-    return "; ".join([f"{origin('Measured')}, {how}, {machine()}, shared", *more]) + "."
+    return "; ".join([f"{origin('Measured')}, {how}, {machine()}", *more]) + "."
 
 
 def put(page: Path, name: str, text: str) -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from benchmarks.lib import DATA
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
-from benchmarks.lib.page import INTERVALS, SET_UP, markdown, share
+from benchmarks.lib.page import markdown, share
 from benchmarks.outside.barn_data import GOAL, GOAL_RADIUS, RADIUS, TEST
 from torchgco import Body, ControlBounds, Goal, Problem, QuadraticCost, Spheres, StateBounds, Unicycle, judge, solve
 from torchgco.obstacles.body import BoundBody
@@ -180,7 +180,7 @@ def table(first: int | None, seed: int, body: str, kinds: list[str]) -> str:
 
 
 main = Command(
-    __doc__, "barn", table, "{body}, seed {seed}, processor time with one thread", SET_UP, INTERVALS,
+    __doc__, "barn", table, "{body}, seed {seed}",
     mark="barn {body}", first=(None, "only the first worlds of each kind, this many"),
     seed=(0, "of the random draws of guidance"), body=("disc", "of the robot", list(BODIES)),
     kinds=(KINDS, "of worlds", KINDS),

@@ -20,7 +20,7 @@ import torch
 
 import torchgco
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import INTERVALS, SET_UP, markdown, share
+from benchmarks.lib.page import markdown, share
 from benchmarks.outside.barn import (
     ACCELERATION,
     BACKWARDS,
@@ -268,7 +268,7 @@ def _first_world() -> tuple[np.ndarray, np.ndarray]:
 
 
 main = Command(
-    __doc__, "maps", table, "seed {seed}, runs per test world: {runs}, processor time, one thread", SET_UP, INTERVALS,
+    __doc__, "maps", table, "seed {seed}, runs per test world: {runs}",
     mark="lidar", first=(None, "only the first worlds, this many"), runs=(1, "per world"),
     seed=(0, "of the lidar's noise, and of guidance"),
 )  # fmt: skip

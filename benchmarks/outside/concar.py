@@ -18,7 +18,6 @@ from torch import Tensor
 from benchmarks.lib import DATA, ROOT
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, count, mean, median, named, timed
-from benchmarks.lib.page import SET_UP
 from torchgco import Problem, Solution, Status, judge
 from torchgco.baselines import CasADiSolver
 
@@ -114,7 +113,7 @@ def table(first: int, seed: int) -> str:
 
 
 main = Command(
-    __doc__, "concar", table, "seed {seed}, processor time with one thread", SET_UP,
+    __doc__, "concar", table, "seed {seed}",
     first=(100, "only the first problems, this many"), seed=(0, "of the random draws of guidance"),
 )  # fmt: skip
 

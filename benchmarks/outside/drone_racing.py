@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import torchgco
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import INTERVALS, markdown, share
+from benchmarks.lib.page import markdown, share
 from benchmarks.outside.drone_racing_pilot import Pilot, nominal_plan, tracker
 from benchmarks.outside.drone_racing_plan import Limits, Plan
 
@@ -129,7 +129,7 @@ def table(repository: str, first: int, count: int, flights: str) -> str:
 
 
 main = Command(
-    __doc__, "drone_racing", table, "{count} seeds from {first} on", INTERVALS,
+    __doc__, "drone_racing", table, "{count} seeds from {first} on",
     repository=("lsy_drone_racing", "their repository, at eb891d0"), first=(0, "the first seed"),
     count=(200, "how many seeds"), flights=("drone_racing.csv", "the file of the flights"),
 )  # fmt: skip

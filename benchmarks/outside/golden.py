@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, cost_ratios, named, timed, within, worst
-from benchmarks.lib.page import SET_UP, chosen, filed
+from benchmarks.lib.page import chosen, filed
 from benchmarks.outside.golden_problems import GOLDEN, Golden
 from torchgco import Polish, Problem, certify, solve
 from torchgco.baselines import CasADiSolver
@@ -81,7 +81,7 @@ def table(problems: Sequence[str], starts: int, seed: int) -> str:
 
 
 main = Command(
-    __doc__, "golden", table, "{starts} starts, seed {seed}, processor time with one thread", SET_UP,
+    __doc__, "golden", table, "{starts} starts, seed {seed}",
     problems=(list(GOLDEN), "which", GOLDEN), starts=(8, "starts per problem"), seed=(0, "of the starts"),
 )  # fmt: skip
 

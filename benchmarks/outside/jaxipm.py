@@ -175,8 +175,7 @@ def _beside(name: str, flights: dict[str, pd.DataFrame]) -> list[str]:
 
 main = Command(
     __doc__, "jaxipm", tables,
-    "at most {instances} instances per scenario, {ipopt} for IPOPT (of swaps a quarter), processor time without "
-    "set-up, one thread", "CasADi",
+    "at most {instances} instances per scenario, {ipopt} for IPOPT (of swaps a quarter)", "CasADi",
     instances=(2000, "instances per scenario, at most its pool"), ipopt=(40, "of them for IPOPT, of swaps a quarter"),
     scenarios=(["navigation", "tracking", "swap"], "families", ["navigation", "tracking", "swap"]),
 )  # fmt: skip

@@ -17,7 +17,6 @@ import torchgco
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, cost_ratios, count, mean, median, named, share_within, timed, within
 from benchmarks.lib.limited import limited
-from benchmarks.lib.page import INTERVALS, SET_UP
 from benchmarks.outside.golden import IPOPT
 from benchmarks.outside.maze_problem import drawn, maze, recount, waypoint_guess
 from torchgco import Problem, presets
@@ -113,7 +112,7 @@ def table(starts: int, fatrop: int, seed: int) -> str:
 
 
 main = Command(
-    __doc__, "maze", table, "{starts} starts, seed {seed}, processor time with one thread", "CasADi", SET_UP, INTERVALS,
+    __doc__, "maze", table, "{starts} starts, seed {seed}", "CasADi",
     starts=(64, "the published start and others around it"), fatrop=(16, "of these, starts that FATROP flies"),
     seed=(0, "of the starts"),
 )  # fmt: skip

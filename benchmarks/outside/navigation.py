@@ -20,7 +20,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib import comparison as lib
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import INTERVALS, chosen, filed
+from benchmarks.lib.page import chosen, filed
 from benchmarks.outside.navigation_problem import fan, line_guess, navigation, recount
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
@@ -147,7 +147,7 @@ def table(starts: int, sectors: Sequence[float]) -> str:
 
 main = Command(
     __doc__, "jaxipm", table,
-    "{starts} starts per fan, processor time without set-up, one thread per process", "CasADi", INTERVALS,
+    "{starts} starts per fan", "CasADi",
     mark="navigation",
     starts=(500, "starts per fan"), sectors=([90.0, 180.0], "widths of the fans, degrees"),  # as published
 )  # fmt: skip

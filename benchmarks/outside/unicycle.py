@@ -15,7 +15,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, count, named
-from benchmarks.lib.page import INTERVALS, share
+from benchmarks.lib.page import share
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.judge import judge
 from torchgco.problem.problem import Problem
@@ -116,7 +116,7 @@ def table(count: int, seed: int) -> str:
 
 
 main = Command(
-    __doc__, "unicycle", table, "seed {seed}, processor time with one thread", INTERVALS,
+    __doc__, "unicycle", table, "seed {seed}",
     count=(64, "problems"), seed=(0, "of problems and guesses"),
 )  # fmt: skip
 

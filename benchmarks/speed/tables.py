@@ -15,24 +15,23 @@ NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` 
 
 # The text above each section's table, in the order of the page. The published pages repeat it.
 WORDS = {
-    "targets": "Processor time per problem without set-up. Under a peer's name: how many times as fast the solver is,\n"
-    "per problem and, after the comma, per layout reached, as a peer that stops short of the goal may be fast.",
+    "targets": "Time per problem. Under a peer's name: how many times as fast the solver is, per problem and,\n"
+    "after the comma, per layout reached, as a peer that stops short of the goal may be fast.",
     "families": "Drawn layouts (seed 1000), of which the peers fly the first, before and after `gco`; the second\n"
-    "table has each peer's seconds per problem / those of `gco`. `fatrop_guided` and `acados_guided`\n"
-    "start along the roadmap's best path, whose search counts, all others from the vehicle at rest.",
+    "table has each peer's seconds per problem / those of `gco`.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
     "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
     "finds its kernels, FATROP's program is built.",
-    "loop": "A car (4 states, 2 controls, RK4) follows a reference between two discs, 20 stages of 0.1 s: processor\n"
-    "time of a period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep their\n"
-    "multipliers; `compile` solves to 1e-8. Disturbed cars meet discs that are put into their way; `solved` of\n"
-    "several cars in one call counts periods in which all are.",
+    "loop": "A car (4 states, 2 controls, RK4) follows a reference between two discs, 20 stages of 0.1 s: time of a\n"
+    "period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep their multipliers;\n"
+    "`compile` solves to 1e-8. Disturbed cars meet discs in their way. `solved` counts periods in which all\n"
+    "cars are.",
     "swing_up": "A cart-pole (4 states, 1 control, RK4, both bounded) swings up and stays, 75 stages of 0.02 s, 200\n"
-    "periods from each of several starts near rest, disturbed in every period: processor time of a period but the\n"
-    "first, and of that. `up` counts starts that end within 0.2 of the upright rest.",
-    "learned": "Models of a user's own, in a new process: the first solve by `gco` with an empty cache, and with one\n"
-    "where another model has been solved; networks (tanh) by the interior point, its library's time per iteration;\n"
-    "training steps, each a solve, a gradient of the model's error and a step; code that isn't traced.",
+    "periods from each of several starts near rest, disturbed in every period: time of a period but the first,\n"
+    "and of that. `up` counts starts that end within 0.2 of the upright rest.",
+    "learned": "A user's models: first solves in a new process by `gco`, with an empty cache, and with one where\n"
+    "another model has been solved; the interior point's time per iteration with networks (tanh); training steps,\n"
+    "each a solve, a gradient of the model's error and a step; first solves of code that isn't traced.",
     "own_model": "A user's unicycle (4 states, 2 controls, a Python function, RK4), 100 stages, five discs,\n"
     "`torchgco.solve` without options.",
     "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles;\n"
@@ -40,8 +39,7 @@ WORDS = {
     "mppi": "Milliseconds of one round of white noise around hovering, 30 spheres, float32, B = 1; medians.",
     "first_use": "A first solve in a new process: the model traced, differentiated, written out as C and compiled,\n"
     "and what the first solve takes more than the second, in processor seconds, the compiler's included.",
-    "share": "Processor time of one solve, in percent, by phase of the method. The problems are new to a process\n"
-    "that has solved others.",
+    "share": "Time of one solve, in percent, by phase of the method, in a process that has solved other problems.",
     "cores": "Elapsed time per problem of forests of 30 spheres, in processes with one core and with two.",
     "batch": "Forests of 30 spheres, unless the row names other worlds. `2 outer` ends every problem after two outer\n"
     "iterations. Memory is the peak of a separate process above its memory before the problems were made.",

@@ -243,8 +243,11 @@ def test_an_unknown_option_is_named(plugin: str) -> None:
 def test_without_casadi_there_is_one_clear_line(monkeypatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr("torchgco.baselines.casadi.find_spec", lambda name: None if name == "casadi" else find(name))
-    with pytest.raises(InputError, match="pip install casadi"):
-        CasADiSolver()
+    problem, U0 = planar_batch(B=1, N=5, obstacles=2)
+    solver = CasADiSolver()
+    for call in (lambda: solver.prepare(problem), lambda: solver.solve(problem, U0)):
+        with pytest.raises(InputError, match="pip install casadi"):
+            call()
 
 
 def test_bad_calls_are_named() -> None:

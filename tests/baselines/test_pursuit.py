@@ -70,7 +70,11 @@ def rest(problem: Problem) -> Tensor:
     return problem.x0.new_zeros(problem.B, problem.N, problem.m)
 
 
-@pytest.mark.parametrize("model", [UNICYCLE, VELOCITY, FORCE, STEPS], ids=["unicycle", "velocity", "force", "steps"])
+@pytest.mark.parametrize(
+    "model",
+    [UNICYCLE, VELOCITY, pytest.param(FORCE, marks=pytest.mark.slow), pytest.param(STEPS, marks=pytest.mark.slow)],
+    ids=["unicycle", "velocity", "force", "steps"],
+)
 def test_it_arrives_through_the_door(model: Dynamics) -> None:
     problem = task(model)
     U, found = PathPursuit().guess(problem, rest(problem))

@@ -8,13 +8,14 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.families import general, general_peers
+from benchmarks.families import general, general_exact, general_peers
 from benchmarks.families.general_problems import FAMILIES
 from benchmarks.families.general_starts import STARTS, digest, judged, starts
 from benchmarks.families.general_tables import FAMILY_HEAD, SET_HEAD, better, references_of, within, worse
+from tests.slow import mostly
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", mostly(FAMILIES, "springs30_long"))
 def test_a_family_is_drawn_by_its_seed(name: str) -> None:
     family = FAMILIES[name]
     drawn, same, other = (family.drawn(seed) for seed in (7, 7, 8))
@@ -95,3 +96,11 @@ def test_kept_peers_are_of_known_families() -> None:
     rows = general_peers.rows_of()
     assert set(rows.family) <= set(FAMILIES) and set(rows.start) <= set(STARTS)
     assert not rows.duplicated(["family", "seed", "instance", "digest", "peer", "start"]).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["parking_lot", "time_optimal_car"])
+def test_what_is_solved_exactly_is_stationary_by_the_certificate(name: str) -> None:
+    """Searches kept results to a looser tolerance (1e-5), and rollouts amplified rounding (1e-7)."""
+    rows = general_exact.flown(FAMILIES[name], 0, 1)
+    assert bool((rows.kkt <= general_exact.WANTED).all()) and bool((rows.violation <= general_exact.WANTED).all())

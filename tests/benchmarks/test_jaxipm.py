@@ -9,6 +9,7 @@ import torch
 
 from benchmarks.outside.jaxipm import MX, OURS, PUBLISHED, TOLERANCE, by_ipopt, extremes, main, versus
 from benchmarks.outside.jaxipm_problems import SCENARIOS, Scenario, centers, spread
+from tests.slow import mostly
 from torchgco import Status
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.quality import violation
@@ -77,8 +78,9 @@ def test_pools_follow_their_rules() -> None:
     assert spread(10, 3).tolist() == [0, 4, 9] and spread(2, 5).tolist() == [0, 1]
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=list(NAMED))
-def test_two_instances_are_solved_to_the_published_tolerance(scenario: Scenario) -> None:
+@pytest.mark.parametrize("name", mostly(NAMED, *tuple(NAMED)[1::2], "swap of 4"))
+def test_two_instances_are_solved_to_the_published_tolerance(name: str) -> None:
+    scenario = NAMED[name]
     some = scenario.at(scenario.places(2))
     found = OURS.solve_from(scenario.problem(some), *scenario.guess(some))
     cost, worst = scenario.counted(some, found.U.numpy())

@@ -68,6 +68,7 @@ def test_a_case_is_a_mission_that_can_be_composed(name: str) -> None:
     assert setup.mission is not None and setup.mission.sensor == "lidar"
 
 
+@pytest.mark.slow
 def test_a_mission_is_drawn_at_a_time(tmp_path: Path) -> None:
     target = tmp_path / "one.png"
     assert causes.main(["walls:0:0.5", "--path", str(target)]) == 0

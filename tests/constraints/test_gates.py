@@ -173,6 +173,7 @@ def test_a_path_is_at_each_gate_at_its_knot() -> None:
     assert float(steps[0]) < float(steps[2]) and float(steps[17]) < float(steps[15])
 
 
+@pytest.mark.slow
 def test_beside_horizons_rates_and_the_rest_of_a_batch() -> None:
     ends = torch.tensor([N, 30])
     whole = points(BALLS, ControlBounds(-5.0, 5.0), horizon=ends)

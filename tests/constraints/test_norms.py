@@ -198,6 +198,7 @@ def test_a_thrust_annulus_is_left_on_the_side_that_the_cost_asks_for() -> None:
     assert int((sizes < 0.6 + 1e-4).sum()) > N
 
 
+@pytest.mark.slow
 def test_beside_rates_horizons_and_in_single_precision() -> None:
     slow = torchgco.solve(lander(*SOLVED, RateBounds(-0.1, 0.1)))
     assert slow.statuses == [Status.CONVERGED] * B and float(slow.violation.max()) < 1e-3

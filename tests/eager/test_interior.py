@@ -107,6 +107,7 @@ def test_warm_starts_free_starts_and_guesses_of_states_are_taken() -> None:
         assert_same(native, rest.solve_from(problem.renewed(), X0, torch.zeros(3, 12, 1, dtype=D)))
 
 
+@pytest.mark.slow
 @compiled
 def test_rows_without_room_stay_out() -> None:
     """A bound that the start meets, bounds that coincide, a row that is constantly 0; and one that is broken."""

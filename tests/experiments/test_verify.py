@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import problem_line
+from tests.slow import mostly
 from torchgco.experiments.reports.report import main
 
 WORDS = ["solver=al_ilqr", "study.baselines=[hold]", "study.layouts=3", "scenario.stages=8", "study.workers=1"]
@@ -87,7 +88,7 @@ def test_tables_that_count_the_rows_are_counted_again(name: str, out, capsys) ->
     assert f"not confirmed: {path}, which is missing" in text and f"rows of {name}" not in text
 
 
-@pytest.mark.parametrize("form", ["csv", "json", "markdown", "latex"])
+@pytest.mark.parametrize("form", mostly(["csv", "json", "markdown", "latex"], "markdown", "latex"))
 def test_the_formats_give_what_was_confirmed_and_what_was_not(form: str, out, flown, capsys) -> None:
     assert main(["--verify", str(out), str(flown), "--format", form]) == 0
     captured = capsys.readouterr()

@@ -109,7 +109,7 @@ def test_energy_in_free_fall(make) -> None:
 
 @each_plant
 def test_hover_holds(make) -> None:
-    flown = fly(make(), at_hover(), hover_commands(1000))
+    flown = fly(make(), at_hover(), hover_commands(200))
     assert (flown - flown[0]).abs().max() < 1e-10
 
 

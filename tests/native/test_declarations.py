@@ -15,6 +15,7 @@ from torch import Tensor
 from tests.engines import engine_of
 from tests.native.test_engine import running_state
 from tests.problems import boxed_batch, planar_batch
+from tests.slow import mostly
 from torchgco import ILQR, MPPI, LineSearch, Problem, kernels
 from torchgco.base.draws import DrawKey
 from torchgco.base.status import Status
@@ -274,7 +275,7 @@ OF_ROADMAP = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", OF_ROADMAP)
+@pytest.mark.parametrize("name", mostly(OF_ROADMAP, "TIE", "HOPS"))
 def test_a_constant_of_the_roadmap_changes_both_searches(name: str, monkeypatch) -> None:
     usual = searched()
     for path, module in list(sys.modules.items()):

@@ -197,7 +197,7 @@ MAKERS = {
 }  # fmt: skip
 
 
-USUAL = "curved", "obstacles", "narrow"  # the others are among the slow tests
+USUAL = "curved", "obstacles"  # the others are among the slow tests
 
 
 def guess(problem: Problem, seed: int) -> tuple[Tensor, Tensor]:

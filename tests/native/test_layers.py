@@ -177,7 +177,7 @@ def shared(model: FunctionDynamics) -> Tensor:
     return numbers
 
 
-@pytest.mark.parametrize("name", mostly(CASES, "expressions"))
+@pytest.mark.parametrize("name", mostly(CASES, "expressions", "activations", "many states"))
 def test_derivatives_are_those_of_autodiff(name: str) -> None:
     make, integrator = CASES[name]
     function, n, m = make()
@@ -204,6 +204,7 @@ def test_derivatives_are_those_of_autodiff(name: str) -> None:
             assert torch.equal(alone[0], mine[i])
 
 
+@pytest.mark.slow
 def test_a_network_in_a_branch_that_is_not_taken_spoils_nothing() -> None:
     """Its inputs, values and tangents are NaN or infinite there; one output is read in either branch."""
     net, potential = perceptron(3, 32, 3), perceptron(3, 32, 1, activation=nn.Softplus())

@@ -67,6 +67,11 @@ MODELS: dict[str, Dynamics] = {
 }
 
 
+# Their integrators besides Euler's take seconds of a compiler.
+LARGE = [f"{model} {kind}" for model in ("plant", "rotors", "quadrotor") for kind in KINDS if kind != "euler"]
+ALONE = ["planar, one each", "quadrotor, one each", "plant rk4", "user's"]
+
+
 def points(model: Dynamics, kind: str) -> tuple[Tensor, Tensor]:
     """States (B, n) and controls (B, m) near rest, tumbling, far away, or without thrust."""
     generator = torch.Generator().manual_seed(5)
@@ -88,7 +93,7 @@ def points(model: Dynamics, kind: str) -> tuple[Tensor, Tensor]:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", mostly(MODELS, "plant rk4", "rotors rk4", "quadrotor rk4"))
+@pytest.mark.parametrize("name", mostly(MODELS, *LARGE))
 def test_steps_and_derivatives(name: str) -> None:
     model = MODELS[name]
     emitted = Model(trace_dynamics(model))
@@ -114,7 +119,7 @@ def test_single_precision() -> None:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["planar, one each", "quadrotor, one each", "plant rk4", "user's"])
+@pytest.mark.parametrize("name", mostly(ALONE, "plant rk4"))
 def test_a_problem_depends_on_no_other(name: str) -> None:
     model = MODELS[name]
     emitted = Model(trace_dynamics(model))
@@ -169,6 +174,7 @@ def test_parameters_that_must_be_computed() -> None:
     assert torch.equal(whole, torch.stack(one_by_one))
 
 
+@pytest.mark.slow
 def test_made_once(monkeypatch) -> None:
     """Another process reads the stored code without CasADi; another parameter makes another model."""
     first, other = trace_dynamics(Planar(drag=2.0)), trace_dynamics(Planar(drag=2.5))

@@ -19,6 +19,7 @@ from tests.engines import engine_of
 from tests.native.test_engine import DAMPED, eager, natively, normal, running_state
 from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
 from tests.problems import planar_batch, quick_gco
+from tests.slow import mostly
 from torchgco import Problem, Status, kernels
 from torchgco.constraints.base import Constraint
 from torchgco.ilqr.lifted import lifted_search
@@ -39,7 +40,7 @@ def blocks(slopes: Tensor, curvatures: Tensor) -> Tensor:
     return torch.cat((slopes.unsqueeze(-1), curvatures.triu()), dim=-1)
 
 
-@pytest.mark.parametrize("unit", [False, True], ids=["as it is", "in cost units"])
+@pytest.mark.parametrize("unit", mostly([False, True], True), ids=["as it is", "in cost units"])
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> None:
     problem = PROBLEMS[name]()

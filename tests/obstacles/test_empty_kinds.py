@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import torchgco
+from tests.slow import mostly
 from torchgco import (
     Boxes,
     Capsules,
@@ -73,7 +74,8 @@ def problem_of(constraints: list[Any]) -> Problem:
     return Problem(model, cost, [limits, *constraints], x0, 15, Goal([6.0, 0], 0.5))
 
 
-DRAWS = [(seed, "native") for seed in range(8)] + [(2, "eager"), pytest.param(7, "eager", marks=pytest.mark.slow)]
+EAGER = [(2, "eager"), (7, "eager")]
+DRAWS = mostly([*((seed, "native") for seed in range(8)), *EAGER], *((seed, "native") for seed in range(4, 8)), *EAGER)
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")

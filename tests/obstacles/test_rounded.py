@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch, random_trajectory
 from tests.reference import boxes as brute_force
+from tests.slow import mostly
 from torchgco import Boxes, Capsules, Constraint, InputError, Problem, Spheres
 from torchgco.obstacles import CONTACT_FACTOR
 from torchgco.obstacles.boxes import BoundBoxes
@@ -143,7 +144,7 @@ def test_rows_and_derivatives_are_autodiffs(d: int) -> None:
             torch.testing.assert_close(H[b, k, : problem.n, : problem.n], J.T @ torch.diag(h[b, k - 1]) @ J)
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", mostly([2, 3], 3))
 def test_a_capsule_without_length_is_as_far_as_a_sphere(d: int) -> None:
     centers, radii = np.random.default_rng(7).uniform(-1, 1, (5, d)), np.linspace(0.1, 0.4, 5)
     plain, _ = (planar_batch if d == 2 else quadrotor_batch)(B=1, N=4)

@@ -95,6 +95,7 @@ def test_what_a_cost_stops_short_of_is_reached(parts: tuple[Any, ...], native: b
     torch.testing.assert_close(found.X[:, -1, :3], torch.tensor([[0.8, 0.8, 0.0]] * 3, dtype=D), atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 def test_each_problems_own_last_knot_arrives_where_horizons_differ() -> None:
     ends = torch.tensor([30, 22, 27])
     for goal in (BALL, STATE):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.slow import mostly
 from torchgco import (
     ControlBounds,
     FunctionConstraint,
@@ -45,7 +46,7 @@ def swing_up(constant: float, B: int = 2) -> Problem:
     return Problem(FunctionDynamics(field, 2, 1, 0.05, "rk4"), cost, [], x0, 50)
 
 
-@pytest.mark.parametrize(("constant", "native"), [(1e5, True), (-1e9, True), (-1e9, False)])
+@pytest.mark.parametrize(("constant", "native"), mostly([(1e5, True), (-1e9, True), (-1e9, False)], (-1e9, False)))
 def test_a_constant_in_the_cost_hides_nothing(constant: float, native: bool) -> None:
     kernels.use_native(native)
     try:
@@ -128,7 +129,7 @@ def in_units(s: float, kind: str) -> Problem:
 
 @pytest.mark.filterwarnings("ignore::torchgco.ScaleWarning")
 @pytest.mark.parametrize("kind", ["controls", "states", "rows of order 1", "norm"])
-@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize("native", mostly([True, False], False))
 def test_small_units_change_no_answer(kind: str, native: bool) -> None:
     kernels.use_native(native)
     try:
@@ -186,7 +187,7 @@ def test_equality_rows_in_small_units_hide_no_curvature_of_the_cost(solver: str,
     assert found.statuses == [Status.CONVERGED] or (solver == "gco_exact" and size > 1e7)
 
 
-@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize("native", mostly([True, False], False))
 @pytest.mark.parametrize("units", [(1.0, 1e6), (1e-3, 1.0), (1e-3, 1e3)])
 def test_equality_rows_in_mixed_units_change_no_answer(units: tuple[float, float], native: bool) -> None:
     """Two balances, one in kilowatts and one in milliwatts, say, of three controls each."""
@@ -245,20 +246,20 @@ def mixed(kind: str, states: Tensor, controls: Tensor) -> Problem:
     return Problem(model, cost, [rows], (x0 / states).unsqueeze(0), 15)
 
 
-@pytest.mark.parametrize("native", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("native", mostly([True, False], False))
 @pytest.mark.parametrize("kind", ["states", "product"])
-def test_a_cost_is_scaled_by_the_sizes_of_its_variables(kind: str, native: bool) -> None:
+@pytest.mark.parametrize("units", mostly([(1e4, 1.0), (1.0, 1e4), (1e3, 1e-3)], (1.0, 1e4), (1e3, 1e-3)))
+def test_a_cost_is_scaled_by_the_sizes_of_its_variables(units: tuple[float, float], kind: str, native: bool) -> None:
     """Numbers of 1e-4 beside ordinary ones: curvatures of 1e8, by which the cost must not be divided."""
     plain = torch.ones(2, dtype=D)
     kernels.use_native(native)
     try:
         due = torchgco.solve(mixed(kind, plain, plain), solver="interior_point")
-        for units in ((1e4, 1.0), (1.0, 1e4), (1e3, 1e-3)):
-            large = torch.tensor(units, dtype=D)
-            for states, controls in ((large, plain), (plain, large), (large, large)):
-                found = torchgco.solve(mixed(kind, states, controls), solver="interior_point")
-                assert found.statuses == due.statuses == [Status.CONVERGED]
-                torch.testing.assert_close(found.cost, due.cost, rtol=1e-5, atol=0.0)
+        large = torch.tensor(units, dtype=D)
+        for states, controls in ((large, plain), (plain, large), (large, large)):
+            found = torchgco.solve(mixed(kind, states, controls), solver="interior_point")
+            assert found.statuses == due.statuses == [Status.CONVERGED]
+            torch.testing.assert_close(found.cost, due.cost, rtol=1e-5, atol=0.0)
     finally:
         kernels.use_native(True)
 
@@ -301,7 +302,7 @@ def test_a_row_is_small_whatever_the_size_of_other_states(solver: str, pressure:
 
 
 @pytest.mark.filterwarnings("ignore:1 of 1 trajectories count as feasible")  # in single precision
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", mostly([torch.float32, torch.float64], torch.float32))
 def test_slopes_are_numbers_in_any_precision(dtype: torch.dtype) -> None:
     """What is left to save is measured by a regularisation as large as numbers can be: it must not overflow."""
     weights = [[w] * 3 for w in (1e-6, 5e-6, 1e-5)]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.search.scenes import NONE, inflated
+from tests.slow import mostly
 from torchgco import kernels
 from torchgco.base.tree import cast, take
 from torchgco.kernels import EagerWarning
@@ -98,7 +99,7 @@ def both(roadmap: Roadmap, s: Scene, count: int) -> tuple[tuple[Tensor, Tensor],
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("size", ["usual", "small"])
+@pytest.mark.parametrize("size", mostly(["usual", "small"], "small"))
 def test_both_return_the_same_paths(name: str, size: str, monkeypatch: pytest.MonkeyPatch) -> None:
     roadmap = Roadmap(max_overlap=0.02)
     if size == "small":

@@ -9,6 +9,7 @@ import torch
 
 from tests.reference.roadmap import cheapest_cost, path_length, point_along, segment_gap
 from tests.search.scenes import NONE, inflated
+from tests.slow import mostly
 from torchgco import InputError, compose
 from torchgco.obstacles.base import squares_from_segments
 from torchgco.roadmap.geometry import Scene, points_along
@@ -137,7 +138,7 @@ def test_a_path_goes_where_a_metre_is_cheap() -> None:
         assert float(across.min()) < 0 if side > 0 else float(across.max()) > 0
 
 
-@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize("native", mostly([True, False], False))
 def test_no_path_on_the_graph_is_cheaper(native: bool) -> None:
     """The search finds a path of the same cost as Dijkstra on the same graph."""
     s, margin = random_scene(2, B=3, seed=4), 0.15

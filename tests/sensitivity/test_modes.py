@@ -63,21 +63,6 @@ def test_products_with_tangents(jacobian: Tensor) -> None:
 
 
 @compiled
-def test_a_horizon_is_compared_with_the_way_to_the_goal_among_tangents(jacobian: Tensor) -> None:
-    """Its samples are drawn, which the vmap of `jacobian` refuses."""
-    slow = FunctionDynamics(lambda x, u: u, 2, 2, 0.1, position=slice(0, 2))
-
-    def last(x0: Tensor) -> Tensor:
-        problem = Problem(
-            slow, QuadraticCost([1, 1], [0.1, 0.1], [9, 9]), [ControlBounds(-4, 4)], x0, 8, Goal([0, 0], 1)
-        )
-        return torchgco.solve(problem, solver="interior_point", verbose=False).X[:, -1]
-
-    ahead = torch.autograd.functional.jacobian(last, X0, vectorize=True, strategy="forward-mode")
-    torch.testing.assert_close(ahead, torch.autograd.functional.jacobian(last, X0), rtol=1e-9, atol=1e-12)
-
-
-@compiled
 def test_tangents_of_everything_that_a_problem_is_made_of() -> None:
     """In fields of all parts, in captured tensors and in weights of a net: products from both sides agree."""
     leaves, whole = solved(discs, numbers)

@@ -516,6 +516,7 @@ def test_a_start_inside_an_obstacle_has_a_status_of_its_own() -> None:
     assert_same_bits(solution.take(rest), solved(problem).take(rest))
 
 
+@pytest.mark.slow
 def test_controls_are_rolled_out_only_where_they_are_needed_beside_states(monkeypatch) -> None:
     """A problem that never begins has the rollout of its controls, whatever the states."""
     problem = everything()

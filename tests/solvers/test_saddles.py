@@ -37,7 +37,7 @@ PROBLEMS = {  # the cost at rest, and one that is known to exist
 
 
 @pytest.mark.parametrize("solver", ["gco", "interior_point"])
-@pytest.mark.parametrize("native", [pytest.param(True, marks=compiled), False])
+@pytest.mark.parametrize("native", [pytest.param(True, marks=compiled), pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_solve_leaves_points_from_which_the_cost_falls(name: str, native: bool, solver: str) -> None:
     model, most, N, at_rest, known, cost = PROBLEMS[name]

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.slow import mostly
 from torchgco import ControlBounds, FunctionCost, FunctionDynamics, Problem, StateBounds, Status
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint
@@ -79,7 +80,7 @@ def cake(*constraints: Constraint) -> Problem:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("guess", [0.01, 1.0])
+@pytest.mark.parametrize("guess", mostly([0.01, 1.0], 1.0))
 def test_a_cost_that_falls_like_a_logarithm(solver: str, guess: float) -> None:
     """Its slopes vanish against those of the guess, and a fall is never deep; nothing keeps the capital above 0."""
     for constraints in ((), (ControlBounds(1e-3, INF),)):

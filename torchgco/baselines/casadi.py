@@ -45,7 +45,7 @@ class CasADiSolver(Solver):
         options: further options of the plugin, by its names.
 
     Raises:
-        InputError: a field out of its range; CasADi isn't installed.
+        InputError: a field out of its range.
     """
 
     kernels: ClassVar[str | None] = "casadi"
@@ -58,8 +58,6 @@ class CasADiSolver(Solver):
 
     def __post_init__(self) -> None:
         check_options(self, "solver")
-        if find_spec("casadi") is None:
-            raise InputError("solver", "CasADi (`pip install casadi`)", "no such module")
 
     def prepare(self, problem: Problem) -> Solver:
         """The program and the solver built for one batch, so that a solve takes the plugin's time alone.
@@ -68,12 +66,15 @@ class CasADiSolver(Solver):
 
         Raises:
             InputError: a part of the problem that can't be traced, an operation without a counterpart in CasADi, an
-                option that the plugin refuses, or (FATROP) rows that join several knots.
+                option that the plugin refuses, or (FATROP) rows that join several knots; CasADi isn't installed.
         """
         problem = current_problem(problem)
         return self if problem.time is not None else self._prepared(problem)
 
     def _prepared(self, problem: Problem) -> PreparedCasADi:
+        # Not where the solver is made: presets and commands name it also where CasADi isn't installed.
+        if find_spec("casadi") is None:
+            raise InputError("solver", "CasADi (`pip install casadi`)", "no such module")
         import casadi
 
         from torchgco.baselines.nlp import transcribe

@@ -14,7 +14,8 @@ from torch import Tensor
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.problem.problem import Problem
 
-SAMPLES_AT_ONCE = 8192  # samples rolled out together: memory stays bounded
+SAMPLES_AT_ONCE = 8192  # samples rolled out together on a CPU: memory stays bounded
+SAMPLES_ON_GPU = 131072  # the same on a GPU, which a stage of fewer doesn't fill
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Flight:
 def sample(problem: Problem, U: Tensor, how: Sampling) -> Tensor:
     """Controls (B, N, m): the weighted mean of the last round's samples, the first drawn around U."""
     quick, plans = problem.cast(how.dtype), []
-    for rows in torch.arange(problem.B, device=U.device).split(max(1, SAMPLES_AT_ONCE // how.samples)):
+    for rows in torch.arange(problem.B, device=U.device).split(max(1, _at_once(U) // how.samples)):
         spread = how.sigma if how.sigma.shape[0] == 1 else how.sigma[rows]
         part = quick if rows.numel() == problem.B else quick.take(rows)
         plans.append(_rounds(part, U[rows].to(how.dtype), spread.to(how.dtype), rows, how))
@@ -104,7 +105,8 @@ def _rounds(problem: Problem, U: Tensor, sigma: Tensor, rows: Tensor, how: Sampl
     """All rounds for the problems at `rows` of the batch; U (B, N, m), sigma (B|1, 1, m)."""
     mean, key = U.transpose(0, 1).unsqueeze(2).contiguous(), how.key.take(rows)  # (N, B, 1, m)
     bounds = None if how.bounds is None else _of_rows(how.bounds, rows, how.dtype)
-    blocks = [range(s, min(s + SAMPLES_AT_ONCE, how.samples)) for s in range(0, how.samples, SAMPLES_AT_ONCE)]
+    size = _at_once(U)
+    blocks = [range(s, min(s + size, how.samples)) for s in range(0, how.samples, size)]
     for i in range(how.rounds):
         draws = partial(how.noise, problem, key, how.decay**i * sigma.sqrt(), i)
         scores = [how.scores(problem, fly(problem, mean, draws(block), bounds)) for block in blocks]
@@ -114,6 +116,11 @@ def _rounds(problem: Problem, U: Tensor, sigma: Tensor, rows: Tensor, how: Sampl
             new = new + average(draw(mean, draws(block), bounds), weights[:, block.start : block.stop])
         mean = new
     return mean.squeeze(2).transpose(0, 1)
+
+
+def _at_once(U: Tensor) -> int:
+    """Samples that are rolled out together around controls U."""
+    return SAMPLES_AT_ONCE if U.device.type == "cpu" else SAMPLES_ON_GPU
 
 
 def _of_rows(bounds: tuple[Tensor, Tensor], rows: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

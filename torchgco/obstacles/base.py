@@ -43,6 +43,10 @@ class Solids:
         """Half the side lengths (B, M, d) of boxes along the axes that hold the solids before they are grown, m."""
         return torch.zeros_like(self.centers)
 
+    def grown(self, by: Tensor) -> Self:
+        """Those present with radii that are larger by lengths (B,), m."""
+        return replace(self, radii=torch.where(self.absent, self.radii, self.radii + by.unsqueeze(-1)))
+
     def squares(self, points: Tensor) -> Tensor:
         """Squared distances (B, V, M) of points (B, V, d) from the solids before they are grown; 0 inside."""
         return squares(points, self.centers)

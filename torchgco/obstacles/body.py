@@ -246,6 +246,8 @@ class BoundBody(Obstacles):
     radii = property(lambda self: torch.stack([ball.vehicle_radius for ball in self.balls], dim=-1))  # (B, P), m
     # Of the smallest ball about the position that holds the body, (B,), m.
     reach = property(lambda self: (self.points.offsets.norm(dim=-1) + self.radii).amax(-1))
+    # How far it reaches out of the inscribed ball, (B,), m.
+    overhang = property(lambda self: self.reach - self.inner.vehicle_radius)
     calls_function = property(lambda self: self.points.attitude.calls_function)
 
     def __repr__(self) -> str:

@@ -58,10 +58,9 @@ def around_body(problem: Problem, scene: Scene) -> Scene | None:
     bodies = [part for part in problem.obstacles if isinstance(part, BoundBody)]
     if not bodies or scene.obstacles.maps:
         return None
-    more = torch.stack([part.reach - part.inner.vehicle_radius for part in bodies]).amax(0).unsqueeze(-1)
+    more = torch.stack([part.overhang for part in bodies]).amax(0)
     spheres, boxes, _ = scene.obstacles
-    wider = lambda part: replace(part, radii=torch.where(part.absent, part.radii, part.radii + more))
-    return replace(scene, obstacles=Inflated(wider(spheres), None if boxes is None else wider(boxes)))
+    return replace(scene, obstacles=Inflated(spheres.grown(more), None if boxes is None else boxes.grown(more)))
 
 
 def has_paths(problem: Problem) -> bool:

@@ -28,7 +28,6 @@ from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.pursue import pursue
 from torchgco.search.row import Row
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.interior import InteriorPoint
 
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little
 
@@ -81,7 +80,7 @@ class Direct(Row):
             free = WITHOUT_OBSTACLES.solved(replace(call, problem=bare))
             bound = free.best.cost
             search.best.end.iterations[rows] += free.iterations
-        solver = InteriorPoint()
+        solver = search.interior  # what it solves counts as solved: `Tighten` leaves it as it is
         left = self._compared(search, rows, call, solver.solved(call), bound)
         if left.numel() > 0:
             start = take(search.caught.last, rows[left])

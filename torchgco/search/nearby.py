@@ -148,8 +148,7 @@ def _kept(part: Obstacles, near: Callable[[Obstacles, Solids], Tensor | None]) -
     if type(part.inscribed).chosen is Obstacles.chosen or solids is None or solids.absent.shape[1] == 0:
         return None
     if isinstance(part, BoundBody):
-        more = part.reach - part.inner.vehicle_radius
-        solids = replace(solids, radii=torch.where(solids.absent, solids.radii, solids.radii + more.unsqueeze(-1)))
+        solids = solids.grown(part.overhang)
     return near(part, solids)
 
 

@@ -160,8 +160,7 @@ def _clear(part: Obstacles, states: Tensor) -> Tensor:
     good = inner >= 0.0
     if not isinstance(part, BoundBody):
         return good
-    reach = float((part.points.offsets[0].norm(dim=-1) + part.radii[0]).max())
-    near = (good & (inner < reach - part.inner.vehicle_radius[0])).nonzero().flatten()  # others are clear anyhow
+    near = (good & (inner < part.overhang[0])).nonzero().flatten()  # others are clear anyhow
     if near.numel() == 0:
         return good
     centers = part.points.at(states[:, near])

@@ -13,7 +13,7 @@ from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.eager.fixed import GOLDEN
+from torchgco.eager.fixed import GOLDEN, ROUNDINGS
 from torchgco.eager.kernels import least_violation
 from torchgco.kernels import (
     cost_unit,
@@ -249,7 +249,7 @@ class InteriorPoint(Solver):
             constant=constant_cost(problem), least_cost=least_cost(problem), seconds=call.seconds_left,
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
-        X, U = followed(problem, X, U, out["gains"][..., :-1])
+        X, U = rolled_out(problem, X, U, out["gains"][..., :-1])
         found = Iterate(X, U, fitted, problem.cost.total(X, U), measured(problem, X, U))
         put(end.best, rows, found)
         put(end.last, rows, found)
@@ -273,6 +273,31 @@ def _beside(problem: Problem, U: Tensor, share: float) -> Tensor:
         size = torch.where(torch.isfinite(half), half, size)
     count = torch.arange(1, U[0].numel() + 1, dtype=U.dtype, device=U.device).view(U.shape[1:])
     return U + share * size * (2.0 * torch.frac(GOLDEN * count) - 1.0)
+
+
+def rolled_out(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """The rollout that a solve's states X (B, N+1, n) and controls U (B, N, m) stand for, by its gains K (B, N, m, n).
+
+    `followed`, whose feedback closes gaps; but where U alone leads to X up to rounding, there are none to close. Active
+    rows of a tight solution may be so stiff that rounding decides on the gains, which then make a change that counts of
+    one in the last bit: where they do, U alone.
+    """
+    found = followed(problem, X, U, K)
+    rows = (~_is_rounding(X, found[0])).nonzero().flatten()
+    if rows.numel() == 0:
+        return found
+    states, controls = X[rows], U[rows]
+    alone = followed(problem.take(rows), states, controls, torch.zeros_like(K[rows]))
+    better = _is_rounding(states, alone[0])
+    for whole, part in zip(found, alone, strict=True):
+        whole[rows[better]] = part[better]
+    return found
+
+
+def _is_rounding(old: Tensor, new: Tensor) -> Tensor:
+    """Whether trajectories (B, N+1, n) are one, up to rounding along the stages, (B,)."""
+    most = ROUNDINGS * torch.finfo(old.dtype).eps * old.abs().amax(1, keepdim=True)
+    return ((new - old).abs() <= most).flatten(1).all(-1)
 
 
 def guessed(call: Call) -> Iterate:
