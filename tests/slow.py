@@ -6,6 +6,9 @@ from typing import Any
 import pytest
 
 
-def mostly(values: Iterable[Any], *slow: Any) -> list[Any]:
-    """All of them, those of `slow` with its marker."""
-    return [pytest.param(value, marks=pytest.mark.slow) if value in slow else value for value in values]
+def mostly(values: Iterable[Any], *slow: Any, several: bool = False) -> list[Any]:
+    """All of them, those of `slow` with its marker; `several`: each is a tuple of several parameters."""
+    return [
+        pytest.param(*(value if several else (value,)), marks=pytest.mark.slow) if value in slow else value
+        for value in values
+    ]

@@ -10,6 +10,7 @@ import torch
 
 import torchgco
 from tests.problems import planar_batch
+from tests.slow import mostly
 from torchgco import InputError, Problem, QuadraticCost, judge, presets, solve
 from torchgco.experiments.config.groups import _tree
 from torchgco.experiments.results.identity import flat
@@ -29,7 +30,7 @@ def test_the_configuration_of_a_solver_is_its_preset(model: str, name: str) -> N
     assert setup.solver == PRESETS[name](space) == PRESETS[name](setup.task(setup.layouts(1)).problem)
 
 
-@pytest.mark.parametrize("model", ["planar", "quadrotor", pytest.param("unicycle", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("model", mostly(["planar", "quadrotor", "unicycle"], "quadrotor", "unicycle"))
 def test_solve_gives_the_bits_of_the_configuration_gco(model: str) -> None:
     _, scenario = MODELS[model]
     setup = torchgco.compose([f"model={model}", f"scenario={scenario}", "scenario.stages=40"])

@@ -69,6 +69,7 @@ def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
     ]
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # 0.1 s between knots is long
 @pytest.mark.parametrize("name", mostly(MAKERS, "planar", "quadrotor"))

@@ -126,6 +126,7 @@ def test_a_bad_start_affects_its_own_problem_alone() -> None:
     assert torch.equal(PathPursuit().solve(bad.take(index), rest(bad)[index]).U, solution.U[index])
 
 
+@pytest.mark.slow
 def test_horizons_may_differ() -> None:
     problem = task(horizon=[120, 90])
     solution = PathPursuit().solve(problem, rest(problem))

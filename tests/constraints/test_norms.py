@@ -304,6 +304,7 @@ def guessed(*parts: Any) -> Tensor:
     return _guess(problem := lander(*parts), problem)
 
 
+@pytest.mark.slow
 def test_the_default_guess_of_controls_is_within_norms_and_cones() -> None:
     """At rest, (0, 0, 0.5): what holds keeps its bits; elsewhere sizes move, then directions."""
     assert torch.equal(guessed(), guessed(NormBounds("u", 0.4, 1.0), Cone([0.0, 0.0, 1.0], 0.3, "u")))

@@ -90,6 +90,7 @@ def test_answers_are_those_of_native_kernels(solver: str) -> None:
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 @compiled
 def test_warm_starts_free_starts_and_guesses_of_states_are_taken() -> None:
     problem, rest = cart(), InteriorPoint()
@@ -258,6 +259,7 @@ def test_derivatives_of_a_branch_not_taken_do_not_count(name: str, way) -> None:
     torch.testing.assert_close(H[0, inner, 0, 1], slope[inner], rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("place", mostly(["dynamics", "cost", "row"], "cost", "row"))
 def test_branches_not_taken_end_as_with_native_kernels(place: str) -> None:

@@ -81,7 +81,7 @@ def test_a_damaged_file_of_a_finished_study_is_named_and_repaired(name: str, dam
 
 
 @pytest.mark.usefixtures("without_report")
-@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("damage", mostly(DAMAGE, "empty", "text"))
 def test_a_damaged_shard_is_named_and_repaired(damage: str, run, run_until, tmp_path, out) -> None:
     before = results(out)
     shutil.rmtree(out)

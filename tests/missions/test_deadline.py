@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.problems import assert_same_bits, planar_batch, quick_gco
+from tests.slow import mostly
 from torchgco import ILQR, AugmentedLagrangian, InputError, MultiStart, Problem, Spheres, Status
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.solvers import contracts
@@ -37,7 +38,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return looks
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", mostly(SOLVERS, "restarts"))
 def test_a_tiny_limit_leaves_finite_trajectories(name: str, clock: list[int]) -> None:
     problem, U0 = planar_batch(B=5, N=30, obstacles=9, seed=4)
     solver, passes = SOLVERS[name](problem), []

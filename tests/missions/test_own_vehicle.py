@@ -17,6 +17,7 @@ CRAZYFLIE = compose(["vehicle=crazyflie"]).vehicle.dynamics.airframe  # type: ig
 FORESTS = Forest(start=(1, 1, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", mostly([2, 8], 8))
 @pytest.mark.parametrize(
     "airframe", [pytest.param(OWN, id="own"), pytest.param(CRAZYFLIE, id="crazyflie", marks=pytest.mark.slow)]

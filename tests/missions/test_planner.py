@@ -63,6 +63,7 @@ def spheres_of(problem: Problem) -> list[tuple[list[int], Tensor]]:
     return [(torch.arange(problem.N + 1)[part.knots].tolist(), part.inflated_radii) for part in parts]
 
 
+@pytest.mark.slow
 def test_the_first_plan_is_the_solvers_own_solution() -> None:
     problem = varied()
     x = hovering(FRAME, problem.x0[:, :3])

@@ -150,7 +150,8 @@ FREE = list(CASES)[:3]
 @pytest.mark.parametrize(
     ("name", "tracker"),
     [
-        *((name, tracker) for name in FREE for tracker in (Tracker, printed)),
+        *((name, Tracker) for name in FREE),
+        *(pytest.param(name, printed, marks=pytest.mark.slow) for name in FREE),
         ("commands at their limits", smooth),
         ("thrusts at their limits", printed),
     ],

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from tests.reference.interior import Array, Point, Program, begin, moved, newton_step
+from tests.slow import mostly
 from torchgco import (
     Body,
     Boxes,
@@ -246,7 +247,7 @@ def length_of(step: Array, moved: Array, longest: float) -> float:
     return longest / 2 ** round(halvings)
 
 
-@pytest.mark.parametrize("warm", [False, True], ids=["cold", "warm"])
+@pytest.mark.parametrize("warm", mostly([False, True], True), ids=["cold", "warm"])
 @pytest.mark.parametrize(
     "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.slow) for name in MAKERS]
 )

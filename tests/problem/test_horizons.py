@@ -101,7 +101,9 @@ def of_user(parts: str, cost: str, N: int, rows: slice, horizon: Any = None) -> 
 ENDED = [("al_ilqr", "inequality"), *(("interior_point", name) for name in PARTS)]
 
 
-@pytest.mark.parametrize(("solver", "parts"), mostly(ENDED, *(("interior_point", name) for name in list(PARTS)[::2])))
+@pytest.mark.parametrize(
+    ("solver", "parts"), mostly(ENDED, *(("interior_point", name) for name in list(PARTS)[::2]), several=True)
+)
 def test_a_users_code_ends_early(parts: str, solver: str) -> None:
     cost = "quadratic" if parts in ("boxes", "rates") else "function"
     found = torchgco.solve(of_user(parts, cost, 30, slice(0, 3), HORIZONS), solver=solver)

@@ -46,7 +46,9 @@ def swing_up(constant: float, B: int = 2) -> Problem:
     return Problem(FunctionDynamics(field, 2, 1, 0.05, "rk4"), cost, [], x0, 50)
 
 
-@pytest.mark.parametrize(("constant", "native"), mostly([(1e5, True), (-1e9, True), (-1e9, False)], (-1e9, False)))
+@pytest.mark.parametrize(
+    ("constant", "native"), mostly([(1e5, True), (-1e9, True), (-1e9, False)], (-1e9, False), several=True)
+)
 def test_a_constant_in_the_cost_hides_nothing(constant: float, native: bool) -> None:
     kernels.use_native(native)
     try:

@@ -15,6 +15,7 @@ import torchgco
 from tests.engines import compiled
 from tests.problems import planar_batch, quick_gco
 from tests.search.rows import proposed
+from tests.slow import mostly
 from torchgco import (
     ControlBounds,
     FunctionConstraint,
@@ -59,7 +60,7 @@ def planar(*constraints) -> tuple[Problem, torch.Tensor]:
     return Problem(problem.dynamics, problem.cost, constraints, problem.x0, problem.N), U0
 
 
-@pytest.mark.parametrize("kind", EMPTY)
+@pytest.mark.parametrize("kind", mostly(EMPTY, *list(EMPTY)[1::2]))
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_empty_constraints_change_nothing(kind: str, solver: str) -> None:
     free, U0 = planar(BOUNDS)

@@ -105,6 +105,7 @@ def test_a_path_is_driven_from_rest_to_rest_between_changes_of_direction() -> No
     assert np.abs(slopes - speed[1:-1])[inner - 1].max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_car_backs_up_into_a_corridor_hardly_wider_and_alone_as_in_a_batch() -> None:
     problem = corridor([[1.0, 0.9, 0.1], [0.6, -1.0, 0.0], [-1.0, 0.1, 0.0]])
     solution = solve(problem)

@@ -242,6 +242,7 @@ def test_every_constant_is_read(name: str, usual: list[tuple], monkeypatch) -> N
     assert outcome(BASE) != usual
 
 
+@pytest.mark.slow
 def test_walls_between_rest_and_the_path_dont_bar_the_way() -> None:
     """A flat of 12 x 8 m whose walls join the outer ones: one class, and a path around two corners."""
     walls = np.zeros((120, 80), bool)

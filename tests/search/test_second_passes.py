@@ -117,6 +117,7 @@ def test_no_path_is_followed_more_slowly_than_the_pace(woods, monkeypatch) -> No
     assert bool((fast < limited).all())
 
 
+@pytest.mark.slow
 def test_costly_problems_in_small_parts_keep_their_bits(woods, monkeypatch) -> None:
     whole, times = noted(costly(1e-9), woods)
     monkeypatch.setattr("torchgco.search.proposals.PATHS_AT_ONCE", 2 * FIRST.num_paths)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.reference.kkt import dense_kkt
+from tests.slow import mostly
 from torchgco import (
     Boxes,
     ControlBounds,
@@ -86,7 +87,7 @@ def solved(problem: Problem, native: bool, give: Tensor | None = None) -> KktSol
         use_native(True)
 
 
-@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize("native", mostly([True, False], False))
 @pytest.mark.parametrize(
     ("traced_cost", "barrier"), [(True, False), pytest.param(False, False, marks=pytest.mark.slow), (False, True)]
 )

@@ -137,6 +137,7 @@ def test_less_smoothing_is_nearer_to_the_solution() -> None:
     assert apart[0] > 5 * apart[1] > 25 * apart[2] > 0 and apart[2] < 1e-3
 
 
+@pytest.mark.slow
 @compiled
 def test_both_kernels_and_any_batch_give_the_same() -> None:
     th = numbers()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 import torchgco
 from tests.sensitivity.problems import TIGHT, D
+from tests.slow import mostly
 from torchgco import ControlBounds, FunctionDynamics, Goal, Layouts, Problem, QuadraticCost, Spheres
 from torchgco.experiments.config.build import compose
 from torchgco.native import compiler
@@ -28,7 +29,9 @@ def steered() -> FunctionDynamics:
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # of the interior point alone
-@pytest.mark.parametrize(("solver", "warm"), [("gco", False), ("interior_point", True)])
+@pytest.mark.parametrize(
+    ("solver", "warm"), mostly([("gco", False), ("interior_point", True)], ("gco", False), several=True)
+)
 def test_a_training_step_calls_no_compiler(solver: str, warm: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     net = torch.nn.Sequential(torch.nn.Linear(4, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2)).double()

@@ -269,6 +269,7 @@ def around_a_disc(free: bool = False, **time: Any) -> Problem:
     return Problem(model, cost, rows, x0, 30, Goal(state=there, required=True), free_start=mask, time=FreeTime(**time))
 
 
+@pytest.mark.slow
 def test_a_free_start_is_chosen_with_the_time() -> None:
     """The best start is beside the straight line, as the way round the disc is, and no dearer than others."""
     free = torchgco.solve(around_a_disc(True))
@@ -281,6 +282,7 @@ def test_a_free_start_is_chosen_with_the_time() -> None:
         assert bool((held.violation < 1e-6).all() & (free.cost < held.cost - better).all())
 
 
+@pytest.mark.slow
 def test_a_record_is_kept_and_explained() -> None:
     problem = around_a_disc(weight=0.3)
     plain, kept = torchgco.solve(problem), torchgco.solve(problem, record=True)
@@ -325,6 +327,7 @@ def before_or_behind(**time: Any) -> Problem:
     )
 
 
+@pytest.mark.slow
 def test_a_moving_disc_is_passed_at_the_time_that_is_found() -> None:
     """It comes too late to matter; it is waited for; it was there before. Judge, certificate and files see the same."""
     problem = before_or_behind()

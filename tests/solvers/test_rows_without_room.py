@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.slow import mostly
 from torchgco import (
     ControlBounds,
     FunctionConstraint,
@@ -81,6 +82,7 @@ def assert_same_answer(found: Solution, expected: Solution, tolerance: float = 1
     torch.testing.assert_close(found.cost, expected.cost, rtol=tolerance, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, pytest.param(B, marks=pytest.mark.slow)])
 def test_the_plain_problems_have_the_costs_of_ipopt(count: int) -> None:
     for plain in (battery(), cart(), rocket()):
@@ -179,7 +181,7 @@ def test_a_start_outside_a_row(solver: str) -> None:
         assert set(found.worst_rows(problem)["knot"]) == {0}
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", mostly(SOLVERS, "gco"))
 def test_no_later_pass_hides_that_problems_are_infeasible(solver: str) -> None:
     """Starts so far outside that the next knots are, too; and two rows that contradict each other."""
     of, own = cart(drawn(10, -3.0, -0.3))
