@@ -128,7 +128,7 @@ class Demonstrations:
         """Derivatives (usable, numbers, w) of `off`, all columns from one solve; 0 where a plan has none."""
         miss = lambda at: self.off(self.plan(at))
         found = torch.autograd.functional.jacobian(miss, logarithms, vectorize=True, strategy="forward-mode")
-        return cast(Tensor, found)[self.usable]
+        return cast(Tensor, found).detach()[self.usable]
 
     def _identifiable(self) -> Tensor:
         """Which weights (w,) the demonstrations determine."""
