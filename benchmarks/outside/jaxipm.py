@@ -74,7 +74,7 @@ def extremes(own: pd.DataFrame, peer: pd.DataFrame) -> str:
 
 
 def is_solved(flight: pd.DataFrame) -> pd.Series:
-    """Whether instances count: converged, or keeping all rows to 1e-8 where `gco` has cleared them between the knots."""
+    """Whether instances count: converged, or keeping all rows to 1e-8, as those do that are cleared between knots."""
     return flight.converged | (flight.violation <= TOLERANCE)
 
 
