@@ -58,7 +58,7 @@ def excess(own: pd.DataFrame, peer: pd.DataFrame) -> pd.Series:
     """By which share costs exceed the peer's, on the instances that both solved."""
     both = own.index.intersection(peer.index)
     one, other = own.loc[both], peer.loc[both]
-    return (one.cost / other.cost - 1)[one.converged & other.converged]
+    return (one.cost / other.cost - 1)[is_solved(one) & is_solved(other)]
 
 
 def versus(own: pd.DataFrame, peer: pd.DataFrame) -> str:
@@ -73,9 +73,14 @@ def extremes(own: pd.DataFrame, peer: pd.DataFrame) -> str:
     return f"{over.min():+.3g}, {over.max():+.3g}" if len(over) else "-"
 
 
+def is_solved(flight: pd.DataFrame) -> pd.Series:
+    """Whether instances count: converged, or keeping all rows to 1e-8, as those do that are cleared between knots."""
+    return flight.converged | (flight.violation <= TOLERANCE)
+
+
 def solved(flight: pd.DataFrame) -> pd.Series:
     """The costs of the instances that were solved, which the published ones are of, too."""
-    return flight.cost[flight.converged]
+    return flight.cost[is_solved(flight)]
 
 
 def rate(flight: pd.DataFrame) -> float:

@@ -100,7 +100,10 @@ def test_ipopt_as_published_finds_the_same() -> None:
 def test_costs_are_compared_instance_by_instance() -> None:
     own = pd.DataFrame({"cost": [1.0, 2.0, 3.0, 4.0, 9.0], "converged": [True] * 5}, index=[0, 3, 6, 9, 12])
     peer = pd.DataFrame({"cost": [2.0 + 1e-7, 3.5, 3.0, 1.0], "converged": [True] * 3 + [False]}, index=[3, 6, 9, 12])
+    own["violation"], peer["violation"] = 1e-3, 1e-3
     assert versus(own, peer) == "1, 1, 1" and extremes(own, peer) == "-14.3, +33.3"
+    own["converged"], own["violation"] = False, [0.0, 0.0, 1e-9, 1e-7, 0.0]  # cleared between knots, the fourth not
+    assert versus(own, peer) == "1, 1, 0"
 
 
 @pytest.mark.slow

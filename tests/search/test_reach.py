@@ -43,6 +43,18 @@ def test_the_number_of_stages_that_would_do_is_named() -> None:
         assert said is None or (said.startswith("1 of 2 horizons") and "N = 57 would do" in said and "6 m long" in said)
 
 
+def test_it_is_said_among_tangents_of_many_directions() -> None:
+    """The vmap of PyTorch's `jacobian` refuses to draw the samples, though they have a seed of their own."""
+    said = []
+
+    def solved(x0: Tensor) -> Tensor:
+        said.append(short_horizons(task(POINT, [SPEED], 56, [[2.0, 1.0]], Goal([8.0, 1.0], 0.3))))
+        return 2.0 * x0
+
+    slopes = torch.autograd.functional.jacobian(solved, torch.ones(2), vectorize=True, strategy="forward-mode")
+    assert "N = 57 would do" in said[0] and torch.equal(torch.as_tensor(slopes), 2.0 * torch.eye(2))
+
+
 def test_through_a_map_the_way_is_the_roadmaps() -> None:
     cells = np.zeros((100, 100), bool)
     cells[50:52, :90] = True

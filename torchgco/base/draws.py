@@ -9,6 +9,8 @@ thus sees the same noise when it is solved by itself, in any batch and in any sh
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -100,3 +102,25 @@ def scattered(like: Tensor) -> Tensor:
     """Numbers between -1 and 1 in the shape of `like`, without an order, the same in every process."""
     place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
     return (place * 1.618).cos().reshape(like.shape)
+
+
+def uniform(seed: int, shape: tuple[int, ...], like: Tensor) -> Tensor:
+    """Numbers between 0 and 1 in this shape, with the type and on the device of `like`: the same on every device, and
+    within `torch.autograd.functional.jacobian(..., vectorize=True)`.
+    """
+    draws = torch.Generator("cpu").manual_seed(seed)
+    with _outside_vmap():
+        return torch.rand(shape, dtype=like.dtype, generator=draws, device="cpu").to(like.device)
+
+
+@contextmanager
+def _outside_vmap() -> Iterator[None]:
+    """Leave the vmap of `torch.autograd.functional`, in which nothing random is allowed, not even with a seed."""
+    depth = torch._C._vmapmode_increment_nesting() - 1
+    for _ in range(depth + 1):
+        torch._C._vmapmode_decrement_nesting()
+    try:
+        yield
+    finally:
+        for _ in range(depth):
+            torch._C._vmapmode_increment_nesting()

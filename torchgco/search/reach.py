@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients_at_once
+from torchgco.base.draws import uniform
 from torchgco.base.errors import NAMED
 from torchgco.base.shapes import computing_on
 from torchgco.constraints import ControlBounds, StateBounds
@@ -149,9 +150,7 @@ class _Box(NamedTuple):
             return None
         low, high = bounds_at_inner_knots(problem)
         bounded = torch.isfinite(low) & torch.isfinite(high)
-        draws = torch.Generator("cpu").manual_seed(REACH_SEED)  # the same for every problem and device
-        share = torch.rand(1, STEP_SAMPLES, problem.n + problem.m, dtype=low.dtype, generator=draws, device="cpu")
-        share = share.to(low.device)
+        share = uniform(REACH_SEED, (1, STEP_SAMPLES, problem.n + problem.m), low)  # the same for every problem
         least, most = (torch.where(bounded, *ends).unsqueeze(1) for ends in ((low, -WIDE), (high, WIDE)))
         z = least + share * (most - least)
         (slopes,) = gradients_at_once(lambda z: _way(problem, z), z)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients_at_once
+from torchgco.base.draws import uniform
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 from torchgco.search.reach import WIDE, bounds_at_inner_knots
@@ -86,8 +87,7 @@ def sampled(problem: Problem) -> Sampled | None:
     n, ends = problem.n, [part[0] for part in bounds_at_inner_knots(problem)]
     bounded = torch.isfinite(ends[0]) & torch.isfinite(ends[1])
     low, high = (torch.where(bounded, end, wide) for end, wide in zip(ends, (-WIDE, WIDE), strict=True))
-    draws = torch.Generator("cpu").manual_seed(SEED)
-    share = torch.rand(1, SAMPLES, n + problem.m, dtype=low.dtype, generator=draws, device="cpu").to(low.device)
+    share = uniform(SEED, (1, SAMPLES, n + problem.m), low)
     z = low + share * (high - low)
     x, u = z[..., :n], z[..., n:]
     rates = model.field(x, u)[0]
