@@ -89,7 +89,7 @@ class Limits:
     """What a plan leaves to feedback, and how near it goes."""
 
     speed: float = 2.2  # m/s
-    room: float | None = 0.14  # m, of the drone's middle from frames; None: only the squares keep it from these
+    room: float = 0.14  # m, of the drone's middle from frames
     beside: float = 0.14  # m, from poles
     unseen: float = 0.06  # m, more from poles that aren't seen
     half: float = 0.05  # m, half the width of the squares in which gates are crossed
@@ -102,7 +102,6 @@ class Limits:
 EASED = (
     Limits(3.0, 0.12, 0.12, 0.03, 0.075, 0.9, (0.3, 1.6)),
     Limits(4.0, 0.10, 0.11, 0.0, 0.10, 1.0, (0.25, 1.7)),
-    Limits(4.0, None, 0.11, 0.0, 0.08, 1.0, (0.25, 1.7)),
 )  # fmt: skip
 
 
@@ -157,7 +156,7 @@ def posed(track: Track, x: np.ndarray, passed: int, share: float, limits: Limits
         _careful(track, x, passed, limits),
         Gates(centers, normals=turned(track.turns[passed:])[..., 0], half_widths=limits.half,
               knots=[*firsts, N - 1]),
-        *([] if limits.room is None else [Boxes(boxes, halves, limits.room, rotations)]),
+        Boxes(boxes, halves, limits.room, rotations),
         Capsules(track.poles, track.poles - [0.0, 0.0, TALL], around, limits.beside),
     ]  # fmt: skip
     time = FreeTime(0.01, 4.0, guess=1.0, segments=firsts or None)
