@@ -41,6 +41,7 @@ def problem(rows: slice = slice(None), **more: Any) -> Problem:
     return Problem(dynamics, cost, [slow, weak], torch.zeros(len(GOALS[rows]), 4, dtype=D), N, **more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("native", mostly([True, False], False))
 def test_every_problem_has_its_own_values(native: bool) -> None:
     kernels.use_native(native)

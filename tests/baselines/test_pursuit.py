@@ -113,6 +113,7 @@ def test_changes_of_controls_may_be_bounded(model: Dynamics) -> None:
     assert bool(judge(problem, solution.U).sound.all())
 
 
+@pytest.mark.slow
 def test_a_bad_start_affects_its_own_problem_alone() -> None:
     good = task(FORCE)
     x0 = good.x0.repeat(2, 1)

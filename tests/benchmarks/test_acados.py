@@ -136,6 +136,7 @@ def test_problems_without_a_form_for_acados_are_named(tmp_path: Path) -> None:
             write_problem(Problem(plain.dynamics, cost, constraints, plain.x0, 8), U0, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_failed_worker_gives_a_row_and_stops_nothing(tmp_path: Path, monkeypatch) -> None:
     """The other peers still run; the failed ones leave one row each, with the error."""
     monkeypatch.setattr(acados, "installed", lambda: True)

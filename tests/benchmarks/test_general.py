@@ -57,6 +57,7 @@ def test_the_nine_starts_begin_at_the_start_and_lead_on() -> None:
     assert torch.allclose(0.5 * (left + right), line) and bool((left[:, 40, 1] > line[:, 40, 1] + 0.5).all())
 
 
+@pytest.mark.slow
 def test_a_table_without_peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(general, "OUTPUTS", tmp_path)
     names = ["bryson_denham", "time_optimal_di"]

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.slow import mostly
 from torchgco import (
     Boxes,
     ControlBounds,
@@ -116,7 +117,7 @@ KINDS: dict[str, tuple[Callable[[Numbers], Problem], Callable[[int, int], Number
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", mostly(KINDS, "heated"))
 def test_other_numbers_give_what_a_fresh_solve_gives(kind: str) -> None:
     make, draw, as_taken = KINDS[kind]
     B, now = 3, draw(3, 0)
@@ -220,7 +221,7 @@ def native_again() -> Iterator[None]:
     use_native(True)
 
 
-@pytest.mark.parametrize("form", ["rates", "horizon", "free start", "pytorch", "boxes"])
+@pytest.mark.parametrize("form", mostly(["rates", "horizon", "free start", "pytorch", "boxes"], "rates"))
 @pytest.mark.usefixtures("native_again")
 def test_problems_of_every_form(form: str) -> None:
     """What isn't packed for C goes the long way, with the same answers."""
@@ -298,6 +299,7 @@ def test_what_a_function_captures_is_read_at_each_call() -> None:
     assert "compile it again" in str(mpc.stale())
 
 
+@pytest.mark.slow
 def test_what_python_reads_of_captured_tensors_is_read_again_too() -> None:
     """And tensors whose numbers lie apart in memory."""
     table, sharp, side = torch.rand(4, 3, dtype=D), torch.tensor(1.5, dtype=D), torch.tensor([0.3], dtype=D)

@@ -77,6 +77,7 @@ def test_the_bar_counts_the_solved_problems(workers: int, run, monkeypatch) -> N
     assert "| 3/3 [" in err and "pass" not in err and ".0/" not in err
 
 
+@pytest.mark.slow
 def test_figures_may_be_left_out(run, tmp_path) -> None:
     words = ["solver=hold", "study.baselines=[]", *TINY[:4], "study.workers=1", "hydra.run.dir=out"]
     code, out, err = run(*words, "study.figures=false")

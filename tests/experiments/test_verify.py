@@ -179,6 +179,7 @@ def test_rows_that_are_missing_or_twice_are_refused(out, capsys) -> None:
         assert "one row per solver and layout" in problem_line(capsys.readouterr().err)
 
 
+@pytest.mark.slow
 def test_several_studies_and_their_report(out, capsys, monkeypatch) -> None:
     monkeypatch.setattr("torchgco.experiments.reports.report._figures", lambda parts: {})
     shutil.copytree(out, out.parent / "second")

@@ -190,6 +190,7 @@ def test_a_group_without_an_option_is_refused_in_python_too() -> None:
         compose(["scenario=null"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_the_largest_seed_and_the_current_folder_are_accepted(run, tmp_path) -> None:
     code, _, err = run(*HOLD, "seed=1000000000000000000", "hydra.run.dir=.")
@@ -197,6 +198,7 @@ def test_the_largest_seed_and_the_current_folder_are_accepted(run, tmp_path) -> 
     assert (pd.read_parquet(tmp_path / "trials.parquet")["seed"] == 10**18).all()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_solver_is_compared_with_its_own_former_settings(run, tmp_path) -> None:
     words = ["study.layouts=1", "scenario.stages=5", "scenario.num_obstacles=2", "study.workers=1"]

@@ -75,6 +75,7 @@ def test_the_guess_passes_the_waypoints() -> None:
     assert X0[:, 0].equal(drawn(2, 0)) and X0[1, -1, :3].tolist() == list(GOAL)
 
 
+@pytest.mark.slow
 def test_starts_are_solved_without_waypoints() -> None:
     """Also where a candidate takes 80 iterations from hovering to the other end of its path (3, 55, 60)."""
     problem = maze(drawn(64, 0)).take(torch.tensor([0, 1, 2, 3, 55, 60]))

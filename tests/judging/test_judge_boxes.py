@@ -8,6 +8,7 @@ import torch
 
 from tests.problems import boxed_batch, random_trajectory
 from tests.reference import boxes as brute_force
+from tests.slow import mostly
 from torchgco import Boxes, Problem, certify, judge
 from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.certificate import CHORDS
@@ -38,7 +39,7 @@ def boxed_problem(d: int, N: int = 8, rounded: bool = False) -> tuple[Problem, B
     return problem, boxes, (centers, half, rotations, radii)
 
 
-@pytest.mark.parametrize("rounded", [False, True])
+@pytest.mark.parametrize("rounded", mostly([False, True], False))
 @pytest.mark.parametrize("d", [2, 3])
 def test_clearances_against_sampled_segments(d: int, rounded: bool) -> None:
     problem, boxes, parts = boxed_problem(d, rounded=rounded)

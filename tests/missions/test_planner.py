@@ -367,6 +367,7 @@ def test_with_an_infinite_tolerance_every_new_plan_is_flown() -> None:
     assert bool((kept.U[[1, 3]] == 77.0).all()) and kept.violation[[1, 3]].tolist() == [9.0, 0.02]
 
 
+@pytest.mark.slow
 def test_the_estimated_bias_is_the_acceleration_that_the_model_lacks() -> None:
     solver, heavier = Recording(), torch.tensor([0.1, -0.1, 0.0], **DOUBLE)
     wind = Disturbance(wind=1.0)

@@ -269,6 +269,7 @@ def learned(B: int = 3) -> Problem:
     return Problem(dynamics, cost, [rows], x0, 8)
 
 
+@pytest.mark.slow
 def test_networks_anywhere_are_solved_as_by_pytorch() -> None:
     problem = learned()
     assert engine_of(problem) is not None

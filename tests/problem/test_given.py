@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.slow import mostly
 from torchgco import (
     ControlBounds,
     FunctionConstraint,
@@ -154,7 +155,7 @@ ROWS: dict[str, Callable[[], list[Any]]] = {
 
 
 @pytest.mark.parametrize("kind", ROWS)
-@pytest.mark.parametrize("N", [6, 25])
+@pytest.mark.parametrize("N", mostly([6, 25], 6))
 def test_parts_of_a_problem_are_bound_anew_to_another_one(kind: str, N: int) -> None:
     old = line(12, ROWS[kind]())
     due = torchgco.solve(line(N, ROWS[kind]()), solver="interior_point")

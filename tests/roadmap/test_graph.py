@@ -111,6 +111,7 @@ def test_both_return_the_same_paths(name: str, size: str, monkeypatch: pytest.Mo
     torch.testing.assert_close(paths, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_path_is_the_straight_line() -> None:
     s = SCENES["no path"]
     for paths, found in both(Roadmap(), s, 2):

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.slow import mostly
 from torchgco import (
     Boxes,
     Constraint,
@@ -195,7 +196,7 @@ def test_batches_take_each_problems_own_map_and_give_the_same_paths() -> None:
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("merged", [True, False])
+@pytest.mark.parametrize("merged", mostly([True, False], False))
 def test_numpy_finds_the_same_blocks_ways_and_taut_paths(d: int, merged: bool) -> None:
     rng = np.random.default_rng(1)
     cells = rng.random([24] * d) < 0.03

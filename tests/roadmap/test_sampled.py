@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from torchgco import compose
@@ -14,6 +15,7 @@ from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 
 
+@pytest.mark.slow
 def test_a_way_through_the_doors_of_a_building_is_found() -> None:
     setup = compose(["scenario=rooms"])
     problem = setup.task(setup.scenario.draw([0, 1, 2, 3], 1)).problem

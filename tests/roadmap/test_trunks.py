@@ -97,6 +97,7 @@ def test_gaps_do_not_depend_on_the_other_problems() -> None:
         assert torch.equal(alone[0], points[row]) and torch.equal(alone[1], exists[row])
 
 
+@pytest.mark.slow
 def test_posts_in_the_plane_are_flown_around() -> None:
     x0 = torch.zeros(2, 6, dtype=torch.float64)
     x0[:, 0], x0[:, 1] = -1.0, torch.tensor([-0.1, 0.1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -103,6 +104,7 @@ def test_a_problem_keeps_its_bits_in_any_batch() -> None:
     assert torch.equal(torchgco.solve(part, ids=torch.tensor([1])).U[0], whole.U[1])
 
 
+@pytest.mark.slow
 def test_short_steps_raise_the_regularisation() -> None:
     problem = brachistochrone()
     inner = ILQR(max_iterations=25)

@@ -102,6 +102,7 @@ def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_no_other(
     assert_same_bits(solution.take(middle), whole.take(middle))
 
 
+@pytest.mark.slow
 def test_the_trace_names_the_attempt() -> None:
     """It is the row of the table, counted from 1 in any batch, up to the first row that draws more than once."""
     problem, U0 = gates()

@@ -60,6 +60,7 @@ def gaps(problem: Problem, U: Tensor) -> Tensor:
     return problem.cost.total(open_loop(problem.dynamics, problem.x0, U), U) / free.cost - 1
 
 
+@pytest.mark.slow
 def test_costly_proposals_are_compared_with_those_along_more_paths(woods) -> None:
     once, times = noted([FIRST, replace(CLOSER, refine=FIRST.refine)], woods)
     assert times == [(3, LAYOUTS, False)] and bool(once.found.all())
@@ -177,6 +178,7 @@ def test_a_converged_solve_is_enough_where_the_goal_is_assumed() -> None:
     assert bool((solver.solve(given, U0).iterations > alone.iterations).all())
 
 
+@pytest.mark.slow
 def test_what_the_bounds_on_controls_cost_is_no_reason_for_more_paths(woods) -> None:
     """A vehicle that can hardly tilt takes long without trunks, too."""
     rest = woods.cost.rest_controls(woods.x0.new_zeros(woods.B, woods.N, woods.m))

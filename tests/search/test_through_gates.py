@@ -65,6 +65,7 @@ def bent(problem: Problem, sides: tuple[float, ...]) -> Tensor:
     return X
 
 
+@pytest.mark.slow
 def test_each_leg_passes_on_its_better_side() -> None:
     problem = course(DISCS)
     found = torchgco.solve(problem)

@@ -119,6 +119,7 @@ def test_judge_certificate_tables_and_files_know_the_times(tmp_path: Path) -> No
     assert int(torchgco.solve(problem, warm=again).iterations.max()) <= 5
 
 
+@pytest.mark.slow
 def test_a_held_time_that_is_optimal_has_no_slope_in_time() -> None:
     """Slower or faster than the least, the residual says so: the certificate is one with respect to time."""
     fixed = replace(carts(), time=None, cost=QuadraticCost([0.0] * 2, [1.0], [0.0] * 2))

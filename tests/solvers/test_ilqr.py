@@ -142,6 +142,7 @@ def test_a_search_starts_a_little_above_the_last_accepted_rung(monkeypatch) -> N
     assert bool((kept.violation <= 2.0 * plain.violation + 1e-6).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("native", ["eager"], indirect=True)
 def test_parallel_and_sequential_line_searches_agree(native: bool, monkeypatch) -> None:
     many = steep_run(monkeypatch)

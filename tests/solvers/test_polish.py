@@ -281,6 +281,7 @@ def test_a_residual_is_relative_to_the_gradient_of_the_cost() -> None:
     assert polish._slope(model, torch.ones(2)) == 6.0 / (1.0 + 2.0)
 
 
+@pytest.mark.slow
 def test_where_the_exact_model_gives_no_step_the_other_one_does(monkeypatch) -> None:
     problem, before = solved("planar")
     plain, want = polish._convex, Polish(curvature=False).refine(problem, before)

@@ -153,6 +153,7 @@ def test_rows_that_move_by_rounding_alone(solver: str) -> None:
     assert_same_answer(torchgco.solve(Problem(model, cost, parts, x0, 40), solver=solver), expected, 1e-5)
 
 
+@pytest.mark.slow
 def test_a_row_that_is_flat_only_where_the_guess_is() -> None:
     """It is left out at first, and comes in where it turns out to be broken."""
     of, own = battery(0.5)

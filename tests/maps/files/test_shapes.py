@@ -106,6 +106,7 @@ def test_worlds_that_are_refused(old: str, new: str, said: str, tmp_path: Path) 
     assert error.value.field == "map.path"
 
 
+@pytest.mark.slow
 def test_rooms_between_walls_of_a_closed_mesh_stay_free(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     box = lambda size, at=(0, 0, 0): trimesh.creation.box(
