@@ -19,6 +19,7 @@ from torch import Tensor
 from torchgco.obstacles.base import Solids
 
 Coordinates = Sequence[Tensor]
+PAIRS_AT_ONCE = 1024  # of a segment and a box: what is computed of them fits into a processor's cache
 BOX_SLACK = 1e-9  # share of lengths by which bounds are wider, more than rounding
 
 
@@ -89,7 +90,10 @@ class Cuboids(Solids):
 
     def segment_distance(self, pairs: tuple[Tensor, Tensor, Tensor], a: Tensor, b: Tensor) -> Tensor:
         """Smallest signed distances (P,), m, of pairs (problem, segment, box) of segments from a to b (B, V, d)."""
-        i, e, j = pairs
+        parts = zip(*(one.split(PAIRS_AT_ONCE) for one in pairs), strict=True)
+        return torch.cat([self._segment_distance(i, e, j, a, b) for i, e, j in parts])
+
+    def _segment_distance(self, i: Tensor, e: Tensor, j: Tensor, a: Tensor, b: Tensor) -> Tensor:
         o, axes, half = self.centers[i, j], self.axes[i, j], list(self.half_sizes[i, j].unbind(-1))
         begin, end = (_along(axes, (p[i, e] - o).unbind(-1)) for p in (a, b))
         along = [y - x for x, y in zip(begin, end, strict=True)]
@@ -132,37 +136,36 @@ def nearest(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor
     The squared distance is convex and smooth in the share, and quadratic between the shares at which the segment passes
     the planes of the box's sides. Its slope brackets the minimum between two of these.
     """
-
-    def slope(share: Tensor) -> Tensor:
-        away = excess(at_share(begin, along, share), half)
-        return reduce(torch.add, (x * step for x, step in zip(away, along, strict=True)))
-
-    low, high = torch.zeros_like(along[0] + begin[0]), torch.ones_like(along[0] + begin[0])
-    falls, rises = slope(low), slope(high)
+    like = along[0] + begin[0]
+    shares = [torch.zeros_like(like), torch.ones_like(like)]
     for start, step, h in zip(begin, along, half, strict=True):
         for side in (-h, h):
-            share = ((side - start) / torch.where(step == 0, 1.0, step)).clamp(0.0, 1.0)
-            found = slope(share)
-            left, right = (found < 0) & (share > low), (found >= 0) & (share < high)
-            low, falls = torch.where(left, share, low), torch.where(left, found, falls)
-            high, rises = torch.where(right, share, high), torch.where(right, found, rises)
+            shares.append(((side - start) / torch.where(step == 0, 1.0, step)).clamp(0.0, 1.0))
+    share = torch.stack(shares)
+    away = excess(at_share(begin, along, share), half)
+    slope = reduce(torch.add, (x * step for x, step in zip(away, along, strict=True)))
+    low, high, *between = share.unbind(0)
+    falls, rises, *slopes = slope.unbind(0)
+    for share, found in zip(between, slopes, strict=True):
+        left, right = (found < 0) & (share > low), (found >= 0) & (share < high)
+        low, falls = torch.where(left, share, low), torch.where(left, found, falls)
+        high, rises = torch.where(right, share, high), torch.where(right, found, rises)
     part = (-falls / (rises - falls).clamp(min=torch.finfo(low.dtype).tiny)).clamp(0.0, 1.0)
     return torch.where(falls < 0, low + (high - low) * part, low)
 
 
 def segment_distance(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor:
     """Smallest signed distance of a segment from a box's surface, in the box's frame."""
-    outside = signed_distance(at_share(begin, along, nearest(begin, along, half)), half)
+    outside = nearest(begin, along, half)
     # Inside the box the distance is the largest of 2 d linear functions, smallest at an end or where two cross.
-    shares = [torch.zeros_like(outside), torch.ones_like(outside)]
+    shares = [outside, torch.zeros_like(outside), torch.ones_like(outside)]
     sides = [(s * a, s * d, h) for a, d, h in zip(begin, along, half, strict=True) for s in (-1.0, 1.0)]
     for i, (a, d, h) in enumerate(sides):
         for other, change, width in sides[:i]:
             steep = d - change
             share = ((other - width) - (a - h)) / torch.where(steep == 0, 1.0, steep)
             shares.append(share.clamp(0.0, 1.0))
-    within = reduce(torch.minimum, (signed_distance(at_share(begin, along, share), half) for share in shares))
-    return torch.minimum(outside, within)
+    return signed_distance(at_share(begin, along, torch.stack(shares)), half).amin(0)
 
 
 def from_quaternions(turns: Tensor) -> Tensor:
