@@ -101,16 +101,17 @@ class Paths(Row):
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
-        first, near = self.proposals, closer(self.follow)
-        # Obstacles may bar the way from rest to the path, such as a wall between the two.
-        again = replace(
-            first, when="unproposed", roadmaps=(), follow=(near, replace(near, obstacles=0.0)), relax_top=None
-        )
-        if self.refined == 1:
-            again = replace(again, refine=REPAIRED, max_penetration=INSIDE_DEPTH)
+        first, attempt = self.proposals, (FromProposal(), IntoGoal())
         more = () if self.max_gap is None else (self._more(first),)
-        steps = first, *more, again, FromProposal(), IntoGoal()
-        return (*steps, self._thorough(first), FromProposal()) if self.refined == 1 else steps
+        if self.refined > 1:
+            return first, *more, *attempt
+        # Obstacles may bar the way from rest to the path, such as a wall between the two.
+        near = closer(self.follow)
+        again = replace(
+            first, when="unproposed", roadmaps=(), follow=(near, replace(near, obstacles=0.0)), relax_top=None,
+            refine=REPAIRED, max_penetration=INSIDE_DEPTH,
+        )  # fmt: skip
+        return first, *more, again, *attempt, self._thorough(first), FromProposal()
 
     def _thorough(self, first: PathProposals) -> PathProposals:
         """Along twice as many paths, to the end of the horizon and all refined, where the attempt ends far away."""
@@ -134,10 +135,9 @@ class Paths(Row):
     @property
     def does(self) -> str:
         more = "" if self.max_gap is None else f"; over {self.max_gap:.0%} above free: twice as many paths"
-        far = "; still far: twice as many, all refined" if self.refined == 1 else ""
-        return (
-            f"{self.proposals.does}{more}; without any: followed closer; then AL-iLQR from the best, into the goal{far}"
-        )
+        near, far = "; without any: followed closer", "; still far: twice as many, all refined"
+        near, far = (near, far) if self.refined == 1 else ("", "")
+        return f"{self.proposals.does}{more}{near}; then AL-iLQR from the best, into the goal{far}"
 
     def fitting(self, m: int) -> Self:
         """Without initial offsets that have another number of controls than m."""
