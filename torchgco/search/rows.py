@@ -67,7 +67,8 @@ class Paths(Row):
     Args:
         num_paths, roadmap, follow, relax_iterations, relax_top, max_penetration: as of `PathProposals`.
         refined: candidates that are refined before they are compared; 1: the best is proposed as relaxed, only those of
-            paths that led to no proposal are refined, and where the attempt ends far from the goal, twice as many.
+            paths that led to no proposal are followed closer and refined, and where the attempt ends far from the goal,
+            twice as many.
         max_gap: proposals that cost more than this above the trajectory without obstacles, as a share, are compared
             with those along twice as many paths; None: none are.
 

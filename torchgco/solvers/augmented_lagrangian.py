@@ -106,14 +106,17 @@ class AugmentedLagrangian(Solver):
         recorder: Recorder | None = None,
         guide_first: bool = False,
         by_arrival: bool = False,
+        draws: int | None = None,
     ) -> SolveEnd:
         """The solve without its verdict, in the units of the call: with guidance, or with a fixed penalty.
 
         Args:
             guide_first: also call guidance before the first inner solve.
             by_arrival: an iterate that has arrived at a stated goal is preferred to any that hasn't.
+            draws: how often guidance attracts an iterate without replacing it, at most, before the solve ends; None:
+                any number of times.
         """
-        loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
+        loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival, draws)
         B = call.problem.B
         every = torch.arange(B, device=call.rows.device)
         run_all(loop, every, max(1, B if self.slots is None else self.slots))
@@ -132,7 +135,9 @@ class OuterLoop:
         recorder: Recorder | None,
         guide_first: bool,
         by_arrival: bool,
+        draws: int | None,
     ) -> None:
+        self.draws = draws
         self.solver, self.call, self.guidance, self.penalty, self.recorder = solver, call, guidance, penalty, recorder
         self.guide_first, self.by_arrival = guide_first, by_arrival
         self.rules = solver.inner.rules
@@ -315,6 +320,8 @@ class OuterLoop:
             status[rows[advice.stop]] = STOPPED
         if advice.U is not None and advice.taken is not None:
             self._replace_iterate(s, rows, problem, advice)
+        if self.draws is not None:
+            status[rows[(s.guided[rows] >= self.draws) & ~s.replaced[rows]]] = Status.MAX_ITERATIONS
 
     def _replace_iterate(self, s: State, rows: Tensor, problem: Problem, advice: Advice) -> None:
         """Continue from the advised controls where they are taken.
