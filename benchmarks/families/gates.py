@@ -1,4 +1,4 @@
-"""python -m benchmarks.families.gates: gates drawn in forests, beside IPOPT by hand, and the published race.
+"""python -m benchmarks.families.gates: gates drawn in forests, against IPOPT by hand, and the published race.
 
 The layouts are those of `torchgco scenario=gates`: a quadrotor's planning model, balls of 0.5 m as gates, spheres
 between them, and a duration for each leg. IPOPT, through CasADi's SX by hand, states the same problem as multiple
@@ -134,14 +134,14 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
     return one
 
 
-def text(count: int, seed: int, beside: int, minutes: float, tracks: int, moved: int) -> str:
+def text(count: int, seed: int, ipopt: int, minutes: float, tracks: int, moved: int) -> str:
     """The tables of forests and race."""
     race = races(STAGES, MARGIN, tracks, moved)
     print(race, file=sys.stderr, flush=True)
-    return f"{table(forests(count, seed, beside, minutes))}\n\n{race}"
+    return f"{table(forests(count, seed, ipopt, minutes))}\n\n{race}"
 
 
-def forests(count: int, seed: int, beside: int, minutes: float) -> list[Flown]:
+def forests(count: int, seed: int, ipopt: int, minutes: float) -> list[Flown]:
     """Layouts from the first on, until the minutes of processor time are over, or Ctrl-C."""
     setup = torchgco.compose(["scenario=gates", f"seed={seed}"])
     layouts, flown, began = setup.layouts(count), list[Flown](), time.process_time()
@@ -149,7 +149,7 @@ def forests(count: int, seed: int, beside: int, minutes: float) -> list[Flown]:
         for number in range(count):
             task = setup.task(layouts.take([number]))
             setup.solver.solve(task.problem, task.U0, max_seconds=1e-3)  # compiles
-            flown.append(layout_flown(task, setup.solver, number, number < beside))
+            flown.append(layout_flown(task, setup.solver, number, number < ipopt))
             if time.process_time() - began > 60.0 * minutes:
                 break
     return flown
@@ -185,12 +185,12 @@ main = Command(
     __doc__,
     "gates",
     text,
-    "layouts of seed {seed}, at most {count}, for at most {minutes} minutes; IPOPT on the first {beside} of them; "
+    "layouts of seed {seed}, at most {count}, for at most {minutes} minutes; IPOPT on the first {ipopt} of them; "
     "{tracks} tracks moved by seed {moved}, the worst of these; a margin of 1 mm where a plan is aimed",
     "CasADi",
     count=(64, "layouts"),
     seed=(12, "of the layouts; constants were chosen on others"),
-    beside=(16, "layouts that IPOPT solves, too"),
+    ipopt=(16, "layouts that IPOPT solves, too"),
     minutes=(30.0, "of processor time, after which no further layout is begun"),
     tracks=(10, "races with moved gates"),
     moved=(7, "the seed of these"),
