@@ -3,7 +3,7 @@
 The layouts are those of `torchgco scenario=gates`: a quadrotor's planning model, balls of 0.5 m as gates, spheres
 between them, and a duration for each leg. IPOPT, through CasADi's SX by hand, states the same problem as multiple
 shooting; it begins with our states, controls and times, and knows the spheres within 3 m of our knots. Layouts are
-flown in their order, for so many minutes of processor time. The race is that of `benchmarks.families.free_time`.
+flown in their order, for so many minutes of processor time. The race is that of `benchmarks.families.race`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 import torchgco
-from benchmarks.families.free_time import races
+from benchmarks.families.race import races
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import markdown, share
 from torchgco import Problem, Solution, Status
