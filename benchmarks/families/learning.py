@@ -63,11 +63,9 @@ def nets(kind: str, seeds: int, steps: int) -> str:
         one = trained(kind, seed, steps)
         rows.append([
             seed, *(distance(part) for part in (one.before, one.after)), f"{one.differentiable:.1%}",
-            f"{one.seconds:.0f}", f"{one.elapsed:.0f}", f"{one.first:.1f}",
+            f"{one.seconds:.0f}", f"{one.first:.1f}",
         ])  # fmt: skip
-    return markdown(
-        ("seed", "before", "after", "with gradients", "seconds", "elapsed", "of these the first step"), rows
-    )
+    return markdown(("seed", "before", "after", "with gradients", "seconds", "of the first step"), rows)
 
 
 def distance(missed: Tensor) -> str:

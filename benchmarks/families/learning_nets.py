@@ -246,14 +246,13 @@ class Trained:
     Attributes:
         before, after: what is missed, m (problems,).
         differentiable: share of all losses.
-        seconds, elapsed, first: of all steps, by processor and by clock, and of the first, which compiles, by clock.
+        seconds, first: of all steps, by processor, and of the first, which compiles, by clock.
     """
 
     before: Tensor
     after: Tensor
     differentiable: float
     seconds: float
-    elapsed: float
     first: float
 
 
@@ -277,7 +276,7 @@ def trained(kind: str, seed: int, steps: int) -> Trained:
     for _ in tqdm(range(steps), f"{kind}, seed {seed}", unit="step", leave=False):
         good += stepped(task, generator, adam)
         first = first or time.perf_counter() - clock
-    seconds, elapsed = time.process_time() - began, time.perf_counter() - clock
+    seconds = time.process_time() - began
     with torch.no_grad():
         after = task.missed()
-    return Trained(before, after, good / steps, seconds, elapsed, first)
+    return Trained(before, after, good / steps, seconds, first)
