@@ -45,7 +45,6 @@ class Flown:
     iterations: int
     seconds: float  # of processor time
     by_hand: float | None = None  # s, where IPOPT solved it
-    asked: bool = False  # whether it was asked
 
 
 def field(x: Any, u: Any, gravity: float, lag: float) -> Any:
@@ -129,7 +128,7 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
     sound = bool(verdict.sound)
     hand = by_hand(problem, found) if ask and sound else None
     one = Flown(gates, found.statuses[0] is Status.CONVERGED, int(verdict.gates_passed) == gates, sound,
-                float(found.duration), int(found.iterations), spent, hand, ask and sound)  # fmt: skip
+                float(found.duration), int(found.iterations), spent, hand)  # fmt: skip
     print(number, one, file=sys.stderr, flush=True)
     return one
 
@@ -162,21 +161,20 @@ def table(flown: list[Flown]) -> str:
         some = [one for one in flown if low <= one.gates <= high]
         if some:
             rows.append([f"{low} to {high}", *_row(some)])
-    head = ["gates", "passed and clear", "CONVERGED", "duration, s", "iterations (most)", "s a layout (most)",
+    head = ["gates", "passed and clear", "duration, s", "iterations (most)", "s a layout (most)",
             "longer than IPOPT by hand by over 0.5 %", "duration / IPOPT's (most)"]  # fmt: skip
     return markdown(head, rows)
 
 
 def _row(some: list[Flown]) -> list[object]:
     good = [one for one in some if one.sound and one.passed]
-    asked = [one for one in some if one.asked]
-    ratios = [one.duration / one.by_hand for one in asked if one.by_hand is not None]
+    ratios = [one.duration / one.by_hand for one in some if one.by_hand is not None]
     counts, seconds = [one.iterations for one in some], [one.seconds for one in some]
     return [
-        share(len(good), len(some)), sum(one.converged for one in some),
+        share(len(good), len(some)),
         f"{np.median([one.duration for one in some]):.2f}", f"{np.median(counts):.0f} ({max(counts)})",
         f"{np.median(seconds):.1f} ({max(seconds):.1f})",
-        f"{sum(ratio > 1.0 + EXACT for ratio in ratios)} of {len(ratios)} solved, {len(asked)} asked",
+        f"{sum(ratio > 1.0 + EXACT for ratio in ratios)} of {len(ratios)}",
         f"{np.median(ratios):.4f} ({max(ratios):.4f})" if ratios else "-",
     ]  # fmt: skip
 
