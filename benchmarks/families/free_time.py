@@ -259,14 +259,13 @@ def cops() -> str:
             theirs = T if form.weight > 0 else last[0]
             other = f"{unit * theirs:.6g}; {count}; {time.process_time() - began:.2f}" if done else f"failed; {count}"
             rows.append([name, N, f"{unit * known:.6g}", f"{unit * value:.6g}", f"{value / known - 1.0:+.1e}",
-                         found.statuses[0].name, int(found.iterations[0]), f"{spent:.3f}", other])  # fmt: skip
+                         int(found.iterations[0]), f"{spent:.3f}", other])  # fmt: skip
     head = [
         "problem",
         "N",
         "known",
         "gco",
         "relative",
-        "status",
         "iterations",
         "s",
         "IPOPT by hand: value; iterations; s",
