@@ -161,7 +161,7 @@ def table(flown: list[Flown]) -> str:
         some = [one for one in flown if low <= one.gates <= high]
         if some:
             rows.append([f"{low} to {high}", *_row(some)])
-    head = ["gates", "passed and clear", "duration, s", "iterations (most)", "s a layout (most)",
+    head = ["gates", "passed and clear", "duration, s", "s a layout (most)",
             "longer than IPOPT by hand by over 0.5 %", "duration / IPOPT's (most)"]  # fmt: skip
     return markdown(head, rows)
 
@@ -169,10 +169,10 @@ def table(flown: list[Flown]) -> str:
 def _row(some: list[Flown]) -> list[object]:
     good = [one for one in some if one.sound and one.passed]
     ratios = [one.duration / one.by_hand for one in some if one.by_hand is not None]
-    counts, seconds = [one.iterations for one in some], [one.seconds for one in some]
+    seconds = [one.seconds for one in some]
     return [
         share(len(good), len(some)),
-        f"{np.median([one.duration for one in some]):.2f}", f"{np.median(counts):.0f} ({max(counts)})",
+        f"{np.median([one.duration for one in some]):.2f}",
         f"{np.median(seconds):.1f} ({max(seconds):.1f})",
         f"{sum(ratio > 1.0 + EXACT for ratio in ratios)} of {len(ratios)}",
         f"{np.median(ratios):.4f} ({max(ratios):.4f})" if ratios else "-",

@@ -205,7 +205,7 @@ def races(stages: Sequence[int], margin: float, tracks: int, seed: int) -> str:
     rows = _raced("as published", stages, margin, published)
     if tracks > 0:
         rows += _raced(f"{tracks} moved", stages, margin, moved)
-    head = ["track", "N", "duration, s", "iterations", "s, with those before", "gate at 1 ms, m", "end, m",
+    head = ["track", "N", "duration, s", "s, with those before", "gate at 1 ms, m", "end, m",
             "rates over, share"]  # fmt: skip
     return markdown(head, rows)
 
@@ -236,7 +236,7 @@ def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> li
         there = flown(found, gates)
         rows.append([
             name, label, f"{float(found.duration.max()):.4f}",
-            f"{int(found.iterations.median())} ({int(found.iterations.max())})", f"{spent / problem.B:.2f}",
+            f"{spent / problem.B:.2f}",
             *(f"{float(there[key].max()):.4f}" for key in ("gate", "end", "rate")),
         ])  # fmt: skip
         before, passes = (size, found), "aimed" in label and float(there["gate"].max()) <= 0.3
