@@ -20,8 +20,9 @@ WORDS = {
     "families": "Drawn layouts (seed 1000), of which the peers fly the first, before and after `gco`; the second\n"
     "table has each peer's seconds per problem / those of `gco`.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
-    "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
-    "finds its kernels, FATROP's program is built.",
+    "rest of the solution, `gco` from its multipliers as well; `compile` is the same step by a compiled problem.\n"
+    "Set-up does not count: `gco` traces the model and finds its kernels, `compile` makes its first solve, FATROP's\n"
+    "program is built.",
     "loop": "A car (4 states, 2 controls, RK4) follows a reference between two discs, 20 stages of 0.1 s: time of a\n"
     "period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep their multipliers;\n"
     "`compile` solves to 1e-8. Disturbed cars meet discs in their way. `solved` counts periods in which all\n"
