@@ -27,6 +27,8 @@ WORDS = {
     "period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep their multipliers;\n"
     "`compile` solves to 1e-8. Disturbed cars meet discs in their way. `solved` counts periods in which all\n"
     "cars are.",
+    "endless": "Loops that don't end: the resident memory of a process whose `MPC` drives a disturbed car, and the\n"
+    "processor time of compilers that it starts; steps of the environment of missions, without a planner.",
     "swing_up": "A cart-pole (4 states, 1 control, RK4, both bounded) swings up and stays, 75 stages of 0.02 s, 200\n"
     "periods from each of several starts near rest, disturbed in every period: time of a period but the first,\n"
     "and of that. `up` counts starts that end within 0.2 of the upright rest.",
