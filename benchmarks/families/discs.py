@@ -30,10 +30,10 @@ LENGTH = 2.5  # wheelbase, m
 RADIUS = 0.5  # of the car, m
 D = torch.float64
 HEAD = (
-    "solver", "at the goal", "lost", "over 0.1 % more expensive", "s, median",
+    "solver", "n", "at the goal", "lost", "over 0.1 % more expensive", "iterations, most", "s, median",
     f"time / `{PEERS[0]}` where that arrives, median [95 %]", "where it doesn't",
 )  # fmt: skip
-TRAP_HEAD = ("problem", "known to exist", *(f"`{name}`" for name in (OWN, *PEERS)))
+TRAP_HEAD = ("problem", "known to exist", *(f"`{name}`" for name in (OWN, *PEERS)), "iterations of `gco`")
 
 
 def car(x: Tensor, u: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ def solved(name: str, problem: Problem) -> dict[str, Any]:
     verdict = torchgco.judge(problem, solution.U)
     return {
         "solver": name, "status": solution.statuses[0].name, "seconds": seconds, "cost": float(verdict.cost),
-        "feasible": bool(verdict.feasible), "reached": bool(verdict.reached),
+        "feasible": bool(verdict.feasible), "reached": bool(verdict.reached), "iterations": int(solution.iterations),
     }  # fmt: skip
 
 
@@ -112,7 +112,7 @@ def compared(flights: pd.DataFrame, name: str) -> list[Any]:
     ratio, arrives = own["seconds"] / by[PEERS[0]]["seconds"], by[PEERS[0]]["reached"]
     times = ["1", "1"] if name == PEERS[0] else [median(ratio[rows], ".2g") for rows in (arrives, ~arrives)]
     return [
-        f"`{name}`", share(own["reached"].sum(), n), lost, above,
+        f"`{name}`", n, share(own["reached"].sum(), n), lost, above, int(own["iterations"].max()),
         shown(float(own["seconds"].median()), ".2g"), *times,
     ]  # fmt: skip
 
@@ -131,7 +131,7 @@ def traps() -> list[list[Any]]:
     rows = []
     for what, known, problem in named:
         found = [solved(name, problem) for name in (OWN, *PEERS)]
-        rows.append([what, known, *(shown(one["cost"], ".4g") for one in found)])
+        rows.append([what, known, *(shown(one["cost"], ".4g") for one in found), found[0]["iterations"]])
     return rows
 
 

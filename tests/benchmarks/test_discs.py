@@ -22,7 +22,7 @@ def test_ends_are_free_of_discs_and_draws_depend_on_the_seed_alone() -> None:
 def test_lost_and_more_expensive_are_counted_against_those_that_arrive() -> None:
     """Problem 0: above a peer; 1: cheaper, but the peer alone arrives; 2: above one that doesn't arrive."""
     peer = pd.DataFrame({"problem": range(3), "cost": 10.0, "feasible": True, "reached": [True, True, False],
-                         "seconds": 0.1})  # fmt: skip
+                         "seconds": 0.1, "iterations": 5})  # fmt: skip
     own = peer.assign(solver=OWN, cost=[10.1, 9.0, 11.0], reached=[True, False, True], seconds=[0.2, 0.2, 0.9])
     flights = pd.concat([own, *(peer.assign(solver=name) for name in PEERS)])
     cells = dict(zip(HEAD, compared(flights, OWN), strict=True))
