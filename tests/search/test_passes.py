@@ -49,7 +49,7 @@ from torchgco.search import (
     Tighten,
     Tube,
 )
-from torchgco.search.passes import DRAWS
+from torchgco.search.passes import MOST_DRAWS
 from torchgco.search.table import TABLE_COLUMNS
 from torchgco.solvers.contracts import Advice
 from torchgco.solvers.interior import InteriorPoint
@@ -206,7 +206,7 @@ def test_samples_without_a_clear_trajectory_are_drawn_no_further() -> None:
     local = replace(LOCAL, guidance=guidance, max_outer_iterations=20)
     solution = Restarts(local, (Solve(), FromSamples("caught", redraws=3))).recording().solve(*gates(6.0))
     assert solution.search is not None and solution.search.caught is not None
-    assert guidance.asked == DRAWS * len(solution.search.caught[0]) > 0
+    assert guidance.asked == MOST_DRAWS * len(solution.search.caught[0]) > 0
 
 
 LONGEST = ((ClearChords, "rounds"),)

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchgco.obstacles.base import Solids
 
 Coordinates = Sequence[Tensor]
-PAIRS_AT_ONCE = 1024  # of a segment and a box: what is computed of them fits into a processor's cache
+SEGMENTS_AT_ONCE = 1024  # of a segment and a box: what is computed of them fits into a processor's cache
 BOX_SLACK = 1e-9  # share of lengths by which bounds are wider, more than rounding
 
 
@@ -90,7 +90,7 @@ class Cuboids(Solids):
 
     def segment_distance(self, pairs: tuple[Tensor, Tensor, Tensor], a: Tensor, b: Tensor) -> Tensor:
         """Smallest signed distances (P,), m, of pairs (problem, segment, box) of segments from a to b (B, V, d)."""
-        parts = zip(*(one.split(PAIRS_AT_ONCE) for one in pairs), strict=True)
+        parts = zip(*(one.split(SEGMENTS_AT_ONCE) for one in pairs), strict=True)
         return torch.cat([self._segment_distance(i, e, j, a, b) for i, e, j in parts])
 
     def _segment_distance(self, i: Tensor, e: Tensor, j: Tensor, a: Tensor, b: Tensor) -> Tensor:

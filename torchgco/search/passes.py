@@ -28,7 +28,7 @@ ATTRACTED_TO = 0.95  # share of the goal tolerance to which trajectories are att
 ATTRACTION = 1e3  # weight of that attraction, in units of cost per radius^4
 # An attempt's draws, at most, without a clear trajectory. Of 97 attempts from samples that arrived, in eleven families,
 # 96 had made at most three draws, and one six.
-DRAWS = 6
+MOST_DRAWS = 6
 ATTEMPT_SEED_STEP = 1_000_003  # between the seeds of two attempts
 
 
@@ -202,8 +202,8 @@ class FromSamples(Row):
             call = replace(call, warm=warm, outer=search.caught.outer[rows])
         else:
             call = replace(call, seed=call.seed + ATTEMPT_SEED_STEP * draw)
-        end = search.best.attempt(call, search.guidance, guide_first=True, draws=DRAWS)
-        search.drawn[rows] = end.guided >= DRAWS
+        end = search.best.attempt(call, search.guidance, guide_first=True, draws=MOST_DRAWS)
+        search.drawn[rows] = end.guided >= MOST_DRAWS
         search.best.keep(rows, end)
 
 
