@@ -46,8 +46,8 @@ class Optimality(NamedTuple):
 def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
     """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers."""
     problem = lagrangian.problem
-    slack = lagrangian.slack(X, U)
-    run = kernels_of(problem).optimality_pass(lagrangian, X, U)
+    kernels = kernels_of(problem)
+    slack, run = kernels.slack(lagrangian, X, U), kernels.optimality_pass(lagrangian, X, U)
     mu = torch.zeros_like(slack)
     step = run(mu)
     for i in range(TRIES):
