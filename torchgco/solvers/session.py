@@ -12,7 +12,7 @@ from torchgco.base.errors import TraceWarning
 from torchgco.base.status import STOPPED, Status, is_over
 from torchgco.base.tree import Rows, is_users, put, spread, take
 from torchgco.dynamics.rollout import open_loop
-from torchgco.kernels import kernels_of, reproducible
+from torchgco.kernels import kernels_of, measured, reproducible
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -122,7 +122,12 @@ class Session:
         known = gains or (lambda rows: self._optimality(best, rows).K)
         X, U = reproducible(self.call.problem, best.X, best.U, known)
         user = self.given.problem
-        cost, worst = user.cost.total(X, U), violation(user.constraints, X, U)
+        cost = user.cost.total(X, U)
+        # Rows of a user's code count as that code gives them, which its compiled form may not.
+        if any(map(is_users, user.constraints)):
+            worst = violation(user.constraints, X, U)
+        else:
+            worst = measured(self.call.problem, X, U)
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
     def _optimality(self, best: Iterate, rows: Rows) -> Optimality:
