@@ -193,7 +193,11 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *c = p->constraint + i;
             double *lam = c->lam + e * c->knots * c->rows;
-            for (int64_t j = 0; j < c->knots * c->rows; j++) lam[j] = s->rows[i].lam[j][l];
+            for (int64_t k = 0; k < c->knots; k++, lam += c->rows) {
+                const V *next = s->rows[i].lam + k * c->rows;
+                if (s->rows[i].pushed[k][l]) for (int j = 0; j < c->rows; j++) lam[j] = next[j][l];
+                else memset(lam, 0, c->rows * sizeof *lam);
+            }
         }
         if (preferred(o, e, violation[l])) keep(o, e, violation[l]);
         o->outer[e]++;
