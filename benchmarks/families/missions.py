@@ -144,8 +144,8 @@ def many(count: int, outputs: Path) -> str:
 def timing(alone: int, together: int) -> str:
     """Markdown: what a period takes in missions that fly alone, a row per case, and seconds per mission of a batch."""
     head = (
-        "missions, each alone", "n", "first plan, ms", "longest", "later periods", "median, ms", "90 %", "99 %", "longest",
-        "tracker, ms a call", "missed",
+        "missions, each alone", "n", "first plan, ms", "longest", "later periods", "median, ms", "90 %", "99 %",
+        "longest", "tracker, ms a call", "missed",
     )  # fmt: skip
     rows, totals = [], []
     for case in TIMED:
@@ -162,8 +162,8 @@ def timing(alone: int, together: int) -> str:
     batch = float(np.mean([part.sum() for part in _periods(CASES[TIMED[0]], 0, together)])) / 1000.0
     text = [
         "A period of 50 ms is missed where the planner and the tracker's five calls take longer; elapsed times.",
-        "The first plan, by the whole solver from rest, is counted apart: unless obstacles move, a vehicle can wait for",
-        "it. `missed_deadlines` of a study counts it, too.",
+        "The first plan, by the whole solver from rest, is counted apart: unless obstacles move, a vehicle can wait",
+        "for it. `missed_deadlines` of a study counts it, too.",
         f"Planner and tracker take {np.mean(totals):.2f} s for a mission of the first row alone,",
         f"{batch:.2f} s per mission in a batch of {together}.",
     ]
