@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -73,6 +73,7 @@ class AugmentedLagrangian(Solver):
     violation_tolerance: Positive = ADMITTED
     slots: Count | None = None
     record: bool = False
+    by_kernels: ClassVar[bool] = False  # as of `Session`
 
     def __post_init__(self) -> None:
         check_options(self, "solver")
@@ -85,9 +86,15 @@ class AugmentedLagrangian(Solver):
         """The same solver with at most `slots` problems at a time."""
         return replace(self, slots=slots)
 
+    def in_closed_loop(self, rounds: int) -> tuple[Self, Self]:
+        """The same solver twice. A planner flies on what its kernels measure: rows aren't evaluated by PyTorch, too."""
+        other = replace(self)
+        object.__setattr__(other, "by_kernels", True)
+        return other, other
+
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
-        session = Session(call, self.inner.rules, self.record)
+        session = Session(call, self.inner.rules, self.record, self.by_kernels)
         guidance = None if self.guidance is None else self.guidance.suited(session.call.problem)
         end = self.outer_loop(session.call, guidance, recorder=session.recorder)
         return session.finished(end, self.violation_tolerance, self.slots)

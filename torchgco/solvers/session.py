@@ -36,10 +36,12 @@ class Session:
         given: the call in the user's units.
         rules: of the solver; `call` is in their units of cost, `unit` (B,).
         record: keep the history of every problem in `recorder`.
+        by_kernels: violations of what is returned are those that the solver's kernels measure, but for a user's rows;
+            else PyTorch measures them, whatever kernels say.
     """
 
-    def __init__(self, given: Call, rules: Rules, record: bool = False) -> None:
-        self.given, self.rules = given, rules
+    def __init__(self, given: Call, rules: Rules, record: bool = False, by_kernels: bool = False) -> None:
+        self.given, self.rules, self.by_kernels = given, rules, by_kernels
         self.call, self.unit = rules.in_units(given)
         self.recorder = Recorder() if record else None
 
@@ -123,11 +125,10 @@ class Session:
         X, U = reproducible(self.call.problem, best.X, best.U, known)
         user = self.given.problem
         cost = user.cost.total(X, U)
-        # Rows of a user's code count as that code gives them, which its compiled form may not.
-        if any(map(is_users, user.constraints)):
-            worst = violation(user.constraints, X, U)
-        else:
+        if self.by_kernels and not any(map(is_users, user.constraints)):
             worst = measured(self.call.problem, X, U)
+        else:
+            worst = violation(user.constraints, X, U)
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
     def _optimality(self, best: Iterate, rows: Rows) -> Optimality:
