@@ -129,12 +129,13 @@ def count_of(index: slice | Tensor, of: int) -> int:
     return len(range(of)[index]) if isinstance(index, slice) else len(index)
 
 
-def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> slice | Tensor:
-    """Knots as a slice where they are contiguous, else as indices; negative ones count from the end.
+def resolve_knots(knots: Knots | None, last: int, field: str, device: torch.device, first: int = 1) -> slice | Tensor:
+    """Knots as a slice where they are contiguous, else as indices; negative ones count from the end. None: first..last.
 
     Raises:
         InputError: no knot, a repeated knot, a knot that is no whole number or outside 0..last.
     """
+    knots = slice(first, last + 1) if knots is None else knots
     try:
         chosen = list(range(last + 1)[knots]) if isinstance(knots, slice) else [whole(k) for k in knots]
     except (TypeError, ValueError):
@@ -195,11 +196,8 @@ class FunctionConstraint(Constraint):
         check_options(self, self.name if isinstance(self.name, str) else "constraint")
         if self.geometric and self.of != "x":
             raise InputError(f"{self.name}.geometric", "a function of x alone", f"of={self.of!r}")
-        last = dims.N if self.of == "x" else dims.N - 1
-        default = slice(1, dims.N + 1) if self.of == "x" else slice(0, dims.N)
-        knots = resolve_knots(
-            default if self.knots is None else self.knots, last, f"{self.name}.knots", dims.like.device
-        )
+        last, first = (dims.N, 1) if self.of == "x" else (dims.N - 1, 0)
+        knots = resolve_knots(self.knots, last, f"{self.name}.knots", dims.like.device, first)
         where = f"{self.name}.function"
         if not callable(self.function):
             raise InputError(where, f"a function of {' and '.join(self.of)}", shown(self.function))

@@ -43,8 +43,7 @@ class _Bounds(Constraint):
         if self.above is not None and self.lower.dim() == 2:  # bound already; other knots may not fit another problem
             return self
         name, size, last = self.label, dims.m if self.of == "u" else dims.n, dims.N - 1 if self.of == "u" else dims.N
-        default = slice(self._first_knot, last + 1)
-        knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", dims.like.device)
+        knots = resolve_knots(self.knots, last, f"{name}.knots", dims.like.device, self._first_knot)
         shape = dims.B, count_of(knots, last + 1), size
         lower = self._checked(self.lower, f"{name}.lower", shape, dims, torch.inf)
         upper = self._checked(self.upper, f"{name}.upper", shape, dims, -torch.inf)

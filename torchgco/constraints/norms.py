@@ -326,9 +326,8 @@ def _chosen(
 
 def _knots(knots: Any, kind: str, dims: Dimensions, field: str) -> tuple[slice | Tensor, int]:
     """The knots at which a constraint holds, and how many."""
-    last = dims.N - 1 if kind == "u" else dims.N
-    default = slice(0 if kind == "u" else 1, last + 1)
-    found = resolve_knots(default if knots is None else knots, last, field, dims.like.device)
+    last, first = (dims.N - 1, 0) if kind == "u" else (dims.N, 1)
+    found = resolve_knots(knots, last, field, dims.like.device, first)
     return found, count_of(found, last + 1)
 
 

@@ -72,8 +72,7 @@ class Field(Constraint):
         if field.batch not in (None, dims.B):
             raise InputError("field.field", f"one map for all, or {dims.B} maps", field.batch)
         vehicle = vehicle_radii(self.vehicle_radius, "field.vehicle_radius", dims)
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
-        knots = resolve_knots(knots, dims.N, "field.knots", like.device)
+        knots = resolve_knots(self.knots, dims.N, "field.knots", like.device, dims.obstacles_from)
         which = torch.zeros(dims.B, dtype=torch.int64, device=like.device)
         if field.batch is not None:
             which = torch.arange(dims.B, device=like.device)

@@ -78,8 +78,7 @@ class Boxes(Constraint):
             raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
         axes = _axes(self.rotations, absent, d, dims)
         vehicle = vehicle_radii(self.vehicle_radius, "boxes.vehicle_radius", dims)
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
-        knots = resolve_knots(knots, dims.N, "boxes.knots", half.device)
+        knots = resolve_knots(self.knots, dims.N, "boxes.knots", half.device, dims.obstacles_from)
         return BoundBoxes.prepare(centers, half, axes, absent, radii, vehicle, knots, dims)
 
 

@@ -59,8 +59,7 @@ class Capsules(Constraint):
             raise InputError("capsules.radii", "radii above 0 m", 0.0)
         half, axes = _single_side(ends - starts, absent)
         vehicle = vehicle_radii(self.vehicle_radius, "capsules.vehicle_radius", dims)
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
-        knots = resolve_knots(knots, dims.N, "capsules.knots", starts.device)
+        knots = resolve_knots(self.knots, dims.N, "capsules.knots", starts.device, dims.obstacles_from)
         return BoundBoxes.prepare(0.5 * (starts + ends), half, axes, absent, radii, vehicle, knots, dims)
 
 

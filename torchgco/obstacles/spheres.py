@@ -67,14 +67,13 @@ class Spheres(Constraint):
             raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
         if centers.shape[1] == 0:
             velocities = None  # none of them moves: what is asked of moving obstacles alone isn't asked of none
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
         return BoundSpheres.prepare(
             torch.where(absent.unsqueeze(-1), 0.0, centers),
             torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1)),
             velocities,
             absent,
             vehicle,
-            resolve_knots(knots, dims.N, "obstacles.knots", radii.device),
+            resolve_knots(self.knots, dims.N, "obstacles.knots", radii.device, dims.obstacles_from),
             dims.position,
             dims.dt or 0.0,
         )
