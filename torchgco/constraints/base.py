@@ -119,6 +119,13 @@ class WrappedConstraint(Constraint):
         return self.constraint.start_is_clear(x0)
 
 
+def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
+    """Add gradients (B, K, c) and Hessians (B, K, c, c) of components `at` to homogeneous blocks H of n states."""
+    H[:, knots, at, n] += gradient
+    H[:, knots, n, at] += gradient
+    H[:, knots, at, at] += hessian
+
+
 def innermost(constraint: Constraint) -> Constraint:
     """The constraint within all that wraps it."""
     return innermost(constraint.constraint) if isinstance(constraint, WrappedConstraint) else constraint

@@ -11,8 +11,9 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
-from torchgco.constraints.base import Constraint, Sense, count_of, resolve_knots
-from torchgco.obstacles.base import ABSENT, Obstacles, picked
+from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.obstacles.attitude import in_plane
+from torchgco.obstacles.base import ABSENT, OwnKind, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
@@ -56,7 +57,6 @@ class Boxes(Constraint):
     radii: Any = None
     knots: Any = None
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
@@ -83,7 +83,7 @@ class Boxes(Constraint):
 
 
 @dataclass(frozen=True)
-class BoundBoxes(Obstacles):
+class BoundBoxes(OwnKind):
     """Boxes, sharp or rounded, shaped for their problem."""
 
     centers: Tensor  # (B, M, d)
@@ -121,9 +121,6 @@ class BoundBoxes(Obstacles):
         depths = inflated + half.amin(-1)
         return cls(centers, half, axes, absent, vehicle_radius, inflated, depths, knots, dims.position, dims.dt or 0.0)
 
-    def bind(self, dims: Dimensions) -> Self:
-        return self
-
     @property
     def margins(self) -> Tensor:
         return self.inflated_radii
@@ -132,30 +129,11 @@ class BoundBoxes(Obstacles):
     def sizes(self) -> Tensor:
         return self.depths
 
-    def row_shape(self, N: int) -> tuple[int, int]:
-        return count_of(self.knots, N + 1), self.absent.shape[1]
+    def rows(self, p: Tensor, t: Tensor) -> Tensor:
+        return torch.where(self.absent.unsqueeze(1), ABSENT, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
 
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.counted(self._rows(X[:, self.knots, self.position]), ABSENT, X.shape[1])
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        rows = self._rows(x[..., self.position])
-        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, at = X.shape[-1], self.position
-        g, h = self.counted(g, 0.0, X.shape[1]), self.counted(h, 0.0, X.shape[1])
-        cp = -2.0 * self.depths[:, None, :, None] * self.inflated().normals(X[:, self.knots, at])
-        gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
-        H[:, self.knots, at, n] += gradient
-        H[:, self.knots, n, at] += gradient
-        H[:, self.knots, at, at] += (h.unsqueeze(-1) * cp).mT @ cp
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        """Depth beneath the full surface, (B, K, M), m."""
-        p = X[:, self.knots, self.position]
-        depth = (-self.signed_distance(p, self.times(X))).clamp(min=0.0)
-        return self.counted(depth, 0.0, X.shape[1])
+    def slopes(self, p: Tensor, t: Tensor) -> Tensor:
+        return -2.0 * self.depths[:, None, :, None] * self.inflated().normals(p)
 
     def worst(self, X: Tensor, U: Tensor) -> Tensor:
         parts = self._parts(X.shape[1])
@@ -191,9 +169,6 @@ class BoundBoxes(Obstacles):
             parts[name] = parts[name].masked_fill(absent.view(*absent.shape, *([1] * (parts[name].dim() - 2))), 0.0)
         return replace(self, absent=absent, **parts)
 
-    def stopping_at(self, knots: Tensor) -> Self:
-        return replace(self, stops=knots.to(self.centers.dtype))
-
     def inflated(self) -> Cuboids:
         return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)
 
@@ -208,10 +183,6 @@ class BoundBoxes(Obstacles):
         size = max(B, 1) if self.absent.is_cuda else max(1, BOX_GAPS_AT_ONCE // max(1, points * M))
         return [slice(first, first + size) for first in range(0, max(B, 1), size)]
 
-    def _rows(self, p: Tensor) -> Tensor:
-        """c (B, K, M) at points (B, K, d); an absent box is c = -1 everywhere."""
-        return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
-
 
 def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
     """The directions (B, M, d, d) of the sides; those of absent boxes are the axes of space."""
@@ -221,8 +192,7 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
     if d == 2:
         angle = per_problem(rotations, "boxes.rotations", 2, dims)
         check_shape(angle, tuple(absent.shape), "boxes.rotations")
-        cos, sin = angle.cos(), angle.sin()
-        axes = torch.stack((torch.stack((cos, sin), dim=-1), torch.stack((-sin, cos), dim=-1)), dim=-2)
+        axes = in_plane(angle).mT
     else:
         turns = per_problem(rotations, "boxes.rotations", 3, dims)
         check_shape(turns, (*absent.shape, 4), "boxes.rotations")

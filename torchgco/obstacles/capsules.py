@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
-from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import from_quaternions
 from torchgco.obstacles.boxes import BoundBoxes
@@ -42,7 +42,6 @@ class Capsules(Constraint):
     vehicle_radius: Any = 0.0
     knots: Any = None
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
