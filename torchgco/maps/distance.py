@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.notices import AFTER
 from torchgco.base.options import check_value
 from torchgco.maps.grid import OccupancyGrid
-from torchgco.maps.lookup import Lattice, distances
+from torchgco.maps.lookup import Lattice, lengths, squares
 from torchgco.maps.points import PointCloud
 
 FINE_NODES = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
@@ -165,7 +165,7 @@ class DistanceField:
         origins, maps = torch.from_numpy(self.origin).to(p.device), torch.arange(G, device=p.device)
         lattice = Lattice(self.nodes(p.device), maps, origins, self.spacing, smooth)
         cores = torch.full((G,), 0.5 * self.spacing, dtype=p.dtype, device=p.device)
-        return distances(lattice, flat, cores).reshape(p.shape[:-1])
+        return lengths(squares(lattice, flat, cores), cores.unsqueeze(-1)).reshape(p.shape[:-1])
 
 
 def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> DistanceField:

@@ -206,15 +206,20 @@ def number(value: Any, field: str) -> float:
 
 def coordinates(value: Any, field: str) -> np.ndarray:
     """Numbers as a new array of float64; InputError for all else."""
-    if isinstance(value, Tensor):
-        value = value.detach().cpu().numpy()
-    try:
-        held = np.asarray(value)
-    except (TypeError, ValueError):  # lists of different length
-        raise InputError(field, "numbers", shown(value)) from None
+    held = _array(value, field, "numbers")
     if held.dtype.kind not in "iuf":
         raise InputError(field, "numbers", shown(value))
     return np.array(held, float)
+
+
+def _array(value: Any, field: str, expected: str) -> np.ndarray:
+    """An array of what an array, a tensor or nested lists hold."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError):  # lists of different length
+        raise InputError(field, expected, shown(value)) from None
 
 
 def _cells(value: Any) -> np.ndarray:
@@ -223,12 +228,7 @@ def _cells(value: Any) -> np.ndarray:
     Raises:
         InputError: neither bools nor numbers, or numbers out of range.
     """
-    if isinstance(value, Tensor):
-        value = value.detach().cpu().numpy()
-    try:
-        cells = np.asarray(value)
-    except (TypeError, ValueError):
-        raise InputError("grid.occupied", "an array of bools or numbers", shown(value)) from None
+    cells = _array(value, "grid.occupied", "an array of bools or numbers")
     if cells.dtype == np.bool_:
         return cells
     if cells.dtype.kind not in "iuf":

@@ -60,8 +60,7 @@ class Ways:
         The nearest of all where none of these is free.
         """
         at = np.rint((np.asarray(point, float) - self.origin) / self.spacing).astype(int)
-        low = np.clip(at - 2, 0, np.array(self.distance.shape) - 1)
-        high = np.clip(at + 2, 0, np.array(self.distance.shape) - 1)
+        low, high = (np.clip(at + by, 0, np.array(self.distance.shape) - 1) for by in (-2, 2))
         near = np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), -1).reshape(-1, len(low))
         apart = np.linalg.norm(self.origin + self.spacing * near - point, axis=1)
         free = self.distance[tuple(near.T)] > self.radius

@@ -13,7 +13,7 @@ import numpy as np
 
 from torchgco.base.errors import shown
 from torchgco.maps.files.part import Box
-from torchgco.maps.files.source import MOST_CELLS, Cursor, Source, made
+from torchgco.maps.files.source import MOST_CELLS, Cursor, Source, made, whole
 from torchgco.maps.grid import OccupancyGrid
 
 DEPTH = 16  # of OctoMap's trees: the root has a side of 2**16 cells, with the frame's origin in its middle
@@ -96,15 +96,14 @@ def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float,
         source.refuse(f"{expected}, then id, size, res and data", f"only {', '.join(found) or 'none of them'}")
     if found["id"] not in NODE_BYTES:
         source.refuse(f"a tree of {', '.join(NODE_BYTES)}", shown(found["id"]))
-    if not found["size"].isascii() or not found["size"].isdigit() or len(found["size"]) > 12:
-        source.refuse("a whole number of nodes", shown(found["size"]))
+    size = whole(source, found["size"], "size")
     try:
         resolution = float(found["res"])
     except ValueError:
         resolution = np.nan
     if not 0.0 < resolution < np.inf:
         source.refuse("res, a length > 0 m", shown(found["res"]))
-    return found["id"], int(found["size"]), resolution, at
+    return found["id"], size, resolution, at
 
 
 def _binary_tree(cursor: Cursor, size: int) -> tuple[Leaves, int]:
@@ -148,9 +147,7 @@ def _children(inner: np.ndarray) -> tuple[Leaves, int]:
 
 def _tree(cursor: Cursor, more: int) -> tuple[Leaves, int]:
     """Leaves and number of nodes of an ot file: log-odds, a colour or time, and a bit for each child that there is."""
-    row = np.dtype([("log_odds", "<f4"), ("more", f"V{more}"), ("children", "u1")])
-    if not more:
-        row = np.dtype([("log_odds", "<f4"), ("children", "u1")])
+    row = np.dtype([("log_odds", "<f4"), *([("more", f"V{more}")] if more else []), ("children", "u1")])
     count, rest = divmod(cursor.left, row.itemsize)
     cursor.source.limit(count, MOST_NODES, "nodes of a tree")
     rows = np.frombuffer(cursor.data[cursor.at : cursor.at + count * row.itemsize], row)
@@ -180,8 +177,5 @@ def _tree(cursor: Cursor, more: int) -> tuple[Leaves, int]:
     chosen = odds[found[:, 4]]
     if not np.isfinite(chosen).all():
         cursor.source.refuse("finite log-odds of leaves", f"{chosen[~np.isfinite(chosen)][0]}")
-    return Leaves(found[:, :3], 1 << found[:, 3], _probability(chosen)), count
-
-
-def _probability(log_odds: np.ndarray) -> np.ndarray:
-    return (1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0)))).astype(np.float32)
+    probabilities = (1.0 / (1.0 + np.exp(-np.clip(chosen, -50.0, 50.0)))).astype(np.float32)
+    return Leaves(found[:, :3], 1 << found[:, 3], probabilities), count
