@@ -120,26 +120,24 @@ class AugmentedLagrangian(Solver):
         return loop.result
 
 
+@dataclass(eq=False)
 class OuterLoop:
     """The outer loops of one call (Algorithm 4); statuses are (b,) int64, RUNNING until a problem ends."""
 
-    def __init__(
-        self,
-        solver: AugmentedLagrangian,
-        call: Call,
-        guidance: Guidance | None,
-        penalty: Penalty | None,
-        recorder: Recorder | None,
-        guide_first: bool,
-        by_arrival: bool,
-    ) -> None:
-        self.solver, self.call, self.guidance, self.penalty, self.recorder = solver, call, guidance, penalty, recorder
-        self.guide_first, self.by_arrival = guide_first, by_arrival
-        self.rules = solver.inner.rules
-        self._result: SolveEnd | None = None
-        self.stopped = 0  # problems that guidance has stopped
-        self.limit = 1 if recorder is not None else solver.inner.max_iterations
-        self._passes: OuterPasses | None = None  # of the running problems
+    solver: AugmentedLagrangian
+    call: Call
+    guidance: Guidance | None
+    penalty: Penalty | None
+    recorder: Recorder | None
+    guide_first: bool
+    by_arrival: bool
+    stopped: int = 0  # problems that guidance has stopped
+    _result: SolveEnd | None = None
+    _passes: OuterPasses | None = None  # of the running problems
+
+    def __post_init__(self) -> None:
+        self.rules = self.solver.inner.rules
+        self.limit = 1 if self.recorder is not None else self.solver.inner.max_iterations
 
     @property
     def result(self) -> SolveEnd:

@@ -46,8 +46,7 @@ class Condensed:
             G[k + 1, :, here] = F[k, :, n:]
         column = quadratise(problem, X, U)[0, :, :, n]
         local = torch.cat((column[:, :n], column[:, n + 1 :]), dim=-1)
-        gradient = (G * local[:, :n, None]).flatten(0, 1).sum(0) + local[:-1, n:].flatten()
-        return cls(problem, X, U, F, G, local, gradient, *_rows(problem, X, U))
+        return cls(problem, X, U, F, G, local, _reduced(G, local), *_rows(problem, X, U))
 
     def dense(self, rows: Tensor) -> Tensor:
         """A (q, v): derivatives of the rows (q,) w.r.t. U."""
@@ -65,9 +64,7 @@ class Condensed:
 
     def lagrangian_gradient(self, lam: Tensor) -> Tensor:
         """Gradient (v,) of J_var + lam'c w.r.t. U, for multipliers lam (r,)."""
-        n = self.problem.n
-        local = self.local.index_add(0, self.knots, lam.unsqueeze(-1) * self.slopes)
-        return (self.G * local[:, :n, None]).flatten(0, 1).sum(0) + local[:-1, n:].flatten()
+        return _reduced(self.G, self.local.index_add(0, self.knots, lam.unsqueeze(-1) * self.slopes))
 
     def hessian(self, lam: Tensor | None) -> Tensor:
         """Hessian (v, v) of J_var + lam'c w.r.t. U: exact for multipliers lam (r,), that of the cost alone for None.
@@ -124,6 +121,12 @@ class Condensed:
         shapes = [c.value(self.X, self.U).shape for c in self.problem.constraints]
         parts = rows.split([shape.numel() for shape in shapes])
         return tuple(part.view(shape) for part, shape in zip(parts, shapes, strict=True))
+
+
+def _reduced(G: Tensor, local: Tensor) -> Tensor:
+    """The gradient (v,) w.r.t. U of what has gradients `local` (N+1, n + m) w.r.t. the x and u of each knot."""
+    n = G.shape[1]
+    return (G * local[:, :n, None]).flatten(0, 1).sum(0) + local[:-1, n:].flatten()
 
 
 def _rows(problem: Problem, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
