@@ -283,7 +283,7 @@ def _acceleration(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
 
 
 def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    cost = _local(problem.cost.total, X, U)
+    cost = gradients(problem.cost.total, X, U)
     active = _active_rows(problem, X, U)
     gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
     reduced, terms, start = _reduced(problem, X, U, gX, gU)
@@ -301,7 +301,7 @@ def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]
         torch.where(torch.isfinite(c), lam if constraint.sense == "equality" else lam.clamp(min=0.0), 0.0)
         for constraint, lam, c in zip(problem.constraints, multipliers, rows, strict=True)
     ]  # a bound at infinity pushes nobody
-    reduced, terms, start = _reduced(problem, X, U, *_local(_lagrangian(problem, lams), X, U))
+    reduced, terms, start = _reduced(problem, X, U, *gradients(_lagrangian(problem, lams), X, U))
     free = _free(problem)
     rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
     unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
@@ -327,7 +327,7 @@ def _of_factors(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor
     bounds: list[Any] = list(problem.constraints[len(multipliers) :])
     if not bounds:
         return []
-    reduced, _, start = _reduced(problem, X, U, *_local(_lagrangian(problem, multipliers), X, U))
+    reduced, _, start = _reduced(problem, X, U, *gradients(_lagrangian(problem, multipliers), X, U))
     found = []
     for part in bounds:
         slopes = reduced[:, part.knots] if part.of == "u" else start[0].unsqueeze(1)
@@ -367,36 +367,23 @@ def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
     return rest
 
 
-def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, Tensor]]]:
-    """Per constraint with rows that may be active: whether it is an equality, and the rows' gradients (`_local`)."""
+def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, ...]]]:
+    """Per constraint with rows that may be active: whether it is an equality, and the rows' gradients, (q, N+1, n) by X
+    and (q, N, m) by U, without dynamics."""
     found = []
     for constraint in problem.constraints:
         equality = constraint.sense == "equality"
-        spare = _spare(constraint, X, U)[0]
+        is_obstacle = isinstance(constraint, Obstacles)
+        spare = (constraint.distances(X) if is_obstacle else -constraint.value(X, U))[0]  # m, or in the units of c
         knots, columns = (spare <= (torch.inf if equality else ACTIVE_WITHIN)).nonzero(as_tuple=True)
         q = knots.numel()
         if q > 0:
             twins = constraint.take(torch.zeros(q, dtype=torch.int64, device=X.device))
             which = torch.arange(q, device=X.device), knots, columns
             rows = lambda x, u, twins=twins, which=which: twins.value(x, u)[which]
-            found.append((equality, _local(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
+            # Row j is computed from repetition j of the trajectory.
+            found.append((equality, gradients(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
     return found
-
-
-def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
-    """Slack of each row (1, K, p): m for obstacles, else in the units of c."""
-    if isinstance(constraint, Obstacles):
-        return constraint.distances(X)
-    return -constraint.value(X, U)
-
-
-def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of rows(X, U) (q,) with respect to X (q, N+1, n) and U (q, N, m), without dynamics.
-
-    Row j is computed from repetition j of the trajectory.
-    """
-    gX, gU = gradients(rows, X, U)
-    return gX, gU
 
 
 def _reduced(
