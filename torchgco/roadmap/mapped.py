@@ -265,7 +265,7 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
         if len(found) == count:
             break
         path = ways.taut(int(v))
-        points = _spread(path)
+        points = even(path, COMPARED)
         if all(_apart(points, other) > unit for other in found):
             found.append(path)
     return found + _beside(ways, found, count - len(found), unit)
@@ -279,15 +279,10 @@ def _beside(ways: Ways, found: list[Array], count: int, unit: float) -> list[Arr
     for _ in range(count):
         path = ways.beside(weight)
         weight[ways.near(path, unit)] *= 1.0 + DIVERSITY
-        points = _spread(path)
+        points = even(path, COMPARED)
         if all(_apart(points, other) > unit for other in (*found, *others)):
             others.append(path)
     return others
-
-
-def _spread(path: Array) -> Array:
-    """Points (COMPARED, d) at equal shares of a path's length."""
-    return even(path, COMPARED)
 
 
 def even(path: Array, count: int) -> Array:
