@@ -11,8 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.constraints.base import Constraint, innermost, whole
-from torchgco.constraints.norms import NO_ROW, NormBounds
-from torchgco.costs.base import add_blocks
+from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,8 @@ class Gates(Constraint):
         if not bool((normals.norm(dim=-1) > 0).all()):
             raise InputError("gates.normals", "vectors other than 0", normals.tolist())
         half = _sizes(self.half_widths, "gates.half_widths", dims, G)
-        squares = GateSquares(centers, _axes(normals), half, places, torch.tensor(at, device=centers.device))
-        return squares.bind(dims)
+        components = torch.tensor(at, device=centers.device)
+        return GateSquares(centers, _axes(normals), half, places, components=components).bind(dims)
 
 
 @dataclass(frozen=True)
@@ -109,14 +108,13 @@ class GateBalls(NormBounds):
 
 
 @dataclass(frozen=True)
-class GateSquares(Constraint):
+class GateSquares(Vectors):
     """Gates that are squares, bound: rows A p - b <= 0, per knot those before a plane, or beyond one."""
 
     centers: Tensor  # (B, G, d), m
     axes: Tensor  # (B, G, d, d): normal, then the directions of the sides, as rows
     half_widths: Tensor  # (B, G), m
     places: Tensor  # (B, G) int64: the knots before the planes
-    components: Tensor  # (d,) int64: the position's states
     slopes: Tensor | None = field(default=None, repr=False)  # (B, N, p, d), once bound
     limits: Tensor | None = field(default=None, repr=False)  # (B, N, p)
     knots: Any = None
@@ -152,17 +150,12 @@ class GateSquares(Constraint):
             self.slopes[at], self.limits[at] = rows, room + (rows @ self.centers.unsqueeze(-1))[..., 0]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        p = X[:, self.knots][..., self.components]
         assert self.slopes is not None and self.limits is not None
-        return (self.slopes * p.unsqueeze(-2)).sum(-1) - self.limits
+        return (self.slopes * self._vectors(X, U).unsqueeze(-2)).sum(-1) - self.limits
 
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        J = X.new_zeros(*g.shape, X.shape[-1])
+    def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
         assert self.slopes is not None
-        J[..., self.components] = self.slopes
-        add = H.new_zeros(*g.shape[:2], *H.shape[2:])
-        add_blocks(add, X.shape[-1], (g.unsqueeze(-2) @ J).squeeze(-2), None, J.mT @ (h.unsqueeze(-1) * J), None)
-        H[:, self.knots] += add
+        return self.slopes
 
 
 def _balls(at: list[int], centers: Tensor, radius: Tensor, places: Tensor, dims: Dimensions) -> GateBalls:

@@ -24,7 +24,7 @@ OF_ATTITUDE = "quaternion"
 
 
 @dataclass(frozen=True)
-class _Vectors(Constraint):
+class Vectors(Constraint):
     """A constraint on some components of the state, or of the control, at a knot."""
 
     components: Tensor | None = field(default=None, repr=False, kw_only=True)  # (c,) int64, once bound
@@ -50,7 +50,7 @@ class _Vectors(Constraint):
 
 
 @dataclass(frozen=True)
-class NormBounds(_Vectors):
+class NormBounds(Vectors):
     """lower <= |z - center| <= upper, with z some states or some controls of a knot.
 
         speed = NormBounds(("x", [3, 4, 5]), upper=5.0)  # m/s
@@ -112,12 +112,10 @@ class NormBounds(_Vectors):
     def _sides(self) -> list[tuple[float, Tensor, Tensor]]:
         """Of the upper and the lower bounds that there are: +-1, the bounds (B|1, K|1) or 1, where there are any."""
         sides = []
-        if self.upper is not None:
-            there = torch.isfinite(self.upper)
-            sides.append((1.0, torch.where(there, self.upper, 1.0), there.to(self.upper)))
-        if self.lower is not None:
-            there = self.lower > 0
-            sides.append((-1.0, torch.where(there, self.lower, 1.0), there.to(self.lower)))
+        for sign, bound in ((1.0, self.upper), (-1.0, self.lower)):
+            if bound is not None:
+                there = torch.isfinite(bound) & (bound > 0)
+                sides.append((sign, torch.where(there, bound, 1.0), there.to(bound)))
         return sides
 
     @property
@@ -162,7 +160,7 @@ class NormBounds(_Vectors):
 
 
 @dataclass(frozen=True)
-class Cone(_Vectors):
+class Cone(Vectors):
     """A vector stays within `angle` of an axis: |v| cos(angle) <= axis . v.
 
         tilt = Cone([0, 0, 1], math.radians(30), ("quaternion", range(6, 10)))  # the body's z axis
@@ -288,7 +286,7 @@ def within_norms(U: Tensor, constraints: Iterable[Constraint]) -> Tensor:
 
     Sizes move first, then directions: what had none, as a norm's lower bound has no slope there, takes the cone's.
     """
-    parts = [part for part in constraints if isinstance(part, _Vectors) and part.of == "u"]  # type: ignore[attr-defined]
+    parts = [part for part in constraints if isinstance(part, Vectors) and part.of == "u"]  # type: ignore[attr-defined]
     found = U.clone()
     for part in (part for part in parts if isinstance(part, NormBounds)):
         _put(found, part, part.moved_inside(found))
@@ -298,7 +296,7 @@ def within_norms(U: Tensor, constraints: Iterable[Constraint]) -> Tensor:
     return found
 
 
-def _put(U: Tensor, part: _Vectors, vectors: Tensor) -> None:
+def _put(U: Tensor, part: Vectors, vectors: Tensor) -> None:
     some = U[:, part.knots]  # type: ignore[attr-defined]
     some[..., part.components] = vectors
     U[:, part.knots] = some  # type: ignore[attr-defined]
