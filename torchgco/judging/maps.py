@@ -117,10 +117,7 @@ def _solids(field: DistanceField) -> list[Solid]:
     source = field.source
     if not isinstance(source, OccupancyGrid):
         return [Solid(points, 0.0, source.radius, _tree(points)) for points in source.clouds()]
-    cells = source.is_occupied
-    if field.unknown == "occupied":
-        cells = cells | source.is_unknown
-    each = cells if source.batch is not None else cells[None]
+    each = source.held(field.unknown)
     origins = np.broadcast_to(source.origin, (len(each), source.d))
     solids = []
     for one, origin in zip(each, origins, strict=True):

@@ -178,11 +178,7 @@ def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> Dista
         raise InputError("field.refine", "1 to 8 steps per cell", refine)
     _check_count([refine * size + 1 for size in grid.shape])
     spacing = grid.resolution / refine
-    cells = grid.is_occupied
-    if unknown == "occupied":
-        cells = cells | grid.is_unknown
-    each = cells if grid.batch is not None else cells[None]
-    values = np.stack([_signed_distances(one, refine, spacing) for one in each])
+    values = np.stack([_signed_distances(one, refine, spacing) for one in grid.held(unknown)])
     origin = np.broadcast_to(grid.origin, (len(values), grid.d)).copy()
     return DistanceField(values, origin, spacing, grid, unknown)
 

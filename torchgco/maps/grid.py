@@ -166,6 +166,11 @@ class OccupancyGrid:
         """Whether cells are unknown, of the shape of `occupied`."""
         return np.zeros(1, bool) & self.occupied if self.occupied.dtype == np.bool_ else np.isnan(self.occupied)
 
+    def held(self, unknown: str) -> np.ndarray:
+        """Which cells of each grid are occupied, (G, X, Y[, Z]) bool, and `unknown` ones where these are "occupied"."""
+        cells = self.is_occupied | self.is_unknown if unknown == "occupied" else self.is_occupied
+        return cells if self.batch is not None else cells[None]
+
     def single(self, which: int) -> OccupancyGrid:
         """The grid of one problem, which all share."""
         if self.batch is None:

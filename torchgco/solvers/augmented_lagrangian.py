@@ -291,8 +291,8 @@ class OuterLoop:
     def _begin_inner(self, running: Problem, s: State, rows: Tensor) -> None:
         """The next inner solve of `rows` of the running problems: L_M with its new multipliers and penalty."""
         s.regularisation[rows] = 0.0
-        penalty = None if s.penalty is None else take(s.penalty, rows)
-        lagrangian = Lagrangian(running.take(rows), take(s.multipliers, rows), penalty, self.rules.phr)
+        multipliers, penalty = take((s.multipliers, s.penalty), rows)
+        lagrangian = Lagrangian(running.take(rows), multipliers, penalty, self.rules.phr)
         s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
         s.inner[rows] = s.rung[rows] = 0
 

@@ -122,8 +122,8 @@ class Call:
         part = self.problem.take(index)
         if part is self.problem:
             return self
-        warm = None if self.warm is None else take(self.warm, index)
-        U0, ids, rows, outer, X0 = take((self.U0, self.ids, self.rows, self.outer, self.X0), index)
+        held = self.U0, self.ids, self.rows, self.outer, self.warm, self.X0
+        U0, ids, rows, outer, warm, X0 = take(held, index)
         return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline, X0)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -133,7 +133,8 @@ def _of_models(
         kept = _kept(state, model)
         if model.get("placement_frame"):
             source.refuse("models placed by their own frame", f"placement_frame {shown(model.get('placement_frame'))}")
-        if kept is not None and any(float(scale) != 1.0 for scale in _numbers(source, kept, "scale", 3, (1.0,) * 3)):
+        scaled = kept is not None and kept.find("scale") is not None
+        if kept is not None and scaled and any(scale != 1.0 for scale in _numbers(source, kept, "scale", 3)):
             source.refuse("models of the size in which they were saved", f"<scale> {shown(kept.findtext('scale'))}")
         at = _placed(source, model, frame, kept)
         fixed = static or (model.findtext("static") or "").strip().lower() in ("1", "true")
@@ -197,11 +198,7 @@ def _pose(source: Source, element: Element) -> Frame:
     return Frame(R, np.array([x, y, z]))
 
 
-def _numbers(
-    source: Source, element: Element, name: str, count: int, default: Sequence[float] | None = None
-) -> Sequence[float]:
-    if default is not None and element.find(name) is None:
-        return default
+def _numbers(source: Source, element: Element, name: str, count: int) -> list[float]:
     text = (element.findtext(name) or "").strip()
     try:
         found = [float(word) for word in text.split()]
