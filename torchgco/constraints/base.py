@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown, theirs, undefined
 from torchgco.base.mixing import foreign, why
 from torchgco.base.options import check_options
 from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
-from torchgco.base.tree import PerElement, is_users
+from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.costs.base import add_blocks
 
@@ -105,11 +105,8 @@ class WrappedConstraint(Constraint):
 
     constraint: Constraint
 
-    sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
-    geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
-    knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
-    bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
-    row_radii = property(lambda self: self.constraint.row_radii)  # type: ignore[assignment]
+    sense, geometric, knots = passed_on("constraint", "sense", "geometric", "knots")
+    bare, row_radii = passed_on("constraint", "bare", "row_radii")
     calls_function = property(lambda self: is_users(self.constraint))
 
     def grown(self, by: Tensor) -> Self:

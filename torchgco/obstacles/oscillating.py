@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
+from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ABSENT, TOUCH, OwnKind, least, picked
 from torchgco.obstacles.body import Body
@@ -77,11 +78,8 @@ class BoundOscillatingBoxes(OwnKind):
 
     batched: ClassVar[tuple[str, ...]] = ("boxes", "amplitudes", "rates", "phases")
 
-    absent = property(lambda self: self.boxes.absent)  # type: ignore[assignment]
-    vehicle_radius = property(lambda self: self.boxes.vehicle_radius)  # type: ignore[assignment]
-    position = property(lambda self: self.boxes.position)  # type: ignore[assignment]
-    margins = property(lambda self: self.boxes.margins)  # type: ignore[assignment]
-    sizes = property(lambda self: self.boxes.sizes)  # type: ignore[assignment]
+    absent, vehicle_radius, position = passed_on("boxes", "absent", "vehicle_radius", "position")
+    margins, sizes = passed_on("boxes", "margins", "sizes")
     moving = property(lambda self: bool((self.amplitudes != 0).any()))  # type: ignore[assignment]
 
     def places(self, t: Tensor) -> Tensor:
