@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,20 +32,12 @@ def _casadi() -> Any:
 
 def _elementwise(function: Scalar, inputs: int) -> Callable:
     """`function` of scalars, on arrays that are broadcast to one shape."""
-    over = functools.cache(lambda: np.frompyfunc(_function(function), inputs, 1))
+    of_scalars = lambda: getattr(_casadi(), function) if isinstance(function, str) else function
+    over = functools.cache(lambda: np.frompyfunc(of_scalars(), inputs, 1))
     return lambda *arrays: boxed(over()(*arrays))
 
 
-def _function(function: Scalar) -> Callable:
-    return getattr(_casadi(), function) if isinstance(function, str) else function
-
-
-def _unary(function: Scalar) -> Callable:
-    return _elementwise(function, 1)
-
-
-def _binary(function: Scalar) -> Callable:
-    return _elementwise(function, 2)
+_unary, _binary = (functools.partial(_elementwise, inputs=inputs) for inputs in (1, 2))
 
 
 def _choose(condition: Any, a: Any, b: Any) -> Any:
@@ -240,12 +232,11 @@ def _cross(a: np.ndarray, b: np.ndarray, dim: int = -1) -> np.ndarray:
     return np.cross(a, b, axis=dim)
 
 
-def _filled(value: float) -> Callable:
-    return lambda a, **_: np.full(a.shape, value, dtype=object)
+FILLED = {"zeros": 0.0, "ones": 1.0, "empty": 0.0}
 
 
-def _new(value: float) -> Callable:
-    return lambda a, size, **_: np.full(tuple(size), value, dtype=object)
+def _full(value: float, a: np.ndarray, size: Sequence[int] | None = None, **_: Any) -> np.ndarray:
+    return np.full(a.shape if size is None else tuple(size), value, dtype=object)
 
 
 def is_logical(element: Any) -> bool:
@@ -396,12 +387,8 @@ OPERATIONS: dict[str, Callable] = {
     "prims.convert_element_type": lambda a, dtype: a,
     "aten.copy": lambda a, source, *_: arrays.expand(source, a.shape),
     "aten.fill": lambda a, value: arrays.expand(boxed(value), a.shape),
-    "aten.zeros_like": _filled(0.0),
-    "aten.ones_like": _filled(1.0),
-    "aten.full_like": lambda a, value, **_: np.full(a.shape, value, dtype=object),
-    "aten.new_zeros": _new(0.0),
-    "aten.new_ones": _new(1.0),
-    "aten.new_full": lambda a, size, value, **_: np.full(tuple(size), value, dtype=object),
-    "aten.empty_like": _filled(0.0),
-    "aten.new_empty": _new(0.0),
+    **{f"aten.{name}_like": functools.partial(_full, value) for name, value in FILLED.items()},
+    "aten.full_like": lambda a, value, **_: _full(value, a),
+    **{f"aten.new_{name}": functools.partial(_full, value) for name, value in FILLED.items()},
+    "aten.new_full": lambda a, size, value, **_: _full(value, a, size),
 }
