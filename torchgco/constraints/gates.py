@@ -80,7 +80,7 @@ class Gates(Constraint):
 class GateBalls(NormBounds):
     """Gates that are balls, bound: at the other knots from 1 to N there is no bound."""
 
-    places: Tensor | None = field(default=None, kw_only=True)  # (B, G) int64: their knots
+    places: Tensor = field(kw_only=True)  # (B, G) int64: their knots
 
     # Never shared by all problems: a batch of one that is repeated has as many rows of each as any other.
     batched: ClassVar[tuple[str, ...]] = ("upper", "center", "places")
@@ -91,18 +91,15 @@ class GateBalls(NormBounds):
     @property
     def centers(self) -> Tensor:
         """(B, G, d), m."""
-        assert self.places is not None
         return self.center.gather(1, (self.places - 1).unsqueeze(-1).expand(-1, -1, self.center.shape[-1]))
 
     @property
     def sizes(self) -> Tensor:
         """Their radii (B, G), m."""
-        assert self.places is not None
         return self.upper.gather(1, self.places - 1)
 
     def write(self, centers: Tensor, sizes: Tensor) -> None:
         """Put other gates (B, G, d) of other radii (B, G) in the places of these, in this memory."""
-        assert self.places is not None
         self.center.scatter_(1, (self.places - 1).unsqueeze(-1).expand_as(centers), centers)
         self.upper.scatter_(1, self.places - 1, sizes)
 
@@ -115,8 +112,8 @@ class GateSquares(Vectors):
     axes: Tensor  # (B, G, d, d): normal, then the directions of the sides, as rows
     half_widths: Tensor  # (B, G), m
     places: Tensor  # (B, G) int64: the knots before the planes
-    slopes: Tensor | None = field(default=None, repr=False)  # (B, N, p, d), once bound
-    limits: Tensor | None = field(default=None, repr=False)  # (B, N, p)
+    slopes: Tensor = field(default=None, repr=False)  # type: ignore[assignment]  # (B, N, p, d), once bound
+    limits: Tensor = field(default=None, repr=False)  # type: ignore[assignment]  # (B, N, p)
     knots: Any = None
 
     batched: ClassVar[tuple[str, ...]] = ("centers", "axes", "half_widths", "places", "slopes", "limits")
@@ -137,7 +134,6 @@ class GateSquares(Vectors):
 
     def write(self, normals: Tensor | None = None) -> None:
         """Make the rows of the centres and half widths as they are, and of other normals (B, G, d), in this memory."""
-        assert self.slopes is not None and self.limits is not None
         if normals is not None:
             self.axes.copy_(_axes(normals))
         (B, G, _), p, half = self.centers.shape, self.slopes.shape[2], self.half_widths.unsqueeze(-1)
@@ -150,11 +146,9 @@ class GateSquares(Vectors):
             self.slopes[at], self.limits[at] = rows, room + (rows @ self.centers.unsqueeze(-1))[..., 0]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        assert self.slopes is not None and self.limits is not None
         return (self.slopes * self._vectors(X, U).unsqueeze(-2)).sum(-1) - self.limits
 
     def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
-        assert self.slopes is not None
         return self.slopes
 
 

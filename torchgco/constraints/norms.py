@@ -84,11 +84,10 @@ class NormBounds(Vectors):
         name = self.label
         kind, components = _chosen(self.of, self.components, ("x", "u"), dims, f"{name}.of")
         knots, K = _knots(self.knots, kind, dims, f"{name}.knots")
-        bounds = {}
-        for side in ("lower", "upper"):
-            given = getattr(self, side)
-            bounds[side] = None if given is None else _per_knot(given, f"{name}.{side}", dims, K)
-        lower, upper = bounds["lower"], bounds["upper"]
+        lower, upper = (
+            None if given is None else _per_knot(given, f"{name}.{side}", dims, K)
+            for side, given in (("lower", self.lower), ("upper", self.upper))
+        )
         if lower is not None and not bool((torch.isfinite(lower) & (lower >= 0)).all()):
             raise InputError(f"{name}.lower", "finite numbers of at least 0", lower.tolist())
         if upper is not None and not bool((upper > 0).all()):
@@ -100,9 +99,7 @@ class NormBounds(Vectors):
         upper = None if upper is None or not bool(torch.isfinite(upper).any()) else upper
         if lower is None and upper is None:
             raise InputError(name, "a lower bound above 0 or a finite upper bound", "neither")
-        center = self.center
-        if center is not None:
-            center = _points(center, f"{name}.center", dims, K, len(components))
+        center = None if self.center is None else _points(self.center, f"{name}.center", dims, K, len(components))
         return replace(self, of=kind, components=components, knots=knots, lower=lower, upper=upper, center=center)
 
     def _away(self, X: Tensor, U: Tensor) -> Tensor:
@@ -210,11 +207,9 @@ class Cone(Vectors):
         angle = _per_knot(self.angle, "cone.angle", dims, K)
         if not bool(((angle > 0) & (angle < math.pi)).all()):
             raise InputError("cone.angle", "angles in rad, above 0 and below pi", angle.tolist())
-        apex = self.apex
-        if apex is not None and attitude:
-            raise InputError("cone.apex", "none for a quaternion", shown(apex))
-        if apex is not None:
-            apex = _points(apex, "cone.apex", dims, K, d)
+        if self.apex is not None and attitude:
+            raise InputError("cone.apex", "none for a quaternion", shown(self.apex))
+        apex = None if self.apex is None else _points(self.apex, "cone.apex", dims, K, d)
         return replace(
             self, axis=axis, angle=angle, of=kind, components=components, knots=knots, apex=apex,
             attitude=attitude,
