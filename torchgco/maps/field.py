@@ -72,9 +72,8 @@ class Field(Constraint):
             raise InputError("field.field", f"one map for all, or {dims.B} maps", field.batch)
         vehicle = vehicle_radii(self.vehicle_radius, "field.vehicle_radius", dims)
         knots = resolve_knots(self.knots, dims.N, "field.knots", like.device, dims.obstacles_from)
-        which = torch.zeros(dims.B, dtype=torch.int64, device=like.device)
-        if field.batch is not None:
-            which = torch.arange(dims.B, device=like.device)
+        every = torch.arange(dims.B, device=like.device)
+        which = torch.zeros_like(every) if field.batch is None else every
         origins = torch.as_tensor(field.origin, dtype=like.dtype, device=like.device)[which]
         empty = torch.as_tensor(field.values.reshape(len(field.values), -1).min(-1) >= ALL_FREE, device=like.device)
         absent = empty[which].unsqueeze(-1)

@@ -77,9 +77,7 @@ class Boxes(Constraint):
             expected = "finite half sides above 0 m; 0 m too where the box is rounded"
             raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
         axes = _axes(self.rotations, absent, d, dims)
-        vehicle = vehicle_radii(self.vehicle_radius, "boxes.vehicle_radius", dims)
-        knots = resolve_knots(self.knots, dims.N, "boxes.knots", half.device, dims.obstacles_from)
-        return BoundBoxes.prepare(centers, half, axes, absent, radii, vehicle, knots, dims)
+        return BoundBoxes.prepare(self, "boxes", dims, centers, half, axes, absent, radii)
 
 
 @dataclass(frozen=True)
@@ -105,21 +103,23 @@ class BoundBoxes(OwnKind):
     @classmethod
     def prepare(
         cls,
+        given: Any,
+        name: str,
+        dims: Dimensions,
         centers: Tensor,
         half_sizes: Tensor,
         axes: Tensor,
         absent: Tensor,
         radii: Tensor,
-        vehicle_radius: Tensor,
-        knots: Any,
-        dims: Dimensions,
     ) -> BoundBoxes:
-        """Boxes of checked numbers (B, ...), whatever those of absent boxes are."""
+        """Boxes of checked numbers (B, ...), whatever those of absent boxes are, with radius and knots as `given`."""
         assert dims.position is not None
+        vehicle = vehicle_radii(given.vehicle_radius, f"{name}.vehicle_radius", dims)
+        knots = resolve_knots(given.knots, dims.N, f"{name}.knots", centers.device, dims.obstacles_from)
         centers, half = (torch.where(absent.unsqueeze(-1), 0.0, part) for part in (centers, half_sizes))
-        inflated = torch.where(absent, 0.0, radii + vehicle_radius.unsqueeze(-1))
+        inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
         depths = inflated + half.amin(-1)
-        return cls(centers, half, axes, absent, vehicle_radius, inflated, depths, knots, dims.position, dims.dt or 0.0)
+        return cls(centers, half, axes, absent, vehicle, inflated, depths, knots, dims.position, dims.dt or 0.0)
 
     @property
     def margins(self) -> Tensor:

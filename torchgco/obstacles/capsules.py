@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
-from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.constraints.base import Constraint
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import from_quaternions
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.inputs import dimension, own_radii, points, vehicle_radii
+from torchgco.obstacles.inputs import dimension, own_radii, points
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,7 @@ class Capsules(Constraint):
         if bool((radii[~absent] == 0).any()):
             raise InputError("capsules.radii", "radii above 0 m", 0.0)
         half, axes = _single_side(ends - starts, absent)
-        vehicle = vehicle_radii(self.vehicle_radius, "capsules.vehicle_radius", dims)
-        knots = resolve_knots(self.knots, dims.N, "capsules.knots", starts.device, dims.obstacles_from)
-        return BoundBoxes.prepare(0.5 * (starts + ends), half, axes, absent, radii, vehicle, knots, dims)
+        return BoundBoxes.prepare(self, "capsules", dims, 0.5 * (starts + ends), half, axes, absent, radii)
 
 
 def _single_side(along: Tensor, absent: Tensor) -> tuple[Tensor, Tensor]:

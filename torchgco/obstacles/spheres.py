@@ -16,7 +16,6 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, space_of
 from torchgco.constraints.base import Constraint, add_at, resolve_knots
-from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.obstacles.base import TOUCH, OwnKind, Solids, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, per_problem, points, vehicle_radii

@@ -114,9 +114,7 @@ class AugmentedLagrangian(Solver):
             by_arrival: an iterate that has arrived at a stated goal is preferred to any that hasn't.
         """
         loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
-        B = call.problem.B
-        every = torch.arange(B, device=call.rows.device)
-        run_all(loop, every, max(1, B if self.slots is None else self.slots))
+        run_all(loop, max(1, self.slots or call.problem.B))
         return loop.result
 
 
@@ -362,14 +360,14 @@ class OuterLoop:
             self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, now))
 
 
-def run_all(work: OuterLoop, rows: Tensor, slots: int) -> None:
-    """Run the problems `rows` to their end, at most `slots` at a time.
+def run_all(work: OuterLoop, slots: int) -> None:
+    """Run all problems of a call to their end, at most `slots` at a time.
 
     Nested loops would wait for the slowest problem of the batch at three levels. Here every problem is at its own place
     in the loops. A problem that ends frees its slot for a waiting one; if none waits, the running batch shrinks.
     """
-    waiting = rows[slots:]
-    state, status = work.begin(rows[:slots])
+    first, waiting = torch.arange(work.call.problem.B, device=work.call.rows.device).tensor_split([slots])
+    state, status = work.begin(first)
     work.regroup(state.rows)
     running, waiting = _replaced(work, state, status, waiting)
     passes = 0
