@@ -169,6 +169,12 @@ def check_shape(value: Tensor, shape: tuple[int | str, ...], field: str) -> None
         raise InputError(field, f"shape ({', '.join(map(str, shape))})", tuple(value.shape))
 
 
+def check_finite(value: Tensor, field: str, expected: str = "finite numbers") -> None:
+    """Raise InputError where a number isn't finite."""
+    if not bool(torch.isfinite(value).all()):
+        raise InputError(field, expected, "NaN or infinity")
+
+
 def lead(parameter: Tensor | float, component: Tensor) -> Tensor | float:
     """A model parameter shaped to multiply a component (B, ...) of states with leading batch axis.
 

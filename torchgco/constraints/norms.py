@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, tensor
+from torchgco.base.shapes import Dimensions, check_finite, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
@@ -343,6 +343,5 @@ def _points(value: Any, field: str, dims: Dimensions, K: int, size: int) -> Tens
     if not fits:
         expected = f"shape ({size},), ({dims.B}, {size}), or per knot ({dims.B} or 1, {K}, {size})"
         raise InputError(field, expected, tuple(given.shape))
-    if not bool(torch.isfinite(found).all()):
-        raise InputError(field, "finite numbers", "NaN or infinity")
+    check_finite(found, field)
     return found

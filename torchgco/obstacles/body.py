@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement, passed_on
 from torchgco.constraints.base import CONTACT_FACTOR, TOUCH
 from torchgco.obstacles.attitude import Attitude, attitude_of
@@ -64,8 +64,7 @@ class Body:
         if radii.dim() == 0:
             radii = radii.expand(len(offsets))
         check_shape(radii, (len(offsets),), "body.radii")
-        if not bool(torch.isfinite(offsets).all()):
-            raise InputError("body.offsets", "finite numbers", "NaN or infinity")
+        check_finite(offsets, "body.offsets")
         if not bool(((radii >= 0) & torch.isfinite(radii)).all()):
             raise InputError("body.radii", "finite radii of at least 0 m", radii.tolist())
         if self.attitude not in ("heading", "quaternion") and not callable(self.attitude):

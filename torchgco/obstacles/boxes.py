@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape
+from torchgco.base.shapes import Dimensions, check_finite, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.obstacles.attitude import in_plane
@@ -202,6 +202,5 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
             raise InputError("boxes.rotations", "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
         axes = from_quaternions(turns / length)
     axes = torch.where(absent[..., None, None], straight, axes)
-    if not bool(torch.isfinite(axes).all()):
-        raise InputError("boxes.rotations", "finite numbers for every box that is there", "NaN or infinity")
+    check_finite(axes, "boxes.rotations", "finite numbers for every box that is there")
     return axes.contiguous()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape
+from torchgco.base.shapes import Dimensions, check_finite, check_shape
 from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ABSENT, TOUCH, OwnKind, least, picked
@@ -56,8 +56,7 @@ class OscillatingBoxes(Constraint):
             check_shape(part, (B, M, part.shape[2], d), f"boxes.{name}")
             check_shape(part, tuple(sines[0].shape) if sines else tuple(part.shape), f"boxes.{name}")
             part = torch.where(boxes.absent[..., None, None], 0.0, part)
-            if not bool(torch.isfinite(part).all()):
-                raise InputError(f"boxes.{name}", "finite numbers for every box that is there", "NaN or infinity")
+            check_finite(part, f"boxes.{name}", "finite numbers for every box that is there")
             sines.append(part)
         if M == 0:
             return boxes  # none of them moves: what is asked of moving obstacles alone isn't asked of none

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape, space_of
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of
 from torchgco.constraints.base import Constraint, add_at, resolve_knots
 from torchgco.obstacles.base import TOUCH, OwnKind, Solids, least, picked
 from torchgco.obstacles.body import Body
@@ -59,8 +59,7 @@ class Spheres(Constraint):
             velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
             check_shape(velocities, tuple(centers.shape), "obstacles.velocities")
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
-            if not bool(torch.isfinite(velocities).all()):
-                raise InputError("obstacles.velocities", "finite velocities of every sphere", "NaN or infinity")
+            check_finite(velocities, "obstacles.velocities", "finite velocities of every sphere")
             if dims.dt is None:
                 raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
         if centers.shape[1] == 0:

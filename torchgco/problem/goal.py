@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.norms import NormBounds
@@ -62,8 +62,7 @@ class Goal(PerElement):
         position = tensor(self.position, "goal.position", dims.like)
         position = position.expand(dims.B, -1) if position.dim() == 1 else position
         check_shape(position, (dims.B, d), "goal.position")
-        if not bool(torch.isfinite(position).all()):
-            raise InputError("goal.position", "finite numbers", "NaN or infinity")
+        check_finite(position, "goal.position")
         return Goal(position.contiguous(), self._bound_radius(dims), self.required)
 
     def _bound_radius(self, dims: Dimensions) -> Tensor:
