@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
 from torchgco.constraints.base import Constraint, innermost, whole
 from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
 
@@ -176,9 +176,7 @@ def _axes(normals: Tensor) -> Tensor:
 
 def _each(value: Any, name: str, dims: Dimensions, size: tuple[int, ...], G: int | None = None) -> Tensor:
     """Vectors (B, G, d): given so, or as (G, d) for all problems."""
-    found = tensor(value, name, dims.like)
-    found = found.expand(dims.B, *found.shape) if found.dim() == 2 else found
-    check_shape(found, (dims.B, "G" if G is None else G, *size), name)
+    found = per_row(value, name, dims, "G" if G is None else G, *size)
     if found.shape[1] == 0 or not bool(torch.isfinite(found).all()):
         raise InputError(name, "one gate at least, of finite numbers", found.tolist())
     return found.contiguous()
