@@ -145,9 +145,8 @@ def _certified(
 
 def frame_columns(certificate: Certificate) -> dict[str, Any]:
     """The certificate as arrays, by the names of a study's columns."""
-    names = {"clearance": "clearance_full"}
     parts = vars(certificate).items()
-    return {names.get(name, name): value.cpu().numpy() for name, value in parts}
+    return {"clearance_full" if name == "clearance" else name: value.cpu().numpy() for name, value in parts}
 
 
 # One problem: every tensor below has a batch of one ---------------------------------------------------------------

@@ -199,7 +199,10 @@ def paths(
     ways = ways_of(lattice, ends, price, radius, CLOSE_UNITS * unit)
     if ways is None:
         return []
-    found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
+    if lattice.d == 2:  # the cheapest way of each homotopy class
+        found = [ways.taut(v) for v in itertools.islice(one_of_each_class(ways).values(), count)]
+    else:
+        found = _in_space(ways, count, unit)
     return [path for path in found if len(path) <= corners]
 
 
@@ -216,11 +219,6 @@ def ways_of(lattice: Lattice, ends: Array, price: Price, radius: float, margin: 
         if np.isfinite(ways.total).any():
             return ways
     return None
-
-
-def _in_the_plane(ways: Ways, count: int) -> list[Array]:
-    """The cheapest way of each homotopy class, drawn taut."""
-    return [ways.taut(v) for v in itertools.islice(one_of_each_class(ways).values(), count)]
 
 
 def one_of_each_class(ways: Ways) -> dict[int, int]:

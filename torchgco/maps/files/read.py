@@ -170,9 +170,8 @@ def _find(path: Any, field: str) -> tuple[Source, Format]:
         raise InputError(f"{field}.path", "the path of a map", shown(path))
     source = Source(Path(os.path.expanduser(path)), field)
     ending = source.path.suffix.lower()
-    if ending not in FORMATS and (source.path / METADATA).is_file():
-        return source, BAG
-    if ending not in FORMATS:
+    format = FORMATS.get(ending) or (BAG if (source.path / METADATA).is_file() else None)
+    if format is None:
         expected = CONVERTED.get(ending, f"a file that ends with {', '.join(FORMATS)}")
         raise InputError(f"{field}.path", expected, path)
-    return source, FORMATS[ending]
+    return source, format
