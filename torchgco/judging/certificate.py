@@ -218,15 +218,6 @@ def _oscillating_chords(swings: BoundOscillatingBoxes, X: Tensor) -> Tensor:
     return (oscillating_distances(swings, X[None, :, swings.position])[1] - radii)[0]
 
 
-def _field_chords(field: BoundField, X: Tensor) -> Tensor:
-    return segment_distances(field, X[None, :, field.position])[0].unsqueeze(-1) - field.vehicle_radius
-
-
-def _body_chords(body: BoundBody, X: Tensor) -> Tensor:
-    """Less what the balls leave their chords by where the vehicle turns evenly from knot to knot."""
-    return _ball_chords(body, X, body.points.bulge(X.unsqueeze(0))[0])
-
-
 def _ball_chords(body: BoundBody, X: Tensor, bulge: Tensor) -> Tensor:
     """Distances (N, P M) of the chords of all balls, less `bulge` (N, P)."""
     centers, found = body.points.at(X.unsqueeze(0))[0], []
@@ -242,8 +233,9 @@ CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     SpheresInFreeTime: lambda part, X: _sphere_chords(part.along(X.unsqueeze(0)), X),
     BoundBoxes: _box_chords,
     BoundOscillatingBoxes: _oscillating_chords,
-    BoundField: _field_chords,
-    BoundBody: _body_chords,
+    BoundField: lambda map, X: segment_distances(map, X[None, :, map.position])[0].unsqueeze(-1) - map.vehicle_radius,
+    # Less what the balls leave their chords by where the vehicle turns evenly from knot to knot.
+    BoundBody: lambda body, X: _ball_chords(body, X, body.points.bulge(X.unsqueeze(0))[0]),
 }
 
 

@@ -64,16 +64,13 @@ class Spheres(Constraint):
                 raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
         if centers.shape[1] == 0:
             velocities = None  # none of them moves: what is asked of moving obstacles alone isn't asked of none
-        return BoundSpheres.prepare(
-            torch.where(absent.unsqueeze(-1), 0.0, centers),
-            torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1)),
-            velocities,
-            absent,
-            vehicle,
+        centers = torch.where(absent.unsqueeze(-1), 0.0, centers)
+        inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
+        knots, dt = (
             resolve_knots(self.knots, dims.N, "obstacles.knots", radii.device, dims.obstacles_from),
-            dims.position,
             dims.dt or 0.0,
         )
+        return BoundSpheres.prepare(centers, inflated, velocities, absent, vehicle, knots, dims.position, dt)
 
 
 @dataclass(frozen=True)

@@ -57,9 +57,8 @@ def read_pcd(source: Source) -> np.ndarray:
         if len(points) != header.points:
             source.refuse(f"{header.points:,} points", f"{len(points):,}")
         return finite_points(source, points)
-    if header.data == "binary":
-        return finite_points(source, _binary(cursor, header, wanted))
-    return finite_points(source, _compressed(cursor, header, wanted))
+    read = _binary if header.data == "binary" else _compressed
+    return finite_points(source, read(cursor, header, wanted))
 
 
 def _header(source: Source, raw: bytes) -> Header:

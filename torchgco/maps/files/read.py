@@ -61,7 +61,7 @@ def _read_image(
 
 def _read_octomap(source: Source, layer: tuple[float, float] | None, box: Box | None) -> OccupancyGrid:
     """What `layer` and `box` leave of a tree, which may be larger than a grid can be."""
-    box = Box.everything(3) if box is None else box.of(source, 3)
+    box = Box(np.full(3, -np.inf), np.full(3, np.inf)) if box is None else box.of(source, 3)
     return read_octomap(source, box if layer is None else box.between(*layer))
 
 
