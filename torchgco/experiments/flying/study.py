@@ -54,7 +54,6 @@ def run_study(
     folder: Path,
     recompose: Recompose,
     accepted: Callable[[], None] = lambda: None,
-    show: Callable[[str], None] = say,
     command: Sequence[str] = (),
     collect: bool = False,
 ) -> bool:
@@ -81,31 +80,31 @@ def run_study(
         accepted()
         with recorded(folder, study.setup, study.plan, command) as ending:
             if study.plan.job is not None:
-                _fly_share(study, store, show)
+                _fly_share(study, store)
                 ending.append("share flown")
                 return False
-            _fly_and_report(study, store, show, collect)
+            _fly_and_report(study, store, collect)
             return True
 
 
-def _fly_share(study: _Study, store: StudyFolder, show: Callable[[str], None]) -> None:
+def _fly_share(study: _Study, store: StudyFolder) -> None:
     """Fly the share of a job, and leave the tables to the process that finishes the study."""
     name = f"Job {study.plan.job} of {study.plan.jobs}"
     if store.finished(study.layouts):
-        show(f"{name}: already done in {store.path}")
+        say(f"{name}: already done in {store.path}")
         return
     missing = {solver: study.plan.share(store.missing(solver), study.layouts.count) for solver in study.solvers}
     _fly(study, store, missing, name)
     if (store.path / DONE).is_file():  # another process flew the rest, and this share, meanwhile
         store.drop_shards()
-    show(f"{name}: {sum(map(len, missing.values()))} trials flown in {store.path}")
+    say(f"{name}: {sum(map(len, missing.values()))} trials flown in {store.path}")
 
 
-def _fly_and_report(study: _Study, store: StudyFolder, show: Callable[[str], None], collect: bool) -> None:
+def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
     folder = store.path
     if store.finished(study.layouts):
-        show(f"Already done in {folder}: nothing was flown again.\n")
-        _update_success(study, store, show)
+        say(f"Already done in {folder}: nothing was flown again.\n")
+        _update_success(study, store)
     else:
         missing = {name: store.missing(name) for name in study.solvers}
         count, left = study.layouts.count * len(study.solvers), sum(map(len, missing.values()))
@@ -113,21 +112,21 @@ def _fly_and_report(study: _Study, store: StudyFolder, show: Callable[[str], Non
             told = f"{left} of {count} trials missing in {folder} (the same command flies them)"
             raise InputError("study.jobs", "a share from every job", told)
         if left < count and not collect:
-            show(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
+            say(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
         _fly(study, store, missing, study.setup.solver_name)
         flown = [store.flown(name) for name in study.solvers]
         rows = pd.concat([rows for rows, _ in flown], ignore_index=True)
         _finish(study, store, rows, np.stack([U for _, U in flown]))
-    show(_report(study, folder))
+    say(_report(study, folder))
     store.close()
     trials = store.table()
     if study.plan.explain:
-        show(explained(study.setup, study.layouts, trials))
+        say(explained(study.setup, study.layouts, trials))
     elif study.setup.mission is None and (told := advised(study.setup, study.layouts, trials)):
-        show(told)
-    show(f"\nTable, arrays and figures: {folder}")
+        say(told)
+    say(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
-        show(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
+        say(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
     if (trials["status"] == Status.INVALID_START.name).all():
         raise InputError("scenario", where_to_start(study.setup, study.layouts), "none")
 
@@ -281,13 +280,13 @@ def _fly_side_by_side(
     )
 
 
-def _update_success(study: _Study, store: StudyFolder, show: Callable[[str], None]) -> None:
+def _update_success(study: _Study, store: StudyFolder) -> None:
     """Judge the rows of a finished study again where the best costs of its layouts have changed since."""
     trials = store.table()
     new = with_success(trials.assign(sound=sound(trials)), study.layouts, study.rivals)
     if not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object)):
         store.replace(new, study.layouts)
-        show("The best costs of the layouts have changed: best_cost and success were computed again.\n")
+        say("The best costs of the layouts have changed: best_cost and success were computed again.\n")
 
 
 def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

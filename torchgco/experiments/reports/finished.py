@@ -20,12 +20,13 @@ from torchgco.experiments.results.folder import (
     MANIFEST,
     MISSION,
     SOLUTIONS,
+    TIME_STEPS,
     TRIALS,
     read_manifest,
     read_trials,
 )
 from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
@@ -90,6 +91,12 @@ class Study:
     def log(self) -> pd.DataFrame:
         """The control steps of its missions; InputError where the file is damaged, or takes more than it may."""
         return readable(self.folder / MISSION, partial(read_log, trust=self.trust))
+
+    @property
+    def time_steps(self) -> pd.DataFrame | None:
+        """The time steps of its plant, of few missions; None where it kept none. InputError as `log`."""
+        path = self.folder / TIME_STEPS
+        return readable(path, partial(read_table, trust=self.trust)) if path.is_file() else None
 
     @property
     def missions(self) -> bool:
