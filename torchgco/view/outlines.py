@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchgco.constraints.gates import GateSquares, gates_of
+from torchgco.plotting.gates import outlines
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import number
 
@@ -13,17 +13,13 @@ CORNERS = 32  # of a ring
 
 def outlines_of(problem: Problem, b: int) -> list[list[list[float | None]]]:
     """Closed lines, each a list of corners (d,), m, of the gates of problem b in their order."""
-    gates = gates_of(problem)
-    if gates is None:
-        return []
-    centers, sizes = (part[b].detach().cpu().double().numpy() for part in (gates.centers, gates.sizes))
-    if isinstance(gates, GateSquares):
-        found = [_square(*one) for one in zip(centers, sizes, gates.axes[b].cpu().double().numpy(), strict=True)]
-    else:
-        start = problem.x0[b, problem.position].detach().cpu().double().numpy()
-        end = centers[-1] if problem.goal is None else problem.goal.position[b].detach().cpu().double().numpy()
-        stops = np.concatenate((start[None], centers, end[None]))
-        found = [_ring(*one) for one in zip(centers, sizes, stops[2:] - stops[:-2], strict=True)]
+    gates = outlines(problem, b)
+    start = problem.x0[b, problem.position].detach().cpu().double().numpy()
+    centers = [corners.mean(axis=0) for corners, _ in gates]
+    ends = centers[-1:] if problem.goal is None else [problem.goal.position[b].detach().cpu().double().numpy()]
+    ways = [after - before for before, after in zip([start, *centers], [*centers[1:], *ends], strict=False)]
+    rows = zip(gates, centers, ways, strict=True)
+    found = [_ring(center, radius, way) if radius > 0 else corners for (corners, radius), center, way in rows]
     return [[[number(value) for value in corner] for corner in outline] for outline in found]
 
 
@@ -37,10 +33,3 @@ def _ring(center: np.ndarray, radius: float, along: np.ndarray) -> np.ndarray:
     side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     side /= np.linalg.norm(side)
     return center + radius * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(normal, side))
-
-
-def _square(center: np.ndarray, half: float, axes: np.ndarray) -> np.ndarray:
-    """Corners (V, d) of a square whose sides are the rows of axes (d, d) after the first; in the plane both ends."""
-    if len(center) == 2:
-        return center + half * np.array([[-1.0], [1.0]]) * axes[1]
-    return center + half * (np.array([[-1.0, -1], [-1, 1], [1, 1], [1, -1]]) @ axes[1:])
