@@ -18,7 +18,7 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
-from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
+from torchgco.experiments.flying.flight import Batch, Flight, Plan, fly, plan_of, prepare
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionFlight
 from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
 from torchgco.experiments.flying.workers import Shared, run_all
@@ -243,7 +243,7 @@ def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
     return batches
 
 
-def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | MissionFlight:
+def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Batch:
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
     layouts, solver = study.layouts.take(ids), study.solvers[name]
     if study.setup.mission is None:

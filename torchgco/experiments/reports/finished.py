@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +76,7 @@ class Study:
         Raises:
             InputError: the file is damaged, takes more than it may, or has other solvers or layouts.
         """
-        held = readable(self.folder / name, partial(read_npz, trust=self.trust))
+        held = readable(self.folder / name, read_npz, trust=self.trust)
         solvers, ids = list(self.manifest.solvers), self.layouts.ids
         named = {"solver", "layout", part} <= held.keys() and held["solver"].tolist() == solvers
         if not named or not np.array_equal(held["layout"], ids):
@@ -90,13 +89,13 @@ class Study:
     @property
     def log(self) -> pd.DataFrame:
         """The control steps of its missions; InputError where the file is damaged, or takes more than it may."""
-        return readable(self.folder / MISSION, partial(read_log, trust=self.trust))
+        return readable(self.folder / MISSION, read_log, trust=self.trust)
 
     @property
     def time_steps(self) -> pd.DataFrame | None:
         """The time steps of its plant, of few missions; None where it kept none. InputError as `log`."""
         path = self.folder / TIME_STEPS
-        return readable(path, partial(read_table, trust=self.trust)) if path.is_file() else None
+        return readable(path, read_table, trust=self.trust) if path.is_file() else None
 
     @property
     def missions(self) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +58,7 @@ def missions(folder: Path, trust: bool = False) -> Recorded:
     path = folder / TIME_STEPS
     if not path.is_file():
         raise InputError("--run", f"a study of at most four missions, with {TIME_STEPS}", folder)
-    return *readable(path, partial(_logged, trust=trust)), airframe_of(study.vehicle.dynamics)
+    return *readable(path, _logged, trust=trust), airframe_of(study.vehicle.dynamics)
 
 
 def _logged(path: Path, trust: bool) -> tuple[Tensor, Tensor, float]:

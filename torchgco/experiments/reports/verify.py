@@ -123,8 +123,8 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
     manifest = read_manifest(folder / MANIFEST, whole=True)
     missions = manifest.configuration.get("mission") is not None
-    layouts = readable(folder / LAYOUTS, partial(read_layouts, trust=trust))
-    held = readable(folder / TRIALS, partial(read_table, trust=trust))
+    layouts = readable(folder / LAYOUTS, read_layouts, trust=trust)
+    held = readable(folder / TRIALS, read_table, trust=trust)
     rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=TRIAL)
     if not set(TRIAL) <= set(held.columns) or not held.set_index(TRIAL).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
@@ -183,7 +183,7 @@ def _trajectories(
     trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
 ) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
-    arrays = readable(folder / SOLUTIONS, partial(read_npz, trust=trust))
+    arrays = readable(folder / SOLUTIONS, read_npz, trust=trust)
     names, place = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
     parts = []
     for name in manifest.solvers:
@@ -210,7 +210,7 @@ def _missions(
     The log has the plant's state at the start of every control step, and a flight is judged at all time steps: the
     outcome itself, and what belongs to the end of a flight, can't be confirmed.
     """
-    log = readable(folder / MISSION, partial(read_log, trust=trust))
+    log = readable(folder / MISSION, read_log, trust=trust)
     log["shifted"] = log["source"] == "shifted"
     problem = vehicle.task(layouts).problem
     contact, period = Contact.among(problem), float(problem.dynamics.dt)
