@@ -14,11 +14,11 @@ from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
-from torchgco.view.flights import Flight
+from torchgco.view.flights import Flight, constraint_name
 from torchgco.view.outlines import outlines_of
 from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
-from torchgco.view.vehicles import Look, Shape
+from torchgco.view.vehicles import Look, Shape, shape_of
 
 SHARED_FROM = 500  # obstacles of one kind from which on layouts with the same ones share them
 
@@ -54,6 +54,15 @@ class Document:
     labels: list[dict[str, Any]] = field(default_factory=list)
     parts: list[str] = field(default_factory=list)
     maps: dict[bytes, str] = field(default_factory=dict)  # parts that layouts share, by what they hold
+
+    @classmethod
+    def of(cls, problem: Problem, radius: float = 0.0, **given: Any) -> Document:
+        """The page of a batch of problems, whose vehicle has a `radius`, m, where there are no obstacles."""
+        shape, at = shape_of(problem), problem.position
+        radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=radius)
+        names = [constraint_name(part) for part in problem.constraints]
+        size = {"radius": radius if shape is None else shape.reach, "shape": shape}
+        return cls(dimension=at.stop - at.start, constraints=names, **size, **given)  # type: ignore[arg-type]
 
     def add(
         self,

@@ -30,8 +30,7 @@ from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
 from torchgco.view.document import Document
-from torchgco.view.flights import constraint_name
-from torchgco.view.vehicles import Look, shape_of
+from torchgco.view.vehicles import Look
 
 MEASURED_AT_ONCE = 64  # layouts whose trajectories are measured at once
 
@@ -131,15 +130,10 @@ class Study:
 
 def document_of(study: Study, problem: Problem, look: Look) -> Document:
     """The page of a study in the making, from the problems of some of its layouts."""
-    solvers, at = list(study.manifest.solvers), problem.position
-    shape = shape_of(problem)
-    radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=study.vehicle.radius)
+    solvers, dt = list(study.manifest.solvers), problem.dynamics.dt
     count = f"{study.layouts.count} layouts" if study.layouts.count > 1 else "1 layout"
-    return Document(
-        title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
-        about=f"{count}, {study.vehicle.name}, seed {study.seed}, {problem.N} stages of "
-        f"{problem.dynamics.dt:g} s",
-        dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, solvers=solvers,
-        radius=radius if shape is None else shape.reach, shape=shape,
-        constraints=[constraint_name(part) for part in problem.constraints], mission=study.missions,
+    return Document.of(
+        problem, study.vehicle.radius, title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
+        about=f"{count}, {study.vehicle.name}, seed {study.seed}, {problem.N} stages of {dt:g} s",
+        dt=float(dt), look=look, solvers=solvers, mission=study.missions,
     )  # fmt: skip

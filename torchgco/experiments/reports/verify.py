@@ -36,6 +36,7 @@ from torchgco.experiments.results.folder import (
 from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
 from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
+from torchgco.experiments.results.runs import below
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.judging.judge import frame_columns, gates_passed, judge
@@ -108,14 +109,11 @@ def verify(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> tu
             have one row per solver and layout, a study of an older version, a class that `trust` alone admits.
     """
     given = [Path(folder) for folder in folders]
-    for folder in given:
-        if not folder.is_dir():
-            raise InputError("folders", "an existing folder", folder)
-    studies = {path.parent.resolve(): path.parent for folder in given for path in sorted(folder.rglob(MANIFEST))}
-    done = [folder for folder in studies.values() if (folder / DONE).is_file()]
+    studies = below(given, MANIFEST).values()
+    done = [folder for folder in studies if (folder / DONE).is_file()]
     if not done:
         raise InputError("folders", "a finished study in or below them", ", ".join(map(str, given)))
-    unfinished = [str(folder) for folder in studies.values() if folder not in done]
+    unfinished = [str(folder) for folder in studies if folder not in done]
     return [verify_study(folder, trust) for folder in done], unfinished
 
 
