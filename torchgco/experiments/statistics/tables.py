@@ -155,14 +155,15 @@ EFFORT_COLUMNS = (
 PAPER_COLUMNS = ("n", "cost ratio", "iter.", "seconds")  # of them, in a paper's table
 
 
-def _measured(row: pd.Series, median: str, p90: str | None, form: str) -> str:
+def _measured(row: pd.Series, _: str, median: str, p90: str | None, form: str) -> str:
+    """A cell of one of EFFORT_COLUMNS."""
     cells = ["-" if pd.isna(row[name]) else f"{row[name]:{form}}" for name in (median, p90) if name is not None]
     return cells[0] if len(cells) == 1 or cells[0] == "-" else f"{cells[0]} ({cells[1]})"
 
 
 def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
     heads = [header for header, *_ in EFFORT_COLUMNS]
-    return per_solver(task, swept, heads, lambda row: [_measured(row, *how) for _, *how in EFFORT_COLUMNS])
+    return per_solver(task, swept, heads, lambda row: [_measured(row, *how) for how in EFFORT_COLUMNS])
 
 
 def _statuses(task: pd.DataFrame, swept: Sequence[str]) -> str:
@@ -203,11 +204,11 @@ def _pair(row: pd.Series) -> list[str]:
 
 def printed(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
     """The tables that a paper prints: rates and effort, and comparisons where there are any."""
-    columns = [(header, how) for header, *how in EFFORT_COLUMNS if header in PAPER_COLUMNS]
-    heads = [*OUTCOMES, *(header for header, _ in columns)]
+    columns = [how for how in EFFORT_COLUMNS if how[0] in PAPER_COLUMNS]
+    heads = [*OUTCOMES, *(header for header, *_ in columns)]
     rates = printed_rows(
         summary, heads,
-        lambda row: [*(rate(row, name) for name in OUTCOMES), *(_measured(row, *how) for _, how in columns)],
+        lambda row: [*(rate(row, name) for name in OUTCOMES), *(_measured(row, *how) for how in columns)],
     )  # fmt: skip
     return [rates, *([printed_pairs(paired)] if (paired["n"] > 0).any() else [])]
 
