@@ -235,12 +235,8 @@ def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
 
 def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
     """The ids in batches of at most `size` that follow each other without a gap."""
-    batches: list[list[int]] = []
-    for number in ids:
-        if not batches or len(batches[-1]) == size or batches[-1][-1] + 1 != number:
-            batches.append([])
-        batches[-1].append(number)
-    return batches
+    runs = np.split(np.array(ids, int), np.flatnonzero(np.diff(ids) != 1) + 1)
+    return [run[first : first + size].tolist() for run in runs for first in range(0, len(run), size)]
 
 
 def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Batch:
