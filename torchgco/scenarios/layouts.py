@@ -114,38 +114,25 @@ class Layouts:
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
 
     def __post_init__(self) -> None:
-        def put(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
         centers, radii = checks.obstacles(self.centers, self.radii)
-        put("centers", centers)
-        put("radii", radii)
-        put("velocities", checks.velocities(self.velocities, centers))
+        moving = checks.velocities(self.velocities, centers)
         boxes = checks.boxes(self.box_centers, self.box_half_sizes, self.box_rotations, self.box_radii, centers)
-        for name, value in zip(BOXES, boxes, strict=True):
-            put(name, value)
-        sines = checks.sines([getattr(self, name) for name in SINES], self.box_centers)
-        for name, value in zip(SINES, sines, strict=True):
-            put(name, value)
-        for name, value in zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True):
-            put(name, value)
-        put(TIME, checks.free_time(self.free_time, self.velocities))
-        put(BINDS, checks.required(self.goal_required))
-        for name in ("start", "goal"):
-            put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
+        checked: dict[str, Any] = {"centers": centers, "radii": radii, "velocities": moving}
+        checked |= zip(BOXES, boxes, strict=True)
+        checked |= zip(SINES, checks.sines([getattr(self, name) for name in SINES], boxes[0]), strict=True)
+        checked |= zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True)
+        checked |= {TIME: checks.free_time(self.free_time, moving), BINDS: checks.required(self.goal_required)}
+        checked |= {name: checks.states(getattr(self, name), f"layouts.{name}", centers) for name in ("start", "goal")}
+        checked |= {name: checks.scalar(name, getattr(self, name)) for name in SHARED}
+        checked |= zip(CONTROLS, checks.control_bounds(self.control_lower, self.control_upper), strict=True)
+        checked |= {"stages": checks.stages(self.stages, len(centers)), "ids": checks.ids(self.ids, len(centers))}
+        checked |= {"best_cost": checks.best_cost(self.best_cost, len(centers))}
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "map", self._checked_map())
         lengths = {state.shape[1] for state in (self.start, self.goal) if state is not None} - {centers.shape[2]}
         if self.start is not None and self.goal is not None and len(lengths) > 1:
             raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
-        for name in checks.SCALARS:
-            if name != "stages":
-                put(name, checks.scalar(name, getattr(self, name)))
-        put("stages", checks.stages(self.stages, len(centers)))
-        lower, upper = checks.control_bounds(self.control_lower, self.control_upper)
-        put("control_lower", lower)
-        put("control_upper", upper)
-        put("best_cost", checks.best_cost(self.best_cost, len(centers)))
-        put("ids", checks.ids(self.ids, len(centers)))
-        put("map", self._checked_map())
         check_value(self.name, str, "layouts.name")
 
     def _checked_map(self) -> DistanceField | None:
