@@ -72,8 +72,9 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
         for ax in row:
             ax.set_xlabel(_words(variable))
             tidy(ax, title if ax is row[0] else "")
-    looks = {solver: {"color": colour, "label": solver} for solver, colour in colours.items()}
-    legend(figure, [Line2D([], [], marker="o", **look) if numeric else Patch(**look) for look in looks.values()])
+    lines = [Line2D([], [], color=colour, marker="o", label=solver) for solver, colour in colours.items()]
+    patches = [Patch(color=colour, label=solver) for solver, colour in colours.items()]
+    legend(figure, lines if numeric else patches)
     return figure
 
 
