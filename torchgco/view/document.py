@@ -153,11 +153,12 @@ def _numbers(values: np.ndarray) -> list[float | None]:
 
 def outlines_of(problem: Problem, b: int) -> list[list[list[float | None]]]:
     """Closed lines, each a list of corners (d,), m, of the gates of problem b in their order."""
-    gates = outlines(problem, b)
+    if not (gates := outlines(problem, b)):
+        return []
     start = problem.x0[b, problem.position].detach().cpu().double().numpy()
     centers = [corners.mean(axis=0) for corners, _ in gates]
     ends = centers[-1:] if problem.goal is None else [problem.goal.position[b].detach().cpu().double().numpy()]
-    ways = [after - before for before, after in zip([start, *centers], [*centers[1:], *ends], strict=False)]
+    ways = np.array([*centers[1:], *ends]) - [start, *centers[:-1]]
     rows = zip(gates, centers, ways, strict=True)
     found = [_ring(center, radius, way) if radius > 0 else corners for (corners, radius), center, way in rows]
     return [[_numbers(corner) for corner in outline] for outline in found]
