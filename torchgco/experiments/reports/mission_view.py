@@ -113,7 +113,7 @@ def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str
     place = next((i for i, one in enumerate(problem.constraints) if one in problem.obstacles), -1)
     return Flight(
         solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", _told(row), bad,
-        np.where(bad > 0, place, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt)),
+        np.where(bad > 0, place, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt), X),
         notes=_notes(steps)[: len(path)],
     )  # fmt: skip
 
