@@ -29,7 +29,7 @@ from torchgco.plotting.style import INK, PALETTE
 VEHICLE_COLOUR = PALETTE[5]
 VIEWS: tuple[draw.Plane, draw.Plane] = (draw.ABOVE, draw.SIDE)
 POSITION = ("x0", "x1", "x2")
-POSE = tuple(f"x{i}" for i in range(13))  # the states that place and turn the plant
+DRAWN_STATES = tuple(f"x{i}" for i in range(13))  # of the plant: those that place it and turn it come first
 CONTACT: dict[str, Any] = {
     "marker": "X", "color": draw.CROSS, "markeredgecolor": "white", "markersize": 9, "linestyle": "none",
 }  # fmt: skip
@@ -68,7 +68,7 @@ class Course:
 
     def track(self, frame: pd.DataFrame) -> np.ndarray:
         """The track of a frame with columns x0 to x2, or of a vehicle with a body x0 to x12."""
-        columns = POSITION if self.body is None else POSE
+        columns = POSITION if self.body is None else DRAWN_STATES
         return np.stack(tuple(flight(frame, *columns).values()), axis=-1)
 
     @property
