@@ -41,6 +41,9 @@ CASES = {
     "the same in drone-models": [
         "plant=drone_models", "plant.drag=0.1", "plant.mass_error=0.1", "mission.disturbance.wind=0.5",
     ],
+    "forest, a body of 0.6 x 0.6 x 0.2 m": [
+        "+model.vehicle.footprint=[[-0.3,-0.3,-0.1],[0.3,0.3,0.1]]", "+model.vehicle.cells=[2,2,1]",
+    ],
 }  # fmt: skip
 # Planners and how many missions they fly: FATROP plans one problem after the other, and is built again in every period.
 PLANNERS = {"gco": 128, "gco_paper": 32, "al_ilqr": 32, "fatrop": 4}

@@ -214,15 +214,15 @@ class Planner:
         step = torch.zeros_like(x[:, 0])
         if before is not None:
             step = before.X[..., :3].diff(dim=1).square().sum(-1).amax(-1).sqrt()
-        return Margin(self.margin, self.margin_growth, step)
+        return Margin(self.margin, self.margin_growth, step, None if before is None else before.X)
 
     def _constraints(self, whole: Problem, t: float, x: Tensor, margin: Margin, depth: Tensor) -> list[Constraint]:
         """The constraints of plans that start at time t from plants x (B, 17), depth (B,) m within the margin."""
-        parts: list[Constraint] = []
+        parts, start = list[Constraint](), planning_state(x, airframe_of(whole.dynamics))
         for constraint in whole.constraints:
             later = constraint.later(t)
             if isinstance(later, Obstacles):
-                parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth, x[:, :3])
+                parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth, start)
             else:
                 parts.append(later)
         return [*parts, *([first_step(whole, x)] if self.first_step else [])]

@@ -134,6 +134,10 @@ class Obstacles(Constraint):
         """Distances (B, K, M), m, of points p (B, K, d), m, at times t (K,), s."""
         raise undefined(self, "signed_distance")
 
+    def distances_of(self, X: Tensor, t: Tensor) -> Tensor:
+        """The same of vehicles in states X (B, K, n)."""
+        return self.signed_distance(X[..., self.position], t)
+
     def distances(self, X: Tensor) -> Tensor:
         """Distances (B, K, M), m, of states X (B, N+1, n) at the constraint's knots."""
         return self.signed_distance(X[:, self.knots, self.position], self.times(X))
@@ -181,6 +185,10 @@ class Obstacles(Constraint):
     def with_step(self, dt: float) -> Self:
         """The same obstacles, which move from knot to knot by what they do in dt, s."""
         return replace(self, dt=dt)  # type: ignore[type-var]
+
+    def with_knots(self, knots: slice) -> Self:
+        """The same obstacles, which count at other knots."""
+        return replace(self, knots=knots)  # type: ignore[type-var]
 
     def times(self, X: Tensor) -> Tensor:
         """t = k dt (K,) at the constraint's knots, s."""

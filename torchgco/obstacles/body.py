@@ -277,6 +277,9 @@ class BoundBody(Obstacles):
     def distances(self, X: Tensor) -> Tensor:
         return torch.cat([ball.distances(P) for ball, P in self.each(X)], dim=-1)
 
+    def distances_of(self, X: Tensor, t: Tensor) -> Tensor:
+        return torch.cat([ball.signed_distance(P, t) for ball, P in self.each(X)], dim=-1)
+
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
         raise InputError("body", "states, whose `distances` are measured", "positions alone, which have no attitude")
 
@@ -350,6 +353,10 @@ class BoundBody(Obstacles):
 
     def with_step(self, dt: float) -> Self:
         return self._of_each(lambda part: part.with_step(dt))
+
+    def with_knots(self, knots: slice) -> Self:
+        points = replace(self.points, knots=knots)
+        return replace(self._of_each(lambda part: part.with_knots(knots)), points=points)
 
     def _of_each(self, change: Callable[[Any], Any]) -> Self:
         return replace(self, balls=tuple(map(change, self.balls)), inner=change(self.inner))

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import VEHICLE_COLOUR, VIEWS, Course, draw_instant, draw_still, flight, handles, positions
+from torchgco.plotting.course import VEHICLE_COLOUR, VIEWS, Course, draw_instant, draw_still, flight, handles
 from torchgco.plotting.maps import UNSEEN
 from torchgco.plotting.missions import check_plans
 from torchgco.plotting.style import DPI, INK, PALETTE, TITLE, legend, tidy
@@ -39,7 +39,7 @@ def mission_animation(
     Raises:
         InputError: as `snapshots_figure`.
     """
-    t, track = flight(frame, "t")["t"], positions(frame)
+    t, track = flight(frame, "t")["t"], course.track(frame)
     check_plans(plans, len(t))
     every = max(1, round(1.0 / (FPS * period)), ceil((len(t) - 1) / (MAX_FRAMES - 2)))
     steps = sorted({*range(0, len(t), every), len(t) - 1})

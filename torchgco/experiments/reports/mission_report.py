@@ -28,6 +28,7 @@ from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course
 from torchgco.plotting.gates import outlines
+from torchgco.plotting.silhouettes import body_of
 from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts
 
@@ -146,5 +147,7 @@ def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
     held = layouts.vehicle_radius
     vehicle = setup.vehicle.radius if held is None else held
     gates = tuple(outlines(task.problem, 0))
-    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map, gates)
+    if (body := body_of(task.problem)) is not None:
+        vehicle = float(body.inner.vehicle_radius[0])
+    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map, gates, body)
     return course, float(task.problem.dynamics.dt)

@@ -42,7 +42,7 @@ from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.judging.judge import frame_columns, gates_passed, judge
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
-from torchgco.missions.tables import step_columns
+from torchgco.missions.tables import STATES, step_columns
 from torchgco.scenarios import Layouts, Vehicle
 
 TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries round differently
@@ -231,10 +231,10 @@ def _missions(
 def _nearest(log: pd.DataFrame, layouts: Layouts, contact: Contact, period: float) -> dict[int, float]:
     """Smallest distance to contact at the starts of each mission's control steps, m, by layout; infinite without."""
     ids = layouts.ids.tolist()
-    p = np.full((len(ids), 1 + log["step"].max() if len(log) else 0, 3), np.nan)
-    p[log["mission"].map(ids.index).to_numpy(dtype=int), log["step"]] = log[["x0", "x1", "x2"]]
-    found = contact.distances(torch.from_numpy(p), period).numpy()
-    nearest = np.fmin.reduce(np.where(np.isnan(p[..., 0]), np.inf, found), axis=1, initial=np.inf)
+    x = np.full((len(ids), 1 + log["step"].max() if len(log) else 0, STATES), np.nan)
+    x[log["mission"].map(ids.index).to_numpy(dtype=int), log["step"]] = log[[f"x{i}" for i in range(STATES)]]
+    found = contact.distances(torch.from_numpy(x), period).numpy()
+    nearest = np.fmin.reduce(np.where(np.isnan(x[..., 0]), np.inf, found), axis=1, initial=np.inf)
     return dict(zip(ids, nearest.tolist(), strict=True))
 
 
