@@ -98,7 +98,7 @@ def call(**change: Any) -> Solution:
 
 
 def flight(**change: Any) -> object:
-    parts = dict(position=np.zeros((3, 3)), dt=0.01, contact=Contact(()), goal=np.zeros(3), goal_radius=0.1)
+    parts = dict(x=np.zeros((3, 3)), dt=0.01, contact=Contact(()), goal=np.zeros(3), goal_radius=0.1)
     return judge_flight(**{**parts, **change})
 
 
@@ -248,9 +248,7 @@ CASES: dict[str, list[Callable[[], object]]] = {
         lambda a=a: certify(solved()[0], solved()[2].X, solved()[2].U, a) for a in ([True] * 2, torch.ones(2).long())
     ],
     "dt": [lambda: flight(dt=0.0), lambda: flight(dt=None)],
-    "position": [
-        lambda p=p: flight(position=p) for p in (np.zeros((3, 2)), np.zeros((0, 3)), "a", [[0], [0, 1], [2]])
-    ],
+    "x": [lambda x=x: flight(x=x) for x in (np.zeros((3, 2)), np.zeros((0, 3)), "a", [[0], [0, 1], [2]])],
     "device": [
         lambda: plan_batch(solved()[0], "nowhere"), lambda: plan_batch(solved()[0], 1.5),  # type: ignore[arg-type]
         lambda: plan_batch(solved()[0], "cuda:99"), lambda: Solution.load("none.npz", "nowhere"),

@@ -41,6 +41,9 @@ CASES = {
     "the same in drone-models": [
         "plant=drone_models", "plant.drag=0.1", "plant.mass_error=0.1", "mission.disturbance.wind=0.5",
     ],
+    "forest, a body of 0.6 x 0.6 x 0.2 m": [
+        "+model.vehicle.footprint=[[-0.3,-0.3,-0.1],[0.3,0.3,0.1]]", "+model.vehicle.cells=[2,2,1]",
+    ],
 }  # fmt: skip
 # Planners and how many missions they fly: FATROP plans one problem after the other, and is built again in every period.
 PLANNERS = {"gco": 128, "gco_paper": 32, "al_ilqr": 32, "fatrop": 4}
@@ -145,23 +148,26 @@ def many(count: int, outputs: Path) -> str:
 def timing(alone: int, together: int) -> str:
     """Markdown: what a period takes in missions that fly alone, a row per case, and seconds per mission of a batch."""
     head = (
-        "missions, each alone", "n", "periods", "median, ms", "90 %", "99 %", "longest", "tracker, ms a call", "missed",
+        "missions, each alone", "n", "first plan, ms", "longest", "later periods", "median, ms", "90 %", "99 %",
+        "longest", "tracker, ms a call", "missed",
     )  # fmt: skip
     rows, totals = [], []
     for case in TIMED:
         _periods(CASES[case], 0)  # compiles
         parts = [part for seed in range(alone) for part in _periods(CASES[case], seed)]
         totals += [float(part.sum()) / 1000.0 for part in parts if case == TIMED[0]]
-        every = np.concatenate(parts)
+        first, every = [float(part[0, 0]) for part in parts], np.concatenate([part[1:] for part in parts])
         missed = int((every.sum(1) > PERIOD).sum())
         cells = [f"{np.quantile(every[:, 0], q):.1f}" for q in (0.5, 0.9, 0.99, 1.0)]
         calls = f"{np.median(every[:, 1]) / CALLS:.2f}"
-        rows.append(
-            (case, str(alone), f"{len(every):,}", *cells, calls, f"{missed} ({100 * missed / len(every):.2f} %)")
-        )
+        begun = f"{np.median(first):.0f}", f"{max(first):.0f}"
+        share = f"{missed} ({100 * missed / len(every):.2f} %)"
+        rows.append((case, str(alone), *begun, f"{len(every):,}", *cells, calls, share))
     batch = float(np.mean([part.sum() for part in _periods(CASES[TIMED[0]], 0, together)])) / 1000.0
     text = [
         "A period of 50 ms is missed where the planner and the tracker's five calls take longer; elapsed times.",
+        "The first plan, by the whole solver from rest, is counted apart: unless obstacles move, a vehicle can wait",
+        "for it. `missed_deadlines` of a study counts it, too.",
         f"Planner and tracker take {np.mean(totals):.2f} s for a mission of the first row alone,",
         f"{batch:.2f} s per mission in a batch of {together}.",
     ]

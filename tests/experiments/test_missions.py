@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from tqdm import tqdm
 
@@ -53,6 +54,21 @@ def test_one_mission_writes_log_figures_and_animation(run, tmp_path, monkeypatch
     assert "outcomes.png" not in figures, "a bar of one mission says nothing"
     code, out, _ = run("experiment=mission", *SHORT)
     assert code == 0 and "Already done" in out and "TIMEOUT after 0.20 s" in out
+
+
+def test_a_mission_with_a_footprint_is_drawn_and_verified_with_it(run, tmp_path) -> None:
+    """The command's own judge: a flat body beside a sphere, which it touches unless it is turned, as by hand."""
+    body = ["+model.vehicle.footprint=[[-0.3,-0.3,-0.1],[0.3,0.3,0.1]]", "+model.vehicle.cells=[2,2,1]"]
+    assert run("experiment=mission", *SHORT, *body)[0] == 0
+    log, held = pd.read_parquet(tmp_path / "out" / "mission.parquet"), np.load(tmp_path / "out" / "layouts.npz")
+    corners = np.array([[a, b, 0.0] for a in (-0.15, 0.15) for b in (-0.15, 0.15)])
+    turns = Rotation.from_quat(log[["x7", "x8", "x9", "x6"]].to_numpy())
+    places = log[["x0", "x1", "x2"]].to_numpy()[:, None] + np.stack([turns.apply(c) for c in corners], axis=1)
+    away = np.linalg.norm(places[:, :, None] - held["centers"][0], axis=-1) - 0.95 * held["radii"][0]
+    assert np.allclose(log["clearance"], np.nanmin(away, axis=(1, 2)) - 0.5 * np.linalg.norm([0.3, 0.3, 0.2]))
+    assert (tmp_path / "out" / "figures" / "0-distance.png").exists()
+    (verified,), _ = verify([tmp_path / "out"])
+    assert not verified.differs
 
 
 def test_the_figures_show_all_commands(run, tmp_path, monkeypatch) -> None:

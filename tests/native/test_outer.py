@@ -13,7 +13,8 @@ from tests.problems import planar_batch, quadrotor_batch
 from tests.search.test_finish import brachistochrone, bryson_denham, parking
 from torchgco import ILQR, AugmentedLagrangian, Boxes, Problem, Spheres, StateBounds, presets
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.kernels import chord_clearance, measured, open_loop
+from torchgco.kernels import chord_clearance, kernels_of, measured, open_loop
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.native.engine import Engine
@@ -120,7 +121,7 @@ def test_lines_count_up_to_each_problems_own_last_knot(N: int) -> None:
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_violations_and_clearances_equal_those_of_pytorch(moving: bool) -> None:
+def test_violations_slacks_and_clearances_equal_those_of_pytorch(moving: bool) -> None:
     problem, U0 = walled()
     if moving:
         spheres = problem.obstacles[0]
@@ -140,6 +141,13 @@ def test_violations_and_clearances_equal_those_of_pytorch(moving: bool) -> None:
         found = measured(problem, X, U, obstacles=alone)
         torch.testing.assert_close(found, violation(parts, X, U), rtol=1e-12, atol=1e-12)
         assert bool((found > 0).any())
+    draw, some = torch.Generator().manual_seed(2), [(problem.B, *shape) for shape in problem.row_shapes]
+    lam = tuple(torch.rand(shape, generator=draw, dtype=torch.float64) - 0.3 for shape in some)
+    for held in (lam, tuple(part.clamp(min=0.5) - 0.5 for part in lam)):
+        lagrangian = Lagrangian(problem, Multipliers(held, torch.ones_like(X[:, 0, 0])), None, True)
+        slack = lagrangian.slack(X, U)
+        torch.testing.assert_close(kernels_of(problem).slack(lagrangian, X, U), slack, rtol=1e-12, atol=1e-12)
+        assert bool((slack > 0).all())
     for share in (0.0, 0.05, 0.3):
         rows = torch.stack([part.chord_clearance(X, share) for part in problem.obstacles])
         torch.testing.assert_close(chord_clearance(problem, X, share), rows.amin(0), rtol=1e-12, atol=1e-12)

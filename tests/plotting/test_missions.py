@@ -3,12 +3,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from torchgco import Body, Problem, QuadraticCost, QuadrotorPlanning, Spheres
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.maps import DistanceField, OccupancyGrid
@@ -16,6 +19,7 @@ from torchgco.missions.outcome import Outcome
 from torchgco.plotting import missions
 from torchgco.plotting.bodies import Ball, Box
 from torchgco.plotting.course import Course
+from torchgco.plotting.silhouettes import body_of
 
 STEPS, KNOTS, PERIOD = 12, 6, 0.05
 
@@ -45,6 +49,33 @@ def course(speed: float = 0.0) -> Course:
     """A sphere 1 m beside the track at x = 2, which comes toward it at `speed`, m/s."""
     ball = Ball(np.array([2.0, 1.0, 0.0]), 0.3, np.array([0.0, -speed, 0.0]))
     return Course((ball,), np.array([6.0, 0.0, 0.0]), 0.5, vehicle_radius=0.2)
+
+
+def test_a_body_counts_by_its_balls_as_they_are_turned() -> None:
+    """A rotor 0.6 m to the left of a track that passes a sphere at 1 m touches it, but not once it is turned ahead."""
+    body = Spheres([[9.0, 9.0, 9.0]], [0.3], Body([[0.0, 0.6, 0.0], [0.0, 0.0, 0.0]], 0.2, "quaternion"))
+    rest = torch.zeros(1, 14, dtype=torch.float64)
+    rest[0, 6] = 1.0
+    cost = QuadraticCost([1.0] * 14, [1.0] * 4, [1.0] * 14)
+    held = body_of(Problem(QuadrotorPlanning(), cost, [body], rest, 3))
+    ball = Ball(np.array([2.0, 1.0, 0.0]), 0.3, np.zeros(3))
+    drawn = Course((ball,), np.array([6.0, 0.0, 0.0]), 0.5, vehicle_radius=0.2, body=held)
+    states = pd.DataFrame({f"x{i}": np.zeros(9) for i in range(13)} | {"t": PERIOD * np.arange(9)})
+    states["x0"], states["x6"] = 0.5 * np.arange(9), 1.0
+    track = drawn.track(states)
+    assert drawn.nearness(track, states["t"].to_numpy()).min() == pytest.approx(0.4 / 0.5)
+    (place,) = drawn.contacts(track, PERIOD)
+    assert place == pytest.approx([2.0, 0.0, 0.0], abs=0.1)
+    states["x6"], states["x9"] = np.cos(np.pi / 4), -np.sin(np.pi / 4)
+    ahead = drawn.track(states)
+    assert drawn.nearness(ahead, states["t"].to_numpy()).min() == pytest.approx(1.0 / 0.5, abs=0.05)
+    assert len(drawn.contacts(ahead, PERIOD)) == 0
+    assert drawn.limits(track)[0][1] <= -0.8, "the whole body is in the picture"
+    plans = np.zeros((9, KNOTS, 3))
+    (ax, *_) = panels_of(missions.snapshots_figure(states, plans, drawn, [4], PERIOD))
+    (shape,) = [c for c in ax.collections if isinstance(c, PolyCollection) and len(c.get_paths()) == 2]
+    centers = [path.get_extents().get_points().mean(axis=0) for path in shape.get_paths()]
+    np.testing.assert_allclose(centers, [[2.6, 0.0], [2.0, 0.0]], atol=1e-6)
 
 
 def panels_of(figure: Figure) -> list[Axes]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from torchgco import (
     ControlBounds,
     FunctionConstraint,
@@ -24,6 +26,7 @@ from torchgco import (
     StateBounds,
     Status,
 )
+from torchgco.kernels.in_c import NativeKernels
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.native.compiler import find_compiler
@@ -62,6 +65,19 @@ def test_costs_and_violations_are_those_of_what_is_returned(solver: str) -> None
         whole = within_horizons(problem)
         torch.testing.assert_close(found.violation, violation(whole.constraints, found.X, found.U), rtol=0, atol=1e-15)
         torch.testing.assert_close(found.cost, whole.cost.total(found.X, found.U), rtol=1e-14, atol=0)
+
+
+@compiled
+def test_a_planner_flies_on_violations_that_kernels_measure_but_for_a_users_rows(monkeypatch) -> None:
+    problem, U0 = among_discs(), torch.ones(2, 30, 2, dtype=D)
+    own = replace(problem, constraints=[*problem.constraints, FunctionConstraint(lambda x: x[..., :1] - 0.5)])
+    solver = AugmentedLagrangian(max_outer_iterations=1).in_closed_loop(1)[1]
+    for part in (problem, own):
+        found = solver.solve(part, U0)
+        torch.testing.assert_close(found.violation, violation(part.constraints, found.X, found.U), rtol=0, atol=1e-15)
+        assert float(found.violation.min()) > 1e-3
+    monkeypatch.setattr(NativeKernels, "violation", lambda self, problem, X, U, obstacles=False: X.new_zeros(len(X)))
+    assert not bool(solver.solve(problem, U0).violation.any()) and bool(solver.solve(own, U0).violation.all())
 
 
 def test_a_kernel_that_measures_wrongly_changes_no_report(monkeypatch) -> None:

@@ -18,6 +18,7 @@ from torchgco.missions.outcome import FARTHEST, Outcome
 from torchgco.missions.planning_problem import airframe_of, planning_state
 from torchgco.missions.plant import flown, hovering
 from torchgco.missions.tracker import RATES, Reference, Tracking
+from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem
 
 FLYING = -1  # the outcome of an episode that hasn't ended
@@ -45,6 +46,7 @@ class Episodes:
             given = "a sensor" if not mission.sees_all else "a latency" if mission.latency else "a race"
             raise InputError("mission", "no sensor, latency or race in an environment", given)
         self.mission, self.problem, self.control = mission, problem, control
+        check_no_body(problem, "vehicle_radius", "a number for an environment, whose vehicle is a ball")
         self.contacts = Contact.among(problem)
         if self.contacts.moving:
             raise InputError("problem.constraints", "obstacles at rest in an environment", "some that move")

@@ -14,6 +14,7 @@ from torchgco.exploration.sensing.sensors import Depth, Lidar
 from torchgco.missions.mission import Mission
 from torchgco.missions.pilot import Pilot
 from torchgco.native.compiler import find_compiler
+from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem
 
 
@@ -54,6 +55,12 @@ class SensorMission(Mission):
         if not self.sees_all and find_compiler() is None:
             wanted = "full on a machine without a C compiler: sensors and their maps are computed in C (TORCHGCO_CC)"
             raise InputError("mission.sensor", wanted, self.sensor)
+
+    def check_stated(self, problem: Problem) -> None:
+        """See `Mission`."""
+        super().check_stated(problem)
+        if not self.sees_all:
+            check_no_body(problem, "vehicle_radius", "a number for a mission with a sensor, whose vehicle is a ball")
 
     def begin(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> Pilot:
         """Who plans for vehicles at plants x (B, 17): the planner, or with a sensor the explorer."""

@@ -105,6 +105,10 @@ class Kernels(Protocol):
         """See `kernels.chord_clearance`."""
         ...
 
+    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
+        """See `Lagrangian.slack`."""
+        ...
+
     def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
         """The backward pass on J_var + lam'c, for regularisations mu_r (B,)."""
         ...

@@ -81,6 +81,9 @@ class NativeKernels:
         least = clearance_of(others, X, share)
         return least if len(others) == len(parts) else torch.minimum(least, self.engine.chords(problem, X, 1.0 - share))
 
+    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
+        return self.engine.slack(lagrangian, X, U)
+
     def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
         def backward(mu: Tensor) -> BackwardPass:
             G, linear, quadratic, failed = self.engine.gains(lagrangian, X, U, mu)

@@ -50,6 +50,9 @@ class TorchKernels:
     def chord_clearance(self, problem: Problem, X: Tensor, share: float) -> Tensor:
         return clearance_of([c.bare for c in problem.constraints], X, share)
 
+    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
+        return lagrangian.slack(X, U)
+
     def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
         F, H = linearise(lagrangian.problem, X, U), lagrangian.expand_optimality(X, U)
         return lambda mu: backward(F, H, mu)

@@ -5,15 +5,19 @@ Distances are the judge's, which no solver shares, so that a planner that measur
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
+from torchgco.dynamics.quadrotor import Airframe
 from torchgco.judging.judge import CLEARANCES, by_kind
+from torchgco.missions.planning_problem import airframe_of, planning_state
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
 
@@ -21,10 +25,12 @@ from torchgco.problem.problem import Problem
 class Contact(PerElement):
     """The obstacles of B planning problems, as vehicles touch them: at CONTACT_FACTOR of the full radii.
 
-    A constraint that is given as a function has no distance and is left out, as by the judge.
+    A constraint that is given as a function has no distance and is left out, as by the judge. Vehicles are given by the
+    plants' states x (B, ..., 17), from which a `Body` has its attitude; where all are balls, positions (B, ..., 3) do.
     """
 
     obstacles: tuple[Any, ...]  # as at time 0
+    airframe: Airframe | None = None  # of vehicles with a body
 
     batched: ClassVar[tuple[str, ...]] = ("obstacles",)
 
@@ -38,32 +44,55 @@ class Contact(PerElement):
         found = tuple(part for part in problem.constraints if isinstance(part, Obstacles))
         for part in found:
             by_kind(CLEARANCES, part)
-        return cls(found)
+        return cls(found, airframe_of(problem.dynamics) if any(isinstance(part, BoundBody) for part in found) else None)
 
     @property
     def moving(self) -> bool:
         """Whether any obstacle moves."""
         return any(part.moving for part in self.obstacles)
 
-    def distance(self, p: Tensor, t: float) -> Tensor:
-        """Smallest distances (B,), m, of positions p (B, 3), m, at time t, s: negative in contact.
+    def distance(self, x: Tensor, t: float) -> Tensor:
+        """Smallest distances (B,), m, of vehicles at x (B, 17) at time t, s: negative in contact.
 
         Infinite where there is no obstacle.
         """
-        return self._nearest(torch.stack((p, p), dim=1), t, 0.0)
+        return self._nearest(torch.stack((x, x), dim=1), t, 0.0)
 
-    def distances(self, p: Tensor, dt: float) -> Tensor:
-        """The same (B, K) of positions p (B, K, 3) at times k dt, s."""
-        found = [self.distance(p[:, k], k * dt) for k in range(p.shape[1])]
-        return torch.stack(found, dim=1) if found else p[..., 0]
+    def distances(self, x: Tensor, dt: float) -> Tensor:
+        """The same (B, K) of vehicles at x (B, K, 17) at times k dt, s."""
+        found = [self.distance(x[:, k], k * dt) for k in range(x.shape[1])]
+        return torch.stack(found, dim=1) if found else x[..., 0]
 
-    def along(self, p: Tensor, dt: float) -> Tensor:
-        """Smallest distances (B,) on the straight ways between positions p (B, K, 3), K above 0, at times k dt, s."""
-        return self._nearest(p, 0.0, dt) if p.shape[1] > 1 else self.distance(p[:, 0], 0.0)
+    def along(self, x: Tensor, dt: float) -> Tensor:
+        """Smallest distances (B,) on the ways between x (B, K, 17), K above 0, at times k dt, s.
 
-    def _nearest(self, p: Tensor, t: float, dt: float) -> Tensor:
-        nearest = torch.full_like(p[:, 0, 0], torch.inf)
+        Positions move straight from one to the next; a body turns evenly, see `body_clearance`.
+        """
+        return self._nearest(x, 0.0, dt) if x.shape[1] > 1 else self.distance(x[:, 0], 0.0)
+
+    def clear(self, problem: Problem, x: Tensor) -> Tensor:
+        """Whether vehicles touch nothing that hover at x (B, 17) at a problem's starts, (B,) bool."""
+        return problem.start_is_clear if self.airframe is None else self.distance(x, 0.0) >= 0
+
+    def moved(self, before: Tensor, now: Tensor) -> Tensor:
+        """How far (B,), m, the part of the vehicle that moved farthest is from where it was: of x (B, 17) each."""
+        found = (now[..., :3] - before[..., :3]).norm(dim=-1)
         for part in self.obstacles:
-            now = replace(part.later(t), dt=dt) if part.moving else part
-            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(now, p)[1])
+            if isinstance(part, BoundBody):
+                a, b = (part.points.at(self._planning(x)) for x in (before, now))
+                found = torch.maximum(found, (b - a).norm(dim=-1).amax(-1))
+        return found
+
+    def _nearest(self, x: Tensor, t: float, dt: float) -> Tensor:
+        p, nearest = x[..., :3].contiguous(), torch.full_like(x[:, 0, 0], torch.inf)
+        for part in self.obstacles:
+            now = part.later(t).with_step(dt) if part.moving else part
+            X = self._planning(x) if isinstance(part, BoundBody) else p
+            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(now, X)[1])
         return nearest
+
+    def _planning(self, x: Tensor) -> Tensor:
+        """The states of the planning model, of which a body's attitude is a function."""
+        if x.shape[-1] == 3 or self.airframe is None:
+            raise InputError("x", "states (..., 17) of a vehicle with a Body", "positions alone")
+        return planning_state(x, self.airframe)

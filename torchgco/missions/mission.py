@@ -32,7 +32,6 @@ from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.plant import Plant, RotorPlant, flown, hovering
 from torchgco.missions.tracker import Reference, Tracker, Tracking
-from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
@@ -167,7 +166,6 @@ def check_flown(mission: Mission, problem: Problem, seed: int, ids: Tensor | Non
     if problem.goal is None:
         raise InputError("goal", "a Goal in the problem", None)
     mission.check_stated(problem)
-    check_no_body(problem, "vehicle_radius", "a number for a mission, whose vehicle is a ball")
     if problem.horizon is not None:
         raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
     mission.check(problem.dynamics)
@@ -235,12 +233,12 @@ class Flight:
         mission, goal = self.mission, problem.goal
         assert goal is not None
         self.contact, self.passing, self.model = Contact.among(problem), Passing.among(problem), problem.dynamics
-        self.measured_at, self.clearance = problem.x0[:, :3], torch.full_like(problem.x0[:, 0], -torch.inf)
         radius = mission.goal_radius
         self.goal = goal.position
         self.radius = goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
         x = hovering(self.airframe, problem.x0[:, :3])
         self.start, self.ids = x[:, :3], ids
+        self.measured_at, self.clearance = x, torch.full_like(x[:, 0], -torch.inf)
         self.force, self.noise = mission.disturbance.draw(self.seed, ids.tolist(), self.steps, self.period)
         self.plant, self.x, self.rows = flown(mission.plant, self.airframe), x, torch.arange(problem.B)
         self.pilot = begin(problem, x, self.seed, ids)
@@ -248,7 +246,7 @@ class Flight:
         self.log.seen.extend(self.pilot.seen)
         self._plan: Plan | None = None  # to continue, or with a latency to fly
         self._tracking: Tracking | None = None
-        self._leave(~problem.start_is_clear)
+        self._leave(~self.contact.clear(problem, x))
 
     @property
     def done(self) -> bool:
@@ -344,12 +342,12 @@ class Flight:
         finite = torch.isfinite(self.x).all(-1) & ((p - self.start[self.rows]).norm(dim=-1) <= FARTHEST)
         there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
         there = there if self.passing is None else there & self.passing.done
-        return ~finite | there | self._touches(p, t)
+        return ~finite | there | self._touches(t)
 
-    def _touches(self, p: Tensor, t: float) -> Tensor:
-        """Whether vehicles at p (B, 3) are in contact: none is that has flown less than its last clearance at rest."""
-        if self.contact.moving or not bool(((p - self.measured_at).norm(dim=-1) < self.clearance).all()):
-            self.measured_at, self.clearance = p, self.contact.distance(p, t)
+    def _touches(self, t: float) -> Tensor:
+        """Whether vehicles are in contact, (B,): none is that has moved less than its last clearance at rest."""
+        if self.contact.moving or not bool((self.contact.moved(self.measured_at, self.x) < self.clearance).all()):
+            self.measured_at, self.clearance = self.x, self.contact.distance(self.x, t)
             return self.clearance < 0
         return torch.zeros_like(self.clearance, dtype=torch.bool)
 

@@ -57,12 +57,13 @@ class Ending:
 
 
 def judge_flight(
-    position: Any, dt: float, contact: Contact, goal: Any, goal_radius: float, gates: Passing | None = None
+    x: Any, dt: float, contact: Contact, goal: Any, goal_radius: float, gates: Passing | None = None
 ) -> Ending:
     """Judge one flight.
 
     Args:
-        position: samples (T, 3), m, of the plant, one every dt, s; after the flight's end NaN.
+        x: samples (T, 17) of the plant's state, one every dt, s, or where no vehicle has a `Body` of its positions
+            (T, 3), m; after the flight's end NaN.
         contact, gates: of a single problem.
         goal, goal_radius: (3,) and a number above 0, m.
 
@@ -70,11 +71,14 @@ def judge_flight(
         InputError: arrays of other shapes, without a sample, or of anything but numbers; a radius or a time step that
             isn't above 0.
     """
-    position, goal = _numbers(position, "position", (None, 3)), _numbers(goal, "goal", (3,))
+    x, goal = _numbers(x, "x", (None, None)), _numbers(goal, "goal", (3,))
+    if x.shape[1] not in (3, 17):
+        raise InputError("x", "positions (T, 3) or states (T, 17)", x.shape)
+    position = x[:, :3]
     check_value(goal_radius, Meters, "goal_radius")
     check_value(dt, Seconds, "dt")
     if len(position) == 0:
-        raise InputError("position", "at least one sample", "none")
+        raise InputError("x", "at least one sample", "none")
     with np.errstate(invalid="ignore"):
         lost = ~(np.linalg.norm(position - position[0], axis=-1) <= FARTHEST)
     there = np.linalg.norm(position - goal, axis=-1) < goal_radius
@@ -82,7 +86,7 @@ def judge_flight(
         when, _ = gates.along(torch.from_numpy(position[~lost].astype(float)))
         there &= np.arange(len(there)) >= int(when.max())
     last = int(np.argmax(lost | there)) if (lost | there).any() else len(position) - 1
-    way = torch.from_numpy(position[None, : last + (not lost[last])].astype(float))
+    way = torch.from_numpy(x[None, : last + (not lost[last])].astype(float))
 
     def clearance(samples: int) -> float:
         return float(contact.along(way[:, :samples], dt)) if samples else np.inf
@@ -96,7 +100,7 @@ def judge_flight(
     ending = Ending(outcome, last * dt, clearance(samples), distance)
     if gates is None:
         return ending
-    when, away = gates.along(way[0, :samples])
+    when, away = gates.along(way[0, :samples, :3])
     return replace(ending, gates_passed=int((when < samples).sum()), gate_distance=float(away[away.isfinite()].max()))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
@@ -135,6 +136,11 @@ class Planner:
     def __post_init__(self) -> None:
         check_options(self, "planner")
 
+    @cached_property
+    def solvers(self) -> tuple[Solver, Solver]:
+        """What makes a new plan, and what continues one: see `Solver.in_closed_loop`."""
+        return self.solver.in_closed_loop(CONTINUED)
+
     def problem(self, problem: Problem, x: Tensor) -> Problem:
         """The planning problems of a mission at its start, from those of an open-loop study and plants x (B, 17).
 
@@ -167,16 +173,18 @@ class Planner:
         began = time.perf_counter()
         now, margin, bias, U0 = self._posed(whole, now, x, step, before, measured)
         solve = _Solve(self, now, seed, ids, began, self.tolerance + margin.between(whole))
-        if before is not None and self.feedback:
-            U0 = _brought_back(now, before)
-        plan = solve.first(U0) if before is None else solve.next(U0, before)
+        if before is None:
+            plan = solve.first(U0)
+        else:
+            multipliers = before.continued(now)
+            U0 = _brought_back(now, before, multipliers) if self.feedback else U0
+            plan = solve.next(U0, before, multipliers)
         return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
 
     def first(self, whole: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
         """The problems of the first plans from plants x (B, 17), and the solver's solutions, as `plan` makes them."""
         now, _, _, U0 = self._posed(whole, self.problem(whole, x), x, 0, None, x)
-        solver, _ = self.solver.in_closed_loop(CONTINUED)
-        return now, solver.solve(now, U0, seed=seed, ids=ids, max_seconds=self.max_seconds)
+        return now, self.solvers[0].solve(now, U0, seed=seed, ids=ids, max_seconds=self.max_seconds)
 
     def _posed(
         self, whole: Problem, now: Problem, x: Tensor, step: int, before: Plan | None, measured: Tensor
@@ -206,15 +214,15 @@ class Planner:
         step = torch.zeros_like(x[:, 0])
         if before is not None:
             step = before.X[..., :3].diff(dim=1).square().sum(-1).amax(-1).sqrt()
-        return Margin(self.margin, self.margin_growth, step)
+        return Margin(self.margin, self.margin_growth, step, None if before is None else before.X)
 
     def _constraints(self, whole: Problem, t: float, x: Tensor, margin: Margin, depth: Tensor) -> list[Constraint]:
         """The constraints of plans that start at time t from plants x (B, 17), depth (B,) m within the margin."""
-        parts: list[Constraint] = []
+        parts, start = list[Constraint](), planning_state(x, airframe_of(whole.dynamics))
         for constraint in whole.constraints:
             later = constraint.later(t)
             if isinstance(later, Obstacles):
-                parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth, x[:, :3])
+                parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth, start)
             else:
                 parts.append(later)
         return [*parts, *([first_step(whole, x)] if self.first_step else [])]
@@ -229,13 +237,13 @@ class Planner:
         return before.bias + self.estimation * (shown - expected - before.bias)
 
 
-def _brought_back(problem: Problem, before: Plan) -> Tensor:
+def _brought_back(problem: Problem, before: Plan, multipliers: Multipliers) -> Tensor:
     """The controls (B, N, 4) of previous plans one stage later, with feedback where that has the better Lagrangian.
 
     Gains along a plan that is far from stationary may lead away.
     """
     X, U = shifted(before.X), shifted(before.U)
-    lagrangian = Lagrangian(problem, before.continued(problem), None, True)
+    lagrangian = Lagrangian(problem, multipliers, None, True)
     rollouts = followed(problem, X, U, shifted(before.K)), (open_loop(problem, U), U)
     fed, plain = (value(lagrangian, *rollout)[1].nan_to_num(torch.inf) for rollout in rollouts)
     return torch.where((fed <= plain).view(-1, 1, 1), rollouts[0][1].nan_to_num(), U)
@@ -249,16 +257,15 @@ class _Solve:
     ) -> None:
         self.planner, self.problem, self.seed, self.ids, self.began = planner, problem, seed, ids, began
         self.allowed = allowed  # violation (B,)
-        self.solver, self.local = planner.solver.in_closed_loop(CONTINUED)
+        self.solver, self.local = planner.solvers
 
     def first(self, U0: Tensor) -> Plan:
         """The solver's plans, from controls U0 (B, N, 4)."""
         plan = self._plan(self._solved(self.solver, self.problem, U0, None, self.ids), self.allowed)
         return replace(plan, arrived=self._arrives(plan))
 
-    def next(self, U0: Tensor, before: Plan) -> Plan:
-        """Plans that continue previous ones, which are flown one stage later by U0 (B, N, 4)."""
-        multipliers = before.continued(self.problem)
+    def next(self, U0: Tensor, before: Plan, multipliers: Multipliers) -> Plan:
+        """Plans that continue previous ones, which are flown one stage later by U0 (B, N, 4), with `multipliers`."""
         warm = multipliers if self.planner.multipliers == "shifted" else None
         plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids), self.allowed)
         plan.penalty.copy_(before.penalty)

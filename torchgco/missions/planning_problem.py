@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import torch
@@ -19,6 +19,7 @@ from torchgco.dynamics.rotors import QuadrotorThrusts
 from torchgco.kernels import current, open_loop
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
+from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
 MARGIN_PARTS = 4  # of the horizon, with a margin each, where margins grow
@@ -77,8 +78,8 @@ def continued(
 
 
 def planning_state(x: Tensor, airframe: Airframe) -> Tensor:
-    """States (B, 14) of the planning model for plants x (B, 17): thrusts become their acceleration."""
-    return torch.cat((x[:, :13], x[:, 13:].sum(-1, keepdim=True) / airframe.mass), dim=-1).contiguous()
+    """States (..., 14) of the planning model for plants x (..., 17): thrusts become their acceleration."""
+    return torch.cat((x[..., :13], x[..., 13:].sum(-1, keepdim=True) / airframe.mass), dim=-1).contiguous()
 
 
 def acceleration(x: Tensor, airframe: Airframe) -> Tensor:
@@ -96,20 +97,29 @@ class Margin:
     It holds at the knots. Between two of them a straight step of length s leads up to s^2 / (8 r) into a surface of
     radius r, such as the edge of a box around which the vehicle's radius is laid: the margin is larger by this.
 
+    Of a body the balls' steps count, and how far a ball leaves its straight step as the vehicle turns.
+
     size, growth  m, and m per second of the horizon, in four steps
     step          the longest that is expected between two knots, (B,), m
+    before        states (B, N+1, 14) of the previous plan, whose steps are expected; None: there is none
     """
 
     size: float
     growth: float
     step: Tensor
+    before: Tensor | None = None
 
     def of(self, obstacles: Obstacles) -> Tensor:
         """The margin (B,) at the beginning of the horizon, m."""
         if self.size == 0 or obstacles.absent.shape[1] == 0:
             return torch.full_like(self.step, self.size)
+        step, off = self.step, torch.zeros_like(self.step)
+        if isinstance(obstacles, BoundBody) and self.before is not None:
+            points = obstacles.points
+            step = points.at(self.before).diff(dim=1).norm(dim=-1).flatten(1).amax(-1)
+            off = points.bulge(self.before).flatten(1).amax(-1)
         radius = torch.where(obstacles.absent, torch.inf, obstacles.margins).amin(-1)
-        return self.size + torch.minimum(self.step.square() / (8.0 * radius), 0.5 * self.step)
+        return self.size + torch.minimum(step.square() / (8.0 * radius), 0.5 * step) + off
 
     def between(self, problem: Problem) -> Tensor:
         """The largest part of the margins (B,) that is for what happens between two knots, m."""
@@ -119,20 +129,20 @@ class Margin:
     def around(self, obstacles: Obstacles, N: int, dt: float, depth: Tensor, start: Tensor) -> list[Constraint]:
         """Obstacles with the margin: less by `depth` (B,) at the early knots, more at late ones where it grows.
 
-        Nowhere is it so large that the start (B, 3), m, would be in contact with the grown obstacles.
+        Nowhere is it so large that the start (B, 14) would be in contact with the grown obstacles.
         """
         early, size = min(EARLY, N), self.of(obstacles)
-        parts = [_at(obstacles.grown(size - depth), slice(1, early + 1))]
+        parts: list[Constraint] = [obstacles.grown(size - depth).with_knots(slice(1, early + 1))]
         if early == N:
             return parts
         room = torch.full_like(depth, torch.inf)
         if obstacles.absent.shape[1] > 0:
-            distance = obstacles.signed_distance(start.unsqueeze(1), start.new_zeros(1))[:, 0]
+            distance = obstacles.distances_of(start.unsqueeze(1), start.new_zeros(1))[:, 0]
             room = ((distance + (1.0 - CONTACT_FACTOR) * obstacles.margins) / CONTACT_FACTOR).amin(-1) - MARGIN_ROUNDING
         for knots in torch.arange(early + 1, N + 1).chunk(MARGIN_PARTS if self.growth > 0 else 1):
             first, last = int(knots[0]), int(knots[-1]) + 1
             by = size + self.growth * 0.5 * (first + last - 1) * dt
-            parts.append(_at(obstacles.grown(torch.minimum(by, room)), slice(first, last)))
+            parts.append(obstacles.grown(torch.minimum(by, room)).with_knots(slice(first, last)))
         return parts
 
     def unavoidable_depth(self, problem: Problem, t: float, U: Tensor) -> Tensor:
@@ -141,13 +151,13 @@ class Margin:
         At most to where a quarter of the clearance from contact is left. Obstacles of `problem` are as at time 0, its
         states as at time t, s; U are the controls (B, N, m) of the previous plan.
         """
-        p = open_loop(problem, U)[:, : BLIND + 1, problem.position]
-        times = torch.arange(p.shape[1], dtype=p.dtype) * float(problem.dynamics.dt)
-        depth = torch.zeros_like(p[:, 0, 0])
+        X = open_loop(problem, U)[:, : BLIND + 1]
+        times = torch.arange(X.shape[1], dtype=X.dtype) * float(problem.dynamics.dt)
+        depth = torch.zeros_like(X[:, 0, 0])
         for part in problem.constraints:
             if isinstance(part, Obstacles) and part.absent.shape[1] > 0:
                 size = self.of(part).unsqueeze(-1)
-                distance = part.later(t).signed_distance(p, times).amin(1) - size  # (B, M)
+                distance = part.later(t).distances_of(X, times).amin(1) - size  # (B, M)
                 most = size + (1.0 - MARGIN_LEFT) * (1.0 - CONTACT_FACTOR) * part.margins
                 depth = torch.maximum(depth, torch.minimum(-distance, most).clamp(min=0.0).amax(-1))
         return depth
@@ -169,7 +179,3 @@ def first_step(problem: Problem, x: Tensor) -> FirstStepRates:
             lower, upper = (w + share * (bound[:, 0, :3] - w) for bound in bounds.by_knot)
             reachable = lower, upper
     return FirstStepRates(x[:, 13:], model.dt, model.airframe, reachable)
-
-
-def _at(obstacles: Any, knots: slice) -> Constraint:
-    return replace(obstacles, knots=knots)

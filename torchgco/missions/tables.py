@@ -50,8 +50,7 @@ def unpacked(rows: np.ndarray, substeps: int, sensed: bool = False) -> dict[str,
 
 def clearances(arrays: Arrays, period: float, contact: Contact) -> np.ndarray:
     """Distances (B, K) of missions from contact at the starts of their control steps, m; NaN after their ends."""
-    start = arrays["x"][:, :, 0, :3]
-    found = contact.distances(torch.from_numpy(start), period).numpy()
+    found = contact.distances(torch.from_numpy(arrays["x"][:, :, 0]), period).numpy()
     return np.where(np.isnan(arrays["planner_seconds"]), np.nan, found)
 
 
@@ -203,7 +202,7 @@ def ending(
     dt, finite = period / arrays["commands"].shape[2], np.isfinite(x).all(axis=-1, keepdims=True)
     one = slice(b, b + 1)
     own = None if gates is None else gates.take(one)
-    return judge_flight(np.where(finite, x[:, :3], np.nan), dt, contact.take(one), goal, goal_radius, own)
+    return judge_flight(np.where(finite, x, np.nan), dt, contact.take(one), goal, goal_radius, own)
 
 
 def endings(log: MissionLog, problem: Problem, goal_radius: float | None = None) -> list[Ending]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import torch
@@ -34,16 +35,27 @@ class Reference:
     period: float
     airframe: Airframe
 
-    def at(self, times: Tensor) -> tuple[Tensor, Tensor]:
-        """Body rates (B, K, 3), rad/s, and thrust accelerations (B, K), m/s^2, at times (K,) after the first knot, s.
+    def at(self, offset: float, dt: float, count: int) -> tuple[Tensor, Tensor]:
+        """Body rates (B, K, 3), rad/s, and thrust accelerations (B, K), m/s^2, at K = `count` times.
 
-        Interpolated between the knots; after the last knot, its values.
+        These are dt apart, s, the first `offset` s after the first knot. Interpolated between the knots; after the last
+        knot, its values.
         """
-        place = (times / self.period).clamp(max=self.X.shape[1] - 1)
-        left = place.floor().long().clamp(max=self.X.shape[1] - 2)
-        share = (place - left).unsqueeze(-1)
-        values = torch.lerp(self.X[:, left, RATES.start :], self.X[:, left + 1, RATES.start :], share)
+        left, right, share = _between(offset, dt, count, self.period, self.X.shape[1], self.X.dtype)
+        asked = self.X[..., RATES.start :]
+        values = torch.lerp(asked.index_select(1, left), asked.index_select(1, right), share)
         return values[..., :3], values[..., 3]
+
+
+@lru_cache(maxsize=64)  # every period asks for the same times
+def _between(
+    offset: float, dt: float, count: int, period: float, knots: int, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The knots before and after the times of `Reference.at`, (K,) int64, and shares of the way between, (K, 1)."""
+    times = offset + dt * torch.arange(count, dtype=dtype)
+    place = (times / period).clamp(max=knots - 1)
+    left = place.floor().long().clamp(max=knots - 2)
+    return left, left + 1, (place - left).unsqueeze(-1)
 
 
 @dataclass(frozen=True)
@@ -128,7 +140,7 @@ class Tracker:
 
     def _reference(self, x: Tensor, reference: Reference, offset: float) -> tuple[Tensor, Tensor]:
         """The states (B, N+1, 7) and thrust accelerations (B, N) at knots 1..N that are tracked."""
-        rates, acceleration = reference.at(offset + self.dt * torch.arange(self.stages + 1, dtype=x.dtype))
+        rates, acceleration = reference.at(offset, self.dt, self.stages + 1)
         thrusts = rates.new_full((*rates.shape[:2], 4), reference.airframe.hover_thrust)
         return torch.cat((rates, thrusts), dim=-1), acceleration[:, 1:].contiguous()
 

@@ -214,6 +214,12 @@ class Engine:
         self._run(name, problem.B, self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
         return worst
 
+    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
+        """`Lagrangian.slack`, (B,)."""
+        B, found = lagrangian.problem.B, X.new_zeros(lagrangian.problem.B)
+        self._run("tgco_slack", B, self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=found, merit=found))
+        return found
+
     def chords(self, problem: Problem, X: Tensor, scale: float) -> Tensor:
         """The smallest distance (B,) of the lines between knots from spheres with radii times `scale`; or infinity."""
         U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)

@@ -17,16 +17,19 @@ from matplotlib.patches import Circle
 from torchgco.base.errors import InputError
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import ADMITTED
+from torchgco.obstacles.body import BoundBody
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import Ball, Solid
 from torchgco.plotting.gates import Outline, draw_gates
 from torchgco.plotting.maps import draw_map, unknown_handles
 from torchgco.plotting.scene import Scene, contacts, view
+from torchgco.plotting.silhouettes import balls_at, silhouettes
 from torchgco.plotting.style import INK, PALETTE
 
 VEHICLE_COLOUR = PALETTE[5]
 VIEWS: tuple[draw.Plane, draw.Plane] = (draw.ABOVE, draw.SIDE)
 POSITION = ("x0", "x1", "x2")
+DRAWN_STATES = tuple(f"x{i}" for i in range(13))  # of the plant: those that place it and turn it come first
 CONTACT: dict[str, Any] = {
     "marker": "X", "color": draw.CROSS, "markeredgecolor": "white", "markersize": 9, "linestyle": "none",
 }  # fmt: skip
@@ -40,9 +43,12 @@ class Course:
         bodies: see `bodies.bodies`.
         goal: (3,).
         goal_radius: within which the goal counts as reached.
-        vehicle_radius: r_veh.
+        vehicle_radius: r_veh; of a vehicle with a body that of the ball about its position that the body holds.
         map: of the same space, or None.
         gates: see `gates.outlines`.
+        body: of the vehicle; None: it is a ball.
+
+    A `track` has the positions (T, 3), m, of a vehicle that is a ball, or the states (T, 13) of one with a body.
 
     Raises:
         InputError: a goal of another shape.
@@ -54,16 +60,29 @@ class Course:
     vehicle_radius: float = 0.36
     map: DistanceField | None = None
     gates: tuple[Outline, ...] = ()
+    body: BoundBody | None = None
 
     def __post_init__(self) -> None:
         if np.shape(self.goal) != (3,):
             raise InputError("course.goal", "shape (3,)", np.shape(self.goal))
 
+    def track(self, frame: pd.DataFrame) -> np.ndarray:
+        """The track of a frame with columns x0 to x2, or of a vehicle with a body x0 to x12."""
+        columns = POSITION if self.body is None else DRAWN_STATES
+        return np.stack(tuple(flight(frame, *columns).values()), axis=-1)
+
     @property
     def reaches(self) -> np.ndarray:
-        """r_obs + r_veh of each obstacle, (M,); of a box, r_obs is the radius that rounds it, of a map, the last, 0."""
-        own = [body.radius + self.vehicle_radius for body in self.bodies]
-        return np.array(own if self.map is None else [*own, self.vehicle_radius])
+        """r_obs + r_veh of each obstacle, (M,), or of each ball of a body, (P M,).
+
+        Of a box, r_obs is the radius that rounds it, of a map, the last one, 0.
+        """
+        radii = [self.vehicle_radius] if self.body is None else self.body.radii[0].tolist()
+        return np.concatenate([self._reaches(radius) for radius in radii])
+
+    def _reaches(self, radius: float) -> np.ndarray:
+        own = [body.radius + radius for body in self.bodies]
+        return np.array(own if self.map is None else [*own, radius])
 
     def distances(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (M, T) of positions (T, 3) at times t (T,), s, from centres, from sides of boxes, the map."""
@@ -73,23 +92,26 @@ class Course:
 
     def infeasible(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Which positions (T, 3) at times t (T,), s, lie more than a millimetre inside an obstacle grown by r_veh."""
-        return np.any(self.distances(positions, t) < self.reaches[:, None] - ADMITTED, axis=0)
+        return np.any(self.distances(positions, t) < self._reaches(self.vehicle_radius)[:, None] - ADMITTED, axis=0)
 
-    def nearness(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
+    def nearness(self, track: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Smallest of `distances` as a share of r_obs + r_veh, (T,), at times t (T,), s; inf without obstacles."""
-        return (self.distances(positions, t) / self.reaches[:, None]).min(axis=0, initial=np.inf)
+        balls = [track] if self.body is None else list(balls_at(self.body, track)[0].swapaxes(0, 1))
+        away = np.concatenate([self.distances(ball, t) for ball in balls])
+        return (away / self.reaches[:, None]).min(axis=0, initial=np.inf)
 
     def contacts(self, track: np.ndarray, period: float) -> np.ndarray:
-        """Places (C, 3) where a track (T, 3) of control steps of `period` seconds touches an obstacle or the map."""
-        return contacts(self._scene(track[:1], period), 0, track)
+        """Places (C, 3) where a track of control steps of `period` seconds touches an obstacle or the map."""
+        return contacts(self._scene(track[:1], period), 0, track[:, :3], track)
 
     def _scene(self, start: np.ndarray, period: float = 0.0) -> Scene:
-        own = (self.bodies,), start, self.goal[None], self.vehicle_radius, self.goal_radius
-        return Scene(*own, period, np.zeros(1), self.map)
+        own = (self.bodies,), start[:, :3], self.goal[None], self.vehicle_radius, self.goal_radius
+        return Scene(*own, period, np.zeros(1), self.map, body=self.body)
 
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner (3,) of a box around goal and track (T, 3), a little wider where obstacles are."""
-        ways = [track + side * self.vehicle_radius for side in (-1.0, 1.0)]
+        """Lower and upper corner (3,) of a box around goal and track, a little wider where obstacles are."""
+        reach = self.vehicle_radius if self.body is None else float(self.body.reach[0])
+        ways = [track[:, :3] + side * reach for side in (-1.0, 1.0)]
         low, high = view(self._scene(track[:1]), [0], ways, [])
         return low, high
 
@@ -103,7 +125,7 @@ def draw_still(ax: Axes, course: Course, plane: draw.Plane) -> None:
 def draw_instant(
     ax: Axes, course: Course, t: float, track: np.ndarray, plan: np.ndarray, period: float, plane: draw.Plane
 ) -> None:
-    """Other obstacles at time t, s, the track flown so far (T, 3) with the vehicle at its end, and the plan (N+1, 3).
+    """Other obstacles at time t, s, the track flown so far with the vehicle at its end, and the plan (N+1, 3).
 
     Spheres are shown whole; boxes, capsules and maps are cut where the vehicle is, as they may be higher or wider than
     the view.
@@ -114,14 +136,17 @@ def draw_instant(
     changing = [body for body in course.bodies if not _is_still(body)]
     _draw_bodies(ax, course, changing, t, float(np.delete(track[-1], plane)[0]), plane)
     if course.map is not None:
-        draw_map(ax, course.map, track[-1:], plane, course.vehicle_radius, (draw.STONE, draw.EDGE))
-    draw.draw_ends(ax, track[0], course.goal, course.goal_radius, plane)
+        draw_map(ax, course.map, track[-1:, :3], plane, course.vehicle_radius, (draw.STONE, draw.EDGE))
+    draw.draw_ends(ax, track[0, :3], course.goal, course.goal_radius, plane)
     ax.plot(*track[:, plane].T, color=INK, linewidth=1.4, zorder=3)
     infeasible = course.infeasible(plan, t + period * np.arange(len(plan)))
     draw.draw_trajectory(ax, plan, infeasible, plane, every=2, size=7.0)
     draw_contacts(ax, course.contacts(track, period), plane)
-    at = (float(track[-1, plane[0]]), float(track[-1, plane[1]]))
-    ax.add_patch(Circle(at, course.vehicle_radius, facecolor=VEHICLE_COLOUR, edgecolor=INK, linewidth=0.8, zorder=6))
+    look: dict[str, Any] = {"facecolor": VEHICLE_COLOUR, "edgecolor": INK, "linewidth": 0.8, "zorder": 6}
+    if course.body is not None:
+        ax.add_collection(PolyCollection(silhouettes(course.body, track[-1:], plane), **look), autolim=False)
+        return
+    ax.add_patch(Circle((float(track[-1, plane[0]]), float(track[-1, plane[1]])), course.vehicle_radius, **look))
 
 
 def draw_contacts(ax: Axes, places: np.ndarray, plane: draw.Plane) -> None:
@@ -164,8 +189,3 @@ def flight(frame: pd.DataFrame, *columns: str) -> dict[str, np.ndarray]:
     if "mission" in frame.columns and frame["mission"].nunique() > 1:
         raise InputError("frame", "rows of one mission", f"{frame['mission'].nunique()} missions")
     return {name: frame[name].to_numpy(dtype=float) for name in columns}
-
-
-def positions(frame: pd.DataFrame) -> np.ndarray:
-    """Positions (T, 3) of a frame, m."""
-    return np.stack(tuple(flight(frame, *POSITION).values()), axis=-1)

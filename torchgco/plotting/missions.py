@@ -31,7 +31,6 @@ from torchgco.plotting.course import (
     draw_still,
     flight,
     handles,
-    positions,
 )
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, legend, panels, solver_colours, tasks_of, tidy
 
@@ -94,7 +93,7 @@ def distance_figure(frames: Frames, course: Course) -> Figure:
     for ax, title in zip(axes, ("", "near the boundaries"), strict=True):
         for solver, frame in frames.items():
             t = flight(frame, "t")["t"]
-            near = course.nearness(positions(frame), t)
+            near = course.nearness(course.track(frame), t)
             ax.plot(t, near, color=colours[solver], linewidth=1.4)
             ax.plot(t[-1:], near[-1:], color=colours[solver], marker="o", markersize=5, clip_on=title != "")
         ax.axhline(1.0, color=INK, linestyle=":", linewidth=1.2)
@@ -125,7 +124,7 @@ def snapshots_figure(
     Raises:
         InputError: as `compute_figure`, for a step that isn't in the frame, and for plans that don't fit it.
     """
-    t, track = flight(frame, "t")["t"], positions(frame)
+    t, track = flight(frame, "t")["t"], course.track(frame)
     check_plans(plans, len(t))
     low, high = course.limits(track)
     height = 0.4 + 3.9 * (high - low)[1:].max() / (high - low)[0]

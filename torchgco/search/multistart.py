@@ -51,7 +51,7 @@ class MultiStart(Solver):
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
         """The solver itself, and the local solver."""
-        return self, replace(self.local, max_outer_iterations=rounds)
+        return self, replace(self.local, max_outer_iterations=rounds).in_closed_loop(rounds)[1]
 
     def in_slots(self, slots: int) -> MultiStart:
         """The same solver with at most `slots` problems at a time."""

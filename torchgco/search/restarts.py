@@ -80,7 +80,8 @@ class Restarts(Solver):
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
         """The passes but the last solves, as the next plan continues this one; and the local solver, unguided."""
         passes = Passes(step for step in self.passes.steps if not step.last)
-        return replace(self, passes=passes), replace(self.local, guidance=None, max_outer_iterations=rounds)
+        local = replace(self.local, guidance=None, max_outer_iterations=rounds)
+        return replace(self, passes=passes), local.in_closed_loop(rounds)[1]
 
     @property
     def _finishes(self) -> bool:

@@ -22,9 +22,8 @@ from torchgco.problem.problem import Problem
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
 FIRST, STRONGER, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
-HIDES = (
-    0.1  # the error of a curvature by rounding, times the states' and controls' size squared, as a share of that unit
-)
+# The error of a curvature by rounding, times the states' and controls' size squared, as a share of that unit.
+HIDES = 0.1
 
 
 def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
@@ -46,8 +45,8 @@ class Optimality(NamedTuple):
 def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
     """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers."""
     problem = lagrangian.problem
-    slack = lagrangian.slack(X, U)
-    run = kernels_of(problem).optimality_pass(lagrangian, X, U)
+    kernels = kernels_of(problem)
+    slack, run = kernels.slack(lagrangian, X, U), kernels.optimality_pass(lagrangian, X, U)
     mu = torch.zeros_like(slack)
     step = run(mu)
     for i in range(TRIES):

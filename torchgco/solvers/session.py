@@ -12,7 +12,7 @@ from torchgco.base.errors import TraceWarning
 from torchgco.base.status import STOPPED, Status, is_over
 from torchgco.base.tree import Rows, is_users, put, spread, take
 from torchgco.dynamics.rollout import open_loop
-from torchgco.kernels import kernels_of, reproducible
+from torchgco.kernels import kernels_of, measured, reproducible
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -36,10 +36,12 @@ class Session:
         given: the call in the user's units.
         rules: of the solver; `call` is in their units of cost, `unit` (B,).
         record: keep the history of every problem in `recorder`.
+        by_kernels: violations of what is returned are those that the solver's kernels measure, but for a user's rows;
+            else PyTorch measures them, whatever kernels say.
     """
 
-    def __init__(self, given: Call, rules: Rules, record: bool = False) -> None:
-        self.given, self.rules = given, rules
+    def __init__(self, given: Call, rules: Rules, record: bool = False, by_kernels: bool = False) -> None:
+        self.given, self.rules, self.by_kernels = given, rules, by_kernels
         self.call, self.unit = rules.in_units(given)
         self.recorder = Recorder() if record else None
 
@@ -122,7 +124,11 @@ class Session:
         known = gains or (lambda rows: self._optimality(best, rows).K)
         X, U = reproducible(self.call.problem, best.X, best.U, known)
         user = self.given.problem
-        cost, worst = user.cost.total(X, U), violation(user.constraints, X, U)
+        cost = user.cost.total(X, U)
+        if self.by_kernels and not any(map(is_users, user.constraints)):
+            worst = measured(self.call.problem, X, U)
+        else:
+            worst = violation(user.constraints, X, U)
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
     def _optimality(self, best: Iterate, rows: Rows) -> Optimality:

@@ -16,7 +16,7 @@ from torchgco.experiments.flying.mission_flight import PLANS_KEPT
 from torchgco.experiments.flying.progress import draw as draw_all
 from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.folder import LAYOUTS, MISSION, TRIALS, read_trials
+from torchgco.experiments.results.folder import LAYOUTS, MISSION, PLANS_FILE, TIME_STEPS, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.missions.contact import Contact
@@ -28,12 +28,11 @@ from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course
 from torchgco.plotting.gates import outlines
+from torchgco.plotting.silhouettes import body_of
 from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts
 
 SNAPSHOTS = 4  # instants of a mission in one figure
-# Where few missions fly: planned positions (solver, L, K, N+1, 3), and a row per time step of the plant.
-PLANS_FILE, TIME_STEPS = "plans.npz", "time_steps.parquet"
 
 
 def mission_table(
@@ -148,5 +147,7 @@ def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
     held = layouts.vehicle_radius
     vehicle = setup.vehicle.radius if held is None else held
     gates = tuple(outlines(task.problem, 0))
-    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map, gates)
+    if (body := body_of(task.problem)) is not None:
+        vehicle = float(body.inner.vehicle_radius[0])
+    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map, gates, body)
     return course, float(task.problem.dynamics.dt)

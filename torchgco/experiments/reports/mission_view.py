@@ -15,13 +15,14 @@ from torchgco.base.errors import InputError
 from torchgco.base.memory import limited
 from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.reports.finished import Study, document_of
-from torchgco.experiments.reports.mission_report import PLANS_FILE
+from torchgco.experiments.results.folder import PLANS_FILE
 from torchgco.experiments.results.limits import LARGEST_FILE
 from torchgco.exploration.replay import replayed
 from torchgco.judging.contact import contacts
 from torchgco.missions import Mission
 from torchgco.missions.tables import STATES
 from torchgco.native.compiler import NativeError
+from torchgco.plotting.course import DRAWN_STATES
 from torchgco.problem.problem import Problem
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Flight, Rows, whole
@@ -30,7 +31,6 @@ from torchgco.view.vehicles import Look
 
 QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # the plant
 SLOW_MAP = 100  # control periods from which on a bar shows how far a map is
-DRAWN_STATES = 13  # of its states: those that place it and turn it come before the rotors'
 
 
 def missions(study: Study, found: Mapping[int, SearchPart]) -> Document:
@@ -107,13 +107,13 @@ class _Log:
 
 
 def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:
-    X = whole(steps[[f"x{i}" for i in range(DRAWN_STATES)]].to_numpy(dtype=float))
+    X = whole(steps[list(DRAWN_STATES)].to_numpy(dtype=float))
     path, clear = X[:, :3], steps["clearance"].to_numpy(dtype=float)
     bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
     place = next((i for i, one in enumerate(problem.constraints) if one in problem.obstacles), -1)
     return Flight(
         solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", _told(row), bad,
-        np.where(bad > 0, place, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt)),
+        np.where(bad > 0, place, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt), X),
         notes=_notes(steps)[: len(path)],
     )  # fmt: skip
 

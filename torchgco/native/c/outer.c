@@ -4,6 +4,7 @@
 /* What a sweep over an iterate finds. */
 typedef struct {
     V violation, touched; /* touched: rows in contact at a knot */
+    V slack;              /* sum of |lam c| over inequalities with c < 0 */
     int update;           /* whether multipliers change */
 } Sweep;
 
@@ -12,6 +13,7 @@ static inline void note(const Lanes *s, const Constraint *con, V c, V violated, 
     V zero = SET(0.0), worst = sweep->violation;
     sweep->violation = tgco_choose((violated > worst) | (violated != violated), violated, worst); /* NaN stays */
     sweep->touched += tgco_truth(c > zero);
+    if (!con->equality) SUBTRACT(sweep->slack, *lam, tgco_choose(c > zero, zero, c));
     if (!sweep->update) return;
     V next = *lam + s->mu * c;
     *lam = con->equality ? next : tgco_choose(next < zero, zero, next);
@@ -96,25 +98,25 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
     if (sweep->update) rows->pushed[place] = pushed;
 }
 
-/* The largest violation of the iterates, of all rows or of obstacles alone, and whether one is caught: `least` rows of
+/* What a sweep over the iterates finds, of all rows or of obstacles alone, and whether one is caught: `least` rows of
    obstacles or more in contact at a knot, start and end left out. */
-static V swept(Lanes *s, int obstacles, int update, V least, I *caught) {
+static Sweep swept(Lanes *s, int obstacles, int update, V least, I *caught) {
     int64_t N = s->of->N;
-    V zero = SET(0.0), worst = zero;
+    V zero = SET(0.0);
+    Sweep sweep = {zero, zero, zero, update};
     *caught = zero != zero;
     for (int64_t k = 0; k <= N; k++) {
         V contacts = zero;
         for (int64_t i = 0; i < s->of->constraints; i++) {
             const Constraint *con = s->of->constraint + i;
             if (con->place[k] == NOWHERE || (obstacles && !con->geometric)) continue;
-            Sweep sweep = {worst, zero, update};
+            sweep.touched = zero;
             note_rows(s, i, k, s->X + k * NX, k < N ? s->U + k * NU : 0, &sweep);
-            worst = sweep.violation;
             if (con->geometric) contacts += sweep.touched;
         }
         if (k > 0 && k < N) *caught |= contacts >= least;
     }
-    return worst;
+    return sweep;
 }
 
 /* Whether a trajectory of problem e counts as feasible and arrived. */
@@ -178,7 +180,7 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
         enter(s, l, e);
         least[l] = o->single_after >= 0 && o->base[e] + o->outer[e] + 1 >= o->single_after ? 1 : 2;
     }
-    V violation = swept(s, 0, !failed, least, &caught);
+    V violation = swept(s, 0, !failed, least, &caught).violation;
     for (int l = 0; l < count && !failed; l++) {
         int64_t e = number[l];
         double growth = o->growth;
@@ -191,7 +193,11 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *c = p->constraint + i;
             double *lam = c->lam + e * c->knots * c->rows;
-            for (int64_t j = 0; j < c->knots * c->rows; j++) lam[j] = s->rows[i].lam[j][l];
+            for (int64_t k = 0; k < c->knots; k++, lam += c->rows) {
+                const V *next = s->rows[i].lam + k * c->rows;
+                if (s->rows[i].pushed[k][l]) for (int j = 0; j < c->rows; j++) lam[j] = next[j][l];
+                else memset(lam, 0, c->rows * sizeof *lam);
+            }
         }
         if (preferred(o, e, violation[l])) keep(o, e, violation[l]);
         o->outer[e]++;
@@ -277,7 +283,7 @@ static int violations(const Problem *p, int obstacles, int64_t first, int64_t la
     if (!start(s, p)) return 0;
     for (int64_t e = first; e < last; e += LANES) {
         for (int l = 0; l < LANES; l++) enter_iterate(s, l, e + l < last ? e + l : e);
-        V violation = swept(s, obstacles, 0, SET(0.0), &caught);
+        V violation = swept(s, obstacles, 0, SET(0.0), &caught).violation;
         for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = violation[l];
     }
     finish(s);
@@ -289,6 +295,20 @@ int tgco_violation(const Problem *p, int64_t first, int64_t last) { return viola
 
 /* The same of rows of obstacles alone. */
 int tgco_penetration(const Problem *p, int64_t first, int64_t last) { return violations(p, 1, first, last); }
+
+/* The sums of |lam c| over inequalities with c < 0 of given trajectories, into `merit`. */
+int tgco_slack(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    I caught;
+    if (!start(s, p)) return 0;
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
+        V slack = swept(s, 0, 0, SET(0.0), &caught).slack;
+        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = slack[l];
+    }
+    finish(s);
+    return 1;
+}
 
 #if DIM > 0
 /* Squared distance of the origin from the segment that begins at a and goes along. */

@@ -115,11 +115,13 @@ static void enter(Lanes *s, int lane, int64_t e) {
         const Constraint *c = p->constraint + i;
         if (!c->lam) continue; /* `start` has set them to 0, and only an outer loop changes them, which has some */
         const double *lam = c->lam + e * c->knots * c->rows;
-        for (int64_t k = 0; k < c->knots; k++) {
+        for (int64_t k = 0; k < c->knots; k++, lam += c->rows) {
             int pushed = 0;
-            for (int j = 0; j < c->rows; j++, lam++) {
-                s->rows[i].lam[k * c->rows + j][lane] = *lam;
-                if (*lam != 0) pushed = 1, squares += *lam * *lam;
+            for (int j = 0; j < c->rows; j++) pushed |= lam[j] != 0;
+            if (!pushed && !s->rows[i].pushed[k][lane]) continue; /* as at most knots, where the lane's are 0, too */
+            for (int j = 0; j < c->rows; j++) {
+                s->rows[i].lam[k * c->rows + j][lane] = lam[j];
+                if (lam[j] != 0) squares += lam[j] * lam[j];
             }
             s->rows[i].pushed[k][lane] = -pushed;
         }
