@@ -20,7 +20,7 @@ from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import CPU, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
-from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later_in_time, numbers_in_time
+from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.explaining.account import Account
 from torchgco.kernels import cost_unit, current, interior_of
@@ -237,7 +237,9 @@ class Compiled:
         own, other = ("elapsed", "shift") if free else ("shift", "elapsed")
         given, wrong = (elapsed, shift) if free else (shift, elapsed)
         if wrong is not None:
-            raise InputError(other, f"None where the time is {'free' if free else 'fixed'}: `{own}` serves", shown(wrong))
+            raise InputError(
+                other, f"None where the time is {'free' if free else 'fixed'}: `{own}` serves", shown(wrong)
+            )
         if given is None:
             return int(self.receding)
         if isinstance(given, bool) or not isinstance(given, int | float) or not 0 <= given < math.inf:
@@ -311,9 +313,13 @@ class Compiled:
         """Have C begin `shift` stages later, and read what it doesn't share with the problem's tensors."""
         kept = self._kept
         assert kept is not None
-        if shift:
+        parts = self._changed
+        if isinstance(kept, KeptInTime):
+            with _plainly():
+                kept.shift(shift)
+                parts = kept.read(parts, self._now())
+        elif shift:
             kept.shift(shift)
-        parts = kept.read(self._changed, self._now()) if isinstance(kept, KeptInTime) and self._changed else self._changed
         for part in parts:
             if part == "dynamics":
                 kept.refresh_model()
@@ -409,7 +415,7 @@ class Compiled:
         now = self._now() if problem is None else problem
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
         seconds = None if until == math.inf else max(1e-3, until - time.perf_counter())
-        warm = None if shift is None or self._last is None else _later(now, self._last, shift)
+        warm = None if shift is None or self._last is None else later(now, self._last, shift)
         return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:
@@ -425,19 +431,8 @@ class Compiled:
         # The next call may begin with solutions, and with what only the time was over for.
         ended = status.numpy()
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
-        t = found.times if found is not None else kept.times if kept is not None else None
+        t = found.times if found is not None else None
+        if found is None and isinstance(kept, KeptInTime):
+            with _plainly():
+                t = kept.times
         return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began, t)
-
-
-def _later(problem: Problem, last: Solution, shift: float) -> Solution:
-    """A guess for a horizon that begins so many stages, or seconds, later; parts of one as `Kept.shift` takes them."""
-    if problem.time is not None:
-        return later_in_time(problem, last, shift)
-    whole = int(shift)
-    guess, part = last.shifted(whole) if whole else last, shift - whole
-    if part == 0:
-        return guess
-    one = guess.shifted()
-    X, U, K, d = (torch.lerp(getattr(guess, name), getattr(one, name), part) for name in ("X", "U", "K", "d"))
-    lam = tuple(torch.lerp(*pair, part) for pair in zip(guess.multipliers.lam, one.multipliers.lam, strict=True))
-    return replace(one, X=X, U=U, K=K, d=d, multipliers=Multipliers(lam, guess.multipliers.mu))

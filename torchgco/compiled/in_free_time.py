@@ -1,4 +1,4 @@
-"""Compiled problems with a free time: what stays packed, the numbers that have another form there, and later guesses."""
+"""Compiled problems with a free time: what stays packed, numbers that have another form there, and later guesses."""
 
 from __future__ import annotations
 
@@ -66,6 +66,8 @@ class KeptInTime(Kept):
 
     def shift(self, by: float) -> None:
         """Let all trajectories and multipliers begin `by` seconds later; see `Elapsed`."""
+        if by == 0:
+            return
         user, count = self.user, len(self.user.constraints)
         factors = factors_in(user, self.X)
         at = Elapsed.of(user, factors, by)
@@ -144,7 +146,21 @@ def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:
     ]
 
 
-def later_in_time(problem: Problem, last: Solution, seconds: float) -> Solution:
+def later(problem: Problem, last: Solution, shift: float) -> Solution:
+    """A guess for a horizon that begins so many stages, or seconds, later; parts of one as `Kept.shift` takes them."""
+    if problem.time is not None:
+        return _later_in_time(problem, last, shift)
+    whole = int(shift)
+    guess, part = last.shifted(whole) if whole else last, shift - whole
+    if part == 0:
+        return guess
+    one = guess.shifted()
+    X, U, K, d = (torch.lerp(getattr(guess, name), getattr(one, name), part) for name in ("X", "U", "K", "d"))
+    lam = tuple(torch.lerp(*pair, part) for pair in zip(guess.multipliers.lam, one.multipliers.lam, strict=True))
+    return replace(one, X=X, U=U, K=K, d=d, multipliers=Multipliers(lam, guess.multipliers.mu))
+
+
+def _later_in_time(problem: Problem, last: Solution, seconds: float) -> Solution:
     """A guess for problems with a free time, so many seconds after the solution `last` began."""
     assert last.times is not None
     factors, knots = factors_of(problem, last.times), torch.arange(problem.N + 1)

@@ -55,8 +55,7 @@ class MPC:
 
     Raises:
         InputError: as `torchgco.compile`; stages that differ in length, horizons of each problem, or free starts. Where
-            the time is free: a shortest duration below a period, `RateBounds` with a `previous`, gates that are squares
-            or not at the ends of segments.
+            the time is free: a shortest duration below a period, `RateBounds` with a `previous`.
     """
 
     def __init__(

@@ -129,10 +129,7 @@ class Plan:
         """The states (B, n) after shares (B,) of the stages k (B,)."""
         rows = torch.arange(len(k))
         states = self.X[rows, k].clone()
-        if self.knots is None:
-            lengths = np.full(len(k), self.dt)
-        else:
-            lengths = self.knots.diff(dim=1)[rows, k].numpy()
+        lengths = np.full(len(k), self.dt) if self.knots is None else self.knots.diff(dim=1)[rows, k].numpy()
         for stage, part, length in sorted(set(zip(k.tolist(), share.tolist(), lengths.tolist(), strict=True))):
             if part > 0:
                 at = torch.tensor([stage]), self.X.new_tensor([part * length]), self.X.new_tensor([length])

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.constraints.bounds import RateBounds
-from torchgco.constraints.gates import GateSquares, gates_of, has_gates
+from torchgco.constraints.gates import has_gates
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.problem import Problem
 from torchgco.problem.times import times
@@ -21,8 +21,7 @@ def stage_of(problem: Problem) -> float:
     Raises:
         InputError: dynamics without a time step, or with several, a free time, or gates.
     """
-    if has_gates(problem):
-        raise InputError("problem", "one without Gates in a loop, whose plans begin again at their knot 0", "Gates")
+    _check_no_gates(problem)
     if problem.time is not None:
         raise InputError("problem", "one of fixed times in a loop", "a free time")
     lengths = times(problem).diff()
@@ -35,25 +34,22 @@ def check_loop_in_free_time(problem: Problem, period: float) -> None:
     """Refuse, in one line each, what a loop in free time doesn't serve.
 
     Raises:
-        InputError: a shortest duration below the period; gates elsewhere than where segments end, or squares; bounds on
-            rates from the controls before.
+        InputError: gates; a shortest duration below the period; bounds on rates from the controls before.
     """
     time, dt = problem.time, problem.dynamics.dt
     assert time is not None
+    _check_no_gates(problem)
     shortest = dt * time.least[:, time.of_stages(problem.N)].sum(-1)
     if bool((shortest < period * (1.0 - STAGE_ROUNDING)).any()):
         raise InputError("time.least", f"a shortest duration of at least a period, {period:g} s", float(shortest.min()))
-    gates = gates_of(problem)
-    if isinstance(gates, GateSquares):
-        raise InputError("problem", "Gates with a radius in a loop, which a large one ends", "squares")
-    if gates is not None:
-        assert gates.places is not None
-        ends = {*time.segments[1:], problem.N}
-        if not ends.issuperset(gates.places.flatten().tolist()):
-            raise InputError("time.segments", "the knots of the gates in a loop", list(time.segments[1:]))
     if any(isinstance(part, RateBounds) and part.previous is not None for part in problem.constraints):
-        expected = "without `previous` in a loop in free time, whose stages aren't its periods"
-        raise InputError("RateBounds", expected, "with it")
+        expected = "None in a loop in free time, whose stages aren't its periods"
+        raise InputError("rate_bounds.previous", expected, "controls")
+
+
+def _check_no_gates(problem: Problem) -> None:
+    if has_gates(problem):
+        raise InputError("problem", "one without Gates in a loop, whose plans begin again at their knot 0", "Gates")
 
 
 def stages_between(count: float) -> float:

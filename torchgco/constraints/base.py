@@ -105,6 +105,8 @@ class WrappedConstraint(Constraint):
 
     constraint: Constraint
 
+    keeps_rows: ClassVar[bool] = False  # whether rows, and by how much they are violated, are those of the other one
+
     sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
     geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
     knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -36,7 +37,7 @@ class Elapsed:
         time = problem.time
         assert time is not None
         firsts, dt, N = [*time.segments, problem.N], float(problem.dynamics.dt), problem.N
-        sizes = factors.new_tensor([b - a for a, b in zip(firsts[:-1], firsts[1:], strict=True)])
+        sizes = factors.new_tensor([b - a for a, b in itertools.pairwise(firsts)])
         ends = (dt * sizes * factors).cumsum(-1)
         under_way = (ends <= seconds).sum(-1, keepdim=True).clamp(max=time.count - 1)
         even = (ends.gather(1, under_way) - seconds).clamp(min=0.0) / (dt * sizes.cumsum(0)[under_way])
@@ -54,7 +55,7 @@ class Elapsed:
         return _between(X, self.place)
 
     def controls(self, U: Tensor, stages: Tensor) -> Tensor:
-        """The means (B, N, m) of controls U (B, N, m) over the stages of what is left; `stages` (B, N) were theirs, s."""
+        """The means (B, N, m) of controls U (B, N, m), whose `stages` (B, N) lasted, s, over those of what is left."""
         added = (U * stages.unsqueeze(-1)).cumsum(1)
         added = torch.cat((torch.zeros_like(added[:, :1]), added), dim=1)
         over = torch.cat((torch.zeros_like(stages[:, :1]), stages.cumsum(1)), dim=1).unsqueeze(-1)

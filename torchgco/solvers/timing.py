@@ -78,7 +78,8 @@ class Timed:
     def __init__(self, chooser: Chooser, problem: Problem, call: Any) -> None:
         self.chooser, self.problem, self.call = chooser, problem, call
         assert problem.time is not None
-        self.time, self.through_gates = problem.time, gates_of(problem) is not None and problem.dynamics.position is not None
+        self.time = problem.time
+        self.through_gates = gates_of(problem) is not None and problem.dynamics.position is not None
         self.first = self._first()
         self.best: Solution | None = None
 
@@ -97,7 +98,7 @@ class Timed:
 
     @cached_property
     def _estimate(self) -> Tensor:
-        """The factors (B, 1 or S) of the linear model, perhaps NaN; a call with states and times needs none at first."""
+        """The factors (B, 1 or S) of the linear model, perhaps NaN: calls with states and times need none at first."""
         estimate, legs, time, N = self._steering.factors().unsqueeze(-1), self._legs, self.time, self.problem.N
         if legs is None:
             return estimate
