@@ -100,7 +100,6 @@ worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.families.worlds --write $(ARGS)
 	$(BIN)/python -m benchmarks.outside.barn --write
 	$(BIN)/python -m benchmarks.outside.maze --write --fatrop 8
-	$(BIN)/python -m benchmarks.outside.navigation --write
 	$(BIN)/python -m benchmarks.outside.jaxipm --write
 
 benchmark: $(PEERS)

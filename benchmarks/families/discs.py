@@ -30,7 +30,7 @@ LENGTH = 2.5  # wheelbase, m
 RADIUS = 0.5  # of the car, m
 D = torch.float64
 HEAD = (
-    "solver", "n", "feasible", "at the goal", "lost", "over 0.1 % more expensive", "iterations, most", "s, median",
+    "solver", "n", "at the goal", "lost", "over 0.1 % more expensive", "iterations, most", "s, median",
     f"time / `{PEERS[0]}` where that arrives, median [95 %]", "where it doesn't",
 )  # fmt: skip
 TRAP_HEAD = ("problem", "known to exist", *(f"`{name}`" for name in (OWN, *PEERS)), "iterations of `gco`")
@@ -112,8 +112,8 @@ def compared(flights: pd.DataFrame, name: str) -> list[Any]:
     ratio, arrives = own["seconds"] / by[PEERS[0]]["seconds"], by[PEERS[0]]["reached"]
     times = ["1", "1"] if name == PEERS[0] else [median(ratio[rows], ".2g") for rows in (arrives, ~arrives)]
     return [
-        f"`{name}`", n, share(own["feasible"].sum(), n), share(own["reached"].sum(), n), lost, above,
-        int(own["iterations"].max()), shown(float(own["seconds"].median()), ".2g"), *times,
+        f"`{name}`", n, share(own["reached"].sum(), n), lost, above, int(own["iterations"].max()),
+        shown(float(own["seconds"].median()), ".2g"), *times,
     ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""python -m benchmarks.families.free_time: least times against closed forms, COPS, and the race of 19 gates.
+"""python -m benchmarks.families.free_time: least times against closed forms and COPS.
 
 Every problem is stated with `FreeTime` and solved by `gco`, without any guess but that of the time where one is named.
 Beside it IPOPT through CasADi by hand: multiple shooting on equal stages with the duration as a variable, states on the
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.families.race import GATES, aimed, finer, flown, race
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import chosen, filed, markdown, share
 from torchgco import (
@@ -28,7 +27,6 @@ from torchgco import (
     FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
-    InteriorPoint,
     Problem,
     StateBounds,
     Status,
@@ -36,11 +34,6 @@ from torchgco import (
 
 D, INF = torch.float64, math.inf
 EXACT = 1e-3  # share of the least time, of equal stages of which one holds the switch
-RACE, FINER = InteriorPoint(max_iterations=1000), 1e-2  # the barrier from a solution with fewer stages
-# The barrier of a plan that is aimed. Many trajectories take as long, to 0.1 ms: from a larger one a solve ends at one
-# whose thrusts differ by newtons, and whose flight misses by as much as before, but elsewhere.
-AIMED = 1e-4
-AIMS = 3  # plans that are aimed at most, until a flight passes all gates
 
 
 @dataclass(frozen=True)
@@ -180,7 +173,7 @@ def carts(count: int, seed: int, N: int = 60) -> str:
             "IPOPT by hand: within 1e-3; iterations; ms"]  # fmt: skip
     whole = markdown(head, rows)
     few = {"guess / least time": ("none", "drawn")}
-    return filed("free_time-carts", whole, chosen(whole, head, **few))
+    return filed("free_time-carts", whole, chosen(whole, [name for name in head if name != "not CONVERGED"], **few))
 
 
 def _within(violation: np.ndarray, found: np.ndarray, best: np.ndarray) -> int:
@@ -266,14 +259,13 @@ def cops() -> str:
             theirs = T if form.weight > 0 else last[0]
             other = f"{unit * theirs:.6g}; {count}; {time.process_time() - began:.2f}" if done else f"failed; {count}"
             rows.append([name, N, f"{unit * known:.6g}", f"{unit * value:.6g}", f"{value / known - 1.0:+.1e}",
-                         found.statuses[0].name, int(found.iterations[0]), f"{spent:.3f}", other])  # fmt: skip
+                         int(found.iterations[0]), f"{spent:.3f}", other])  # fmt: skip
     head = [
         "problem",
         "N",
         "known",
         "gco",
         "relative",
-        "status",
         "iterations",
         "s",
         "IPOPT by hand: value; iterations; s",
@@ -281,61 +273,13 @@ def cops() -> str:
     return markdown(head, rows)
 
 
-def races(stages: Sequence[int], margin: float, tracks: int, seed: int) -> str:
-    """The table of the race: the track, and tracks with gates moved by up to 0.3 m along each axis, as aimed."""
-    draws, published = torch.Generator().manual_seed(seed), torch.tensor([GATES], dtype=D)
-    moved = published + 0.6 * torch.rand(tracks, len(GATES), 3, generator=draws, dtype=D) - 0.3
-    rows = _raced("as published", stages, margin, published)
-    if tracks > 0:
-        rows += _raced(f"{tracks} moved", stages, margin, moved)
-    head = ["track", "N", "CONVERGED", "duration, s", "iterations", "s, with those before", "gate at 1 ms, m", "end, m",
-            "rates over, share"]  # fmt: skip
-    return markdown(head, rows)
-
-
-def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> list[list[object]]:
-    """A row for each number of stages a leg, and those for the last aimed at where its flight shall be.
-
-    All but the first begin with the solution before. Batches: the worst.
-    """
-    rows, before, spent, passes = list[list[object]](), None, 0.0, False
-    for size in (*stages, *[stages[-1]] * AIMS):
-        if passes:
-            break
-        problem, X0, U0 = race(size, gates, 0.3)
-        solver, label = RACE, f"{problem.N}"
-        if before is not None and size > before[0]:
-            problem, X0, U0 = finer(problem, before[1], size // before[0])
-            solver = replace(RACE, initial_barrier=FINER)
-        elif before is not None:
-            began = time.process_time()
-            problem, X0, U0 = aimed(before[1], size, gates, 0.3 - margin)
-            spent += time.process_time() - began
-            solver, label = replace(RACE, initial_barrier=AIMED), f"{problem.N}, aimed"
-        solver.solve(problem, U0, X0=X0, max_seconds=1e-3)
-        began = time.process_time()
-        found = solver.solve(problem, U0, X0=X0)
-        spent += time.process_time() - began
-        there = flown(found, gates)
-        ended = sum(status is Status.CONVERGED for status in found.statuses)
-        rows.append([
-            name, label, f"{ended} of {problem.B}", f"{float(found.duration.max()):.4f}",
-            f"{int(found.iterations.median())} ({int(found.iterations.max())})", f"{spent / problem.B:.2f}",
-            *(f"{float(there[key].max()):.4f}" for key in ("gate", "end", "rate")),
-        ])  # fmt: skip
-        before, passes = (size, found), "aimed" in label and float(there["gate"].max()) <= 0.3
-    return rows
-
-
-def text(count: int, seed: int, stages: list[int], margin: float, tracks: int) -> str:
+def text(count: int, seed: int) -> str:
     """The tables."""
-    return "\n\n".join((carts(count, seed), cops(), races(stages, margin, tracks, seed)))
+    return f"{carts(count, seed)}\n\n{cops()}"
 
 
 main = Command(
-    __doc__, "free_time", text, "{count} drawn carts, {tracks} moved tracks, seed {seed}",
-    "CasADi", count=(64, "carts"), seed=(7, "of carts and tracks"), stages=([20, 80], "of each leg of the race"),
-    margin=(1e-3, "of the gates' radius in a plan that is aimed, m"), tracks=(0, "races with moved gates"),
+    __doc__, "free_time", text, "{count} drawn carts, seed {seed}", "CasADi", count=(64, "carts"), seed=(7, "of carts"),
 )  # fmt: skip
 
 if __name__ == "__main__":

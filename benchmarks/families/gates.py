@@ -1,9 +1,9 @@
-"""python -m benchmarks.families.gates: gates drawn in forests, beside IPOPT by hand, and the published race.
+"""python -m benchmarks.families.gates: gates drawn in forests, against IPOPT by hand, and the published race.
 
 The layouts are those of `torchgco scenario=gates`: a quadrotor's planning model, balls of 0.5 m as gates, spheres
 between them, and a duration for each leg. IPOPT, through CasADi's SX by hand, states the same problem as multiple
 shooting; it begins with our states, controls and times, and knows the spheres within 3 m of our knots. Layouts are
-flown in their order, for so many minutes of processor time. The race is that of `benchmarks.families.free_time`.
+flown in their order, for so many minutes of processor time. The race is that of `benchmarks.families.race`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 import torchgco
-from benchmarks.families.free_time import races
+from benchmarks.families.race import races
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import markdown, share
 from torchgco import Problem, Solution, Status
@@ -45,7 +45,6 @@ class Flown:
     iterations: int
     seconds: float  # of processor time
     by_hand: float | None = None  # s, where IPOPT solved it
-    asked: bool = False  # whether it was asked
 
 
 def field(x: Any, u: Any, gravity: float, lag: float) -> Any:
@@ -129,19 +128,19 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
     sound = bool(verdict.sound)
     hand = by_hand(problem, found) if ask and sound else None
     one = Flown(gates, found.statuses[0] is Status.CONVERGED, int(verdict.gates_passed) == gates, sound,
-                float(found.duration), int(found.iterations), spent, hand, ask and sound)  # fmt: skip
+                float(found.duration), int(found.iterations), spent, hand)  # fmt: skip
     print(number, one, file=sys.stderr, flush=True)
     return one
 
 
-def text(count: int, seed: int, beside: int, minutes: float, tracks: int, moved: int) -> str:
+def text(count: int, seed: int, ipopt: int, minutes: float, tracks: int, moved: int) -> str:
     """The tables of forests and race."""
     race = races(STAGES, MARGIN, tracks, moved)
     print(race, file=sys.stderr, flush=True)
-    return f"{table(forests(count, seed, beside, minutes))}\n\n{race}"
+    return f"{table(forests(count, seed, ipopt, minutes))}\n\n{race}"
 
 
-def forests(count: int, seed: int, beside: int, minutes: float) -> list[Flown]:
+def forests(count: int, seed: int, ipopt: int, minutes: float) -> list[Flown]:
     """Layouts from the first on, until the minutes of processor time are over, or Ctrl-C."""
     setup = torchgco.compose(["scenario=gates", f"seed={seed}"])
     layouts, flown, began = setup.layouts(count), list[Flown](), time.process_time()
@@ -149,7 +148,7 @@ def forests(count: int, seed: int, beside: int, minutes: float) -> list[Flown]:
         for number in range(count):
             task = setup.task(layouts.take([number]))
             setup.solver.solve(task.problem, task.U0, max_seconds=1e-3)  # compiles
-            flown.append(layout_flown(task, setup.solver, number, number < beside))
+            flown.append(layout_flown(task, setup.solver, number, number < ipopt))
             if time.process_time() - began > 60.0 * minutes:
                 break
     return flown
@@ -162,21 +161,20 @@ def table(flown: list[Flown]) -> str:
         some = [one for one in flown if low <= one.gates <= high]
         if some:
             rows.append([f"{low} to {high}", *_row(some)])
-    head = ["gates", "passed and clear", "CONVERGED", "duration, s", "iterations (most)", "s a layout (most)",
+    head = ["gates", "passed and clear", "duration, s", "s a layout (most)",
             "longer than IPOPT by hand by over 0.5 %", "duration / IPOPT's (most)"]  # fmt: skip
     return markdown(head, rows)
 
 
 def _row(some: list[Flown]) -> list[object]:
     good = [one for one in some if one.sound and one.passed]
-    asked = [one for one in some if one.asked]
-    ratios = [one.duration / one.by_hand for one in asked if one.by_hand is not None]
-    counts, seconds = [one.iterations for one in some], [one.seconds for one in some]
+    ratios = [one.duration / one.by_hand for one in some if one.by_hand is not None]
+    seconds = [one.seconds for one in some]
     return [
-        share(len(good), len(some)), sum(one.converged for one in some),
-        f"{np.median([one.duration for one in some]):.2f}", f"{np.median(counts):.0f} ({max(counts)})",
+        share(len(good), len(some)),
+        f"{np.median([one.duration for one in some]):.2f}",
         f"{np.median(seconds):.1f} ({max(seconds):.1f})",
-        f"{sum(ratio > 1.0 + EXACT for ratio in ratios)} of {len(ratios)} solved, {len(asked)} asked",
+        f"{sum(ratio > 1.0 + EXACT for ratio in ratios)} of {len(ratios)}",
         f"{np.median(ratios):.4f} ({max(ratios):.4f})" if ratios else "-",
     ]  # fmt: skip
 
@@ -185,12 +183,12 @@ main = Command(
     __doc__,
     "gates",
     text,
-    "layouts of seed {seed}, at most {count}, for at most {minutes} minutes; IPOPT on the first {beside} of them; "
+    "layouts of seed {seed}, at most {count}, for at most {minutes} minutes; IPOPT on the first {ipopt} of them; "
     "{tracks} tracks moved by seed {moved}, the worst of these; a margin of 1 mm where a plan is aimed",
     "CasADi",
     count=(64, "layouts"),
     seed=(12, "of the layouts; constants were chosen on others"),
-    beside=(16, "layouts that IPOPT solves, too"),
+    ipopt=(16, "layouts that IPOPT solves, too"),
     minutes=(30.0, "of processor time, after which no further layout is begun"),
     tracks=(10, "races with moved gates"),
     moved=(7, "the seed of these"),

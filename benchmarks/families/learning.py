@@ -29,8 +29,8 @@ def weights(seeds: int, count: int) -> str:
         rows.append([name, *summary(found)])
     columns = (
         "demonstrations", f"seeds with every error under {FOUND}", "largest error, median of seeds",
-        "of the worst seed", "median error, median of seeds", "seeds with the others under it, too", "identifiable",
-        "solves, median", "seconds, median and most",
+        "of the worst seed", "median error, median of seeds", "identifiable", "solves, median",
+        "seconds, median and most",
     )  # fmt: skip
     return filed("learning-weights", markdown(head, every), markdown(columns, rows))
 
@@ -38,11 +38,11 @@ def weights(seeds: int, count: int) -> str:
 def summary(found: list[Recovered]) -> list[str]:
     """A row of all seeds; errors are those of identifiable weights."""
     of = lambda name: [getattr(one, name) for one in found]
-    below = [sum(value < FOUND for value in of(name)) for name in ("largest", "of_all")]
+    below = sum(value < FOUND for value in of("largest"))
     known, unknown = sum(int(one.identifiable.sum()) for one in found), sum(len(one.found) for one in found)
     return [
-        share(below[0], len(found)), f"{median(of('largest')):.0e}", f"{max(of('largest')):.0e}",
-        f"{median(of('median')):.0e}", share(below[1], len(found)), f"{known} of {unknown}",
+        share(below, len(found)), f"{median(of('largest')):.0e}", f"{max(of('largest')):.0e}",
+        f"{median(of('median')):.0e}", f"{known} of {unknown}",
         f"{median(of('solves')):.0f}", f"{median(of('seconds')):.1f}, {max(of('seconds')):.1f}",
     ]  # fmt: skip
 
@@ -63,11 +63,9 @@ def nets(kind: str, seeds: int, steps: int) -> str:
         one = trained(kind, seed, steps)
         rows.append([
             seed, *(distance(part) for part in (one.before, one.after)), f"{one.differentiable:.1%}",
-            f"{one.seconds:.0f}", f"{one.elapsed:.0f}", f"{one.first:.1f}",
+            f"{one.seconds:.0f}", f"{one.first:.1f}",
         ])  # fmt: skip
-    return markdown(
-        ("seed", "before", "after", "with gradients", "seconds", "elapsed", "of these the first step"), rows
-    )
+    return markdown(("seed", "before", "after", "with gradients", "seconds", "of the first step"), rows)
 
 
 def distance(missed: Tensor) -> str:

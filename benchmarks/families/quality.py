@@ -19,7 +19,7 @@ import pandas as pd
 from benchmarks.lib import ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, FAMILIES, Family
-from benchmarks.lib.page import crossed, filed, interval, machine, markdown, origin, put, share, shown
+from benchmarks.lib.page import chosen, crossed, filed, interval, machine, markdown, origin, put, share, shown
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.judging.judge import SUCCESS_VIOLATION
@@ -35,6 +35,7 @@ HEAD = (
     "median seconds",
 )  # fmt: skip
 
+SHOWN = "family", "solver", "n", "reached", "success", "median cost", "median seconds"
 SHORT = ("Success", "Median seconds")  # of several solvers
 
 
@@ -46,6 +47,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if len(asked.solvers) > 1:
         parts = (crossed(text, "family", "solver", cell) for cell in ("success", "median seconds"))
         text = filed("ladder", text, *(f"{title}:\n\n{part}" for title, part in zip(SHORT, parts, strict=True)))
+    else:
+        text = chosen(text, SHOWN)
     if set(asked.families) == set(FAMILIES) and asked.write:
         name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}."
         put(ROOT / "benchmarks" / PAGES[name], name, f"{head}\n\n{text}")

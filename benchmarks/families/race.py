@@ -8,16 +8,21 @@ licence), resources/racetrack/race_uzh_19wp.yaml and parameters/cpc/cpc_quad.yam
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from benchmarks.lib.page import markdown
 from torchgco import (
     ControlBounds,
     FreeTime,
     FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
+    InteriorPoint,
     Problem,
     Solution,
     StateBounds,
@@ -36,6 +41,11 @@ ARM, TURN = 0.15, 0.05  # m, to each axis; yaw torque per newton, m
 STRONGEST, FASTEST = 6.879, (15.0, 15.0, 3.0)  # N per rotor, rad/s
 PACE = 8.0  # m/s, of the guess on straight lines
 MEAN = float(torch.tensor([START, *GATES, END], dtype=D).diff(dim=0).norm(dim=-1).mean())  # m, of a leg
+RACE, FINER = InteriorPoint(max_iterations=1000), 1e-2  # the barrier from a solution with fewer stages
+# The barrier of a plan that is aimed. Many trajectories take as long, to 0.1 ms: from a larger one a solve ends at one
+# whose thrusts differ by newtons, and whose flight misses by as much as before, but elsewhere.
+AIMED = 1e-4
+AIMS = 3  # plans that are aimed at most, until a flight passes all gates
 
 
 def rates(x: Tensor, u: Tensor) -> Tensor:
@@ -186,3 +196,48 @@ def flown(solution: Solution, gates: Tensor, dt: float = 1e-3) -> dict[str, Tens
             rate = torch.maximum(rate, (x[:, 10:].abs() / torch.tensor(FASTEST, dtype=D)).amax(-1) - 1.0)
     end = (x[:, :3] - torch.tensor(END, dtype=D)).norm(dim=-1)
     return {"gate": nearest.amax(-1), "end": end, "rate": rate}
+
+
+def races(stages: Sequence[int], margin: float, tracks: int, seed: int) -> str:
+    """The table of the race: the track, and tracks with gates moved by up to 0.3 m along each axis, as aimed."""
+    draws, published = torch.Generator().manual_seed(seed), torch.tensor([GATES], dtype=D)
+    moved = published + 0.6 * torch.rand(tracks, len(GATES), 3, generator=draws, dtype=D) - 0.3
+    rows = _raced("as published", stages, margin, published)
+    if tracks > 0:
+        rows += _raced(f"{tracks} moved", stages, margin, moved)
+    head = ["track", "N", "duration, s", "s, with those before", "gate at 1 ms, m", "end, m",
+            "rates over, share"]  # fmt: skip
+    return markdown(head, rows)
+
+
+def _raced(name: str, stages: Sequence[int], margin: float, gates: Tensor) -> list[list[object]]:
+    """A row for each number of stages a leg, and those for the last aimed at where its flight shall be.
+
+    All but the first begin with the solution before. Batches: the worst.
+    """
+    rows, before, spent, passes = list[list[object]](), None, 0.0, False
+    for size in (*stages, *[stages[-1]] * AIMS):
+        if passes:
+            break
+        problem, X0, U0 = race(size, gates, 0.3)
+        solver, label = RACE, f"{problem.N}"
+        if before is not None and size > before[0]:
+            problem, X0, U0 = finer(problem, before[1], size // before[0])
+            solver = replace(RACE, initial_barrier=FINER)
+        elif before is not None:
+            began = time.process_time()
+            problem, X0, U0 = aimed(before[1], size, gates, 0.3 - margin)
+            spent += time.process_time() - began
+            solver, label = replace(RACE, initial_barrier=AIMED), f"{problem.N}, aimed"
+        solver.solve(problem, U0, X0=X0, max_seconds=1e-3)
+        began = time.process_time()
+        found = solver.solve(problem, U0, X0=X0)
+        spent += time.process_time() - began
+        there = flown(found, gates)
+        rows.append([
+            name, label, f"{float(found.duration.max()):.4f}",
+            f"{spent / problem.B:.2f}",
+            *(f"{float(there[key].max()):.4f}" for key in ("gate", "end", "rate")),
+        ])  # fmt: skip
+        before, passes = (size, found), "aimed" in label and float(there["gate"].max()) <= 0.3
+    return rows

@@ -124,7 +124,8 @@ def table(summary: pd.DataFrame) -> str:
 
 def short(table: str) -> str:
     """The table as a file, and the rows of `gco`."""
-    return filed("transition", table, chosen(table, cells_of(table)[0], solver=("`gco`",)))
+    speed, _, _, *densities = cells_of(table)[0]
+    return filed("transition", table, chosen(table, [speed, *densities], solver=("`gco`",)))
 
 
 if __name__ == "__main__":

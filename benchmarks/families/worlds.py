@@ -32,7 +32,7 @@ HEAD = (
     "seconds per problem, median",
 )  # fmt: skip
 
-OWN = ("world", "n", "reached, of solved layouts", "success", *HEAD[-2:])  # of `gco`
+OWN = ("world", "success", *HEAD[-2:])  # of `gco`
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -138,12 +138,11 @@ def cells(drives: Drives, optimal: np.ndarray) -> list[str]:
     success = f"{share(drives.sound.sum(), len(optimal))} %"
     score = f"{drives.score(optimal).mean():.3f}"
     if not drives.sound.any():
-        return [success, score, *"----"]
-    seconds, clearance, change = (z[drives.sound] for z in (drives.seconds, drives.clearance, drives.turn_change))
+        return [success, score, *"---"]
+    seconds, clearance = (z[drives.sound] for z in (drives.seconds, drives.clearance))
     ratio = seconds / optimal[drives.sound]
     return [
         success, score, f"{seconds.mean():.2f}", f"{ratio.mean():.3f}, {ratio.max():.3f}", f"{clearance.min():.3f}",
-        f"{change.max():.1f}",
     ]  # fmt: skip
 
 
@@ -151,10 +150,10 @@ KINDS = ["test", "others"]
 BODIES: dict[str, float | Body] = {"disc": VEHICLE, "rectangle": RECTANGLE}
 HEAD = (
     "planner", "worlds", "success", "score", "mean time, s", "time / shortest: mean, largest", "least clearance, m",
-    "change of turn rate, rad/s^2", "seconds per world",
+    "seconds per world",
 )  # fmt: skip
 # README of Daffan/the-barn-challenge: 50 worlds, ten runs each, "Avg Success: 0.8800".
-DWA = ["DWA, as published", "test", "0.88 of 500 runs", "0.169", "33.47", *"----"]
+DWA = ["DWA, as published", "test", "0.88 of 500 runs", "0.169", "33.47", *"---"]
 
 
 def planned(problem: Problem, seed: int) -> Tensor:

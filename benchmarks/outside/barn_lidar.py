@@ -76,8 +76,6 @@ class Robot:
     plan: np.ndarray = field(default_factory=lambda: np.zeros((STAGES, 2)))  # controls, from the next period on
     driven: list[np.ndarray] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)  # of every period: map and plan
-    searched: int = 0
-    braked: int = 0
 
     def sense(self, step: int, seed: int) -> None:
         """Mark the cells of the scan's returns."""
@@ -117,7 +115,6 @@ class Robot:
         if self.driven:
             plans.append(torchgco.presets.al_ilqr(problem).solve(problem, start, seed=seed))
         if not (plans and arrives(plans[0]) and self.clear_until_rest(x, plans[0].U[0, 0].numpy())):
-            self.searched += 1
             for search in (torchgco.presets.gco_fast, torchgco.presets.gco):
                 plans.append(search(problem).solve(problem, start, seed=seed))
                 if arrives(plans[-1]):
@@ -128,7 +125,6 @@ class Robot:
                 return plan.U[0].numpy()
         if self.clear_until_rest(x, self.plan[0]):
             return self.plan
-        self.braked += 1
         return braking(x, before)
 
     def clear_until_rest(self, x: np.ndarray, u: np.ndarray) -> bool:
@@ -201,8 +197,6 @@ class Run:
     clearance: float  # m
     turn_change: float  # rad/s^2
     period: np.ndarray  # s, of every period
-    searched: int
-    braked: int
 
 
 def run(x0: np.ndarray, centers: np.ndarray, number: int, seed: int) -> Run:
@@ -216,7 +210,7 @@ def run(x0: np.ndarray, centers: np.ndarray, number: int, seed: int) -> Run:
     arrived = bool(np.linalg.norm(robot.x[:2] - GOAL) <= GOAL_RADIUS)
     outcome = "COLLISION" if clearance <= 0 else "REACHED" if arrived else "TIMEOUT"
     change = float(np.abs(np.diff(U[:, 1], prepend=0.0)).max() / DT)
-    return Run(outcome, len(U) * DT, clearance, change, np.array(robot.seconds), robot.searched, robot.braked)
+    return Run(outcome, len(U) * DT, clearance, change, np.array(robot.seconds))
 
 
 def drives(first: int | None, runs: int, seed: int) -> pd.DataFrame:
@@ -234,8 +228,7 @@ def drives(first: int | None, runs: int, seed: int) -> pd.DataFrame:
 
 HEAD = (
     "sensor", "runs", "success", "COLLISION", "TIMEOUT", "score", "mean time, s", "time / shortest: mean, largest",
-    "least clearance, m", "change of turn rate, rad/s^2", "searches per run", "stops per run",
-    "ms of a period: median, 99 %", "above 100 ms",
+    "least clearance, m", "ms of a period: median, 99 %", "above 100 ms",
 )  # fmt: skip
 
 
@@ -253,7 +246,6 @@ def table(first: int | None, runs: int, seed: int) -> str:
     row = [
         "lidar", len(found), f"{share(sound.sum(), len(found))} %", *ended, f"{score.mean():.3f}",
         f"{there['seconds'].mean():.2f}", f"{ratio.mean():.3f}, {ratio.max():.3f}", f"{found['clearance'].min():.3f}",
-        f"{found['turn_change'].max():.1f}", f"{found['searched'].mean():.1f}", f"{found['braked'].mean():.1f}",
         f"{np.median(periods):.0f}, {np.quantile(periods, 0.99):.0f}",
         f"{(periods > 100).sum()} of {len(periods)}",
     ]  # fmt: skip

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.lib.command import Command
-from benchmarks.lib.comparison import Comparison, cost_ratios, count, mean, median, named, share_within, timed, within
+from benchmarks.lib.comparison import Comparison, cost_ratios, mean, median, named, share_within, timed
 from benchmarks.lib.limited import limited
 from benchmarks.outside.golden import IPOPT
 from benchmarks.outside.maze_problem import drawn, maze, recount, waypoint_guess
@@ -43,9 +43,7 @@ def median_cost(own: pd.DataFrame, peer: pd.DataFrame) -> str:
 COMPARISON = Comparison(counted, [
     ("solver", named("solver")),
     ("initial guess", named("guess")),
-    ("n", count),
     ("violation <= 1e-6", share_within(TOLERANCE)),
-    ("violation <= 1e-3", within(1e-3)),
     ("median cost", median_cost),
     ("cost, share of IPOPT's: least, median, largest", cost_ratios(1e-3)),
     ("iterations, median", median("iterations", 0)),

@@ -134,22 +134,6 @@ def line_guess(x0: Tensor) -> tuple[Tensor, Tensor]:
     return (1 - share) * x0.unsqueeze(1) + share * end, x0.new_ones(x0.shape[0], N, 4)
 
 
-def recount(x0: np.ndarray, U: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cost (B,), largest violation (B,) and states (B, N+1, 13) of controls U (B, N, 4), rolled out in NumPy.
-
-    No code is shared with the problem or the solvers. The violation is in m, m/s, rad/s, and shares of hovering speed.
-    """
-    X = rolled(x0, U)
-    squares = (np.array(RADII) + VEHICLE) ** 2 * (1 + GROWTH * DT * np.arange(N)[:, None])
-    apart = np.linalg.norm(X[:, :N, None, :2] - np.array(CENTERS), axis=-1)
-    worst = [
-        (np.sqrt(squares) - apart).max((1, 2)),
-        (np.abs(X[..., [0, 1, 2, 7, 8, 9, 10, 11, 12]]) - BOUND).max((1, 2)),
-        np.maximum(SLOWEST / HOVER - U, U - FASTEST / HOVER).max((1, 2)),
-    ]
-    return (X**2 @ np.array(WEIGHTS)).sum(-1), np.maximum(0.0, np.max(worst, axis=0)), X
-
-
 def rolled(x0: np.ndarray, U: np.ndarray) -> np.ndarray:
     """States (B, N+1, 13) from x0 (B, 13) by controls U (B, N, 4), in NumPy: a second version of `quadrotor`."""
     J, X = np.array(INERTIA), [x0]

@@ -11,8 +11,8 @@ from pathlib import Path
 
 # The longest sections are last, as they take the time that is left; only `targets`, which reads the others, follows.
 SECTIONS = (
-    "first_use", "latency", "loop", "swing_up", "learned", "own_model", "paper", "mppi", "share", "growth", "cores",
-    "batch", "scaling", "families", "targets",
+    "first_use", "latency", "loop", "endless", "swing_up", "learned", "own_model", "paper", "mppi", "share", "growth",
+    "cores", "batch", "scaling", "families", "targets",
 )  # fmt: skip
 ON_GPU = ("mppi", "batch", "families")
 HERE = Path(__file__).resolve().parents[1]

@@ -1,4 +1,4 @@
-"""The time to solve a single problem, cold and from the previous solution."""
+"""The time to solve a single problem, cold and from the previous solution, the latter also by a compiled problem."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from statistics import mean
 
+import torchgco
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import CasADiPeer
 from torchgco.experiments.config.build import Setup
@@ -54,7 +55,9 @@ def run(bench: Bench) -> None:
             break
         began = time.monotonic()
         solution = _fly(bench, setup, task, "cold", None, flights)
-        _fly(bench, setup, _next(task, solution), "warm", solution.multipliers.shifted(), flights)
+        following = _next(task, solution)
+        _fly(bench, setup, following, "warm", solution.multipliers.shifted(), flights)
+        _fly_compiled(bench, task, following, flights)
         known = time.monotonic() - began
     _say(bench, flights)
 
@@ -73,6 +76,15 @@ def _fly(bench: Bench, setup: Setup, task: Task, start: str, warm: Multipliers |
     return solution
 
 
+def _fly_compiled(bench: Bench, task: Task, following: Task, flights: AllFlights) -> None:
+    """The same step by a compiled problem, after its own first solve."""
+    compiled = torchgco.compile(task.problem, receding=True)
+    setup_time = bench.timed(compiled)[1]
+    answer, took = bench.timed(lambda: compiled(x0=following.problem.x0))
+    verdict = judge(following.problem, answer.U, following.goal, following.goal_radius)
+    flights["warm", "compile"].add(took, setup_time.seconds, verdict)
+
+
 def _say(bench: Bench, flights: AllFlights) -> None:
     means = {key: mean(took.seconds for took in mine.times) for key, mine in flights.items()}
     for (start, solver), mine in flights.items():
@@ -82,9 +94,9 @@ def _say(bench: Bench, flights: AllFlights) -> None:
         bench.row(SECTION, start, solver, "set-up", 1000 * mean(mine.setups), "ms")
         for word in ("feasible", "reached"):
             bench.row(SECTION, start, solver, word, mine.count(word))
-        ratio = means[start, "fatrop"] / means[start, "gco"]
-        if solver == "gco":
-            bench.row(SECTION, start, solver, "seconds fatrop / gco", ratio, "", "fatrop / gco")
+        ratio = means[start, "fatrop"] / means[start, solver]
+        if solver != "fatrop":
+            bench.row(SECTION, start, solver, f"seconds fatrop / {solver}", ratio, "", f"fatrop / {solver}")
 
 
 def _next(task: Task, solution: Solution) -> Task:

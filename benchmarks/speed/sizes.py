@@ -27,6 +27,9 @@ class Sizes:
     loop_disturbed: int = 2000
     loop_fleets: tuple[int, ...] = (8, 64, 256)
     loop_compiled: bool = True  # peers that are compiled, too
+    # endless
+    endless_steps: int = 3000
+    endless_missions: int = 256
     # swing_up
     swing_seeds: int = 20
     # learned
@@ -65,9 +68,9 @@ class Sizes:
 
 QUICK = Sizes(
     family_batch=4, large_batch=8, layouts=2, slow_layouts=1, ipopt_layouts=1, latency_layouts=2, loop_periods=24,
-    loop_disturbed=40, loop_fleets=(8,), loop_compiled=False, swing_seeds=1, own_models=1, training_steps=3,
-    own_layouts=4,
-    paper_layouts=2, models=1, whole_batches=(1, 8), limited_batches=(1, 64), fewest_layouts=2,
+    loop_disturbed=40, loop_fleets=(8,), loop_compiled=False, endless_steps=200,
+    endless_missions=4, swing_seeds=1, own_models=1, training_steps=3,
+    own_layouts=4, paper_layouts=2, models=1, whole_batches=(1, 8), limited_batches=(1, 64), fewest_layouts=2,
     world_batch=2, cores_batch=16, growth_batch=8, peers_layouts=1, stages=(50, 100), obstacles=(10, 30),
     samples=(1000,), mppi_repeats=3, share_batch=8, share_alone=4,
 )  # fmt: skip

@@ -20,12 +20,15 @@ WORDS = {
     "families": "Drawn layouts (seed 1000), of which the peers fly the first, before and after `gco`; the second\n"
     "table has each peer's seconds per problem / those of `gco`.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
-    "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
-    "finds its kernels, FATROP's program is built.",
+    "rest of the solution, `gco` from its multipliers as well; `compile` is the same step by a compiled problem.\n"
+    "Set-up does not count: `gco` traces the model and finds its kernels, `compile` makes its first solve, FATROP's\n"
+    "program is built.",
     "loop": "A car (4 states, 2 controls, RK4) follows a reference between two discs, 20 stages of 0.1 s: time of a\n"
     "period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep their multipliers;\n"
     "`compile` solves to 1e-8. Disturbed cars meet discs in their way. `solved` counts periods in which all\n"
     "cars are.",
+    "endless": "Loops that don't end: the resident memory of a process whose `MPC` drives a disturbed car, and the\n"
+    "processor time of compilers that it starts; steps of the environment of missions, without a planner.",
     "swing_up": "A cart-pole (4 states, 1 control, RK4, both bounded) swings up and stays, 75 stages of 0.02 s, 200\n"
     "periods from each of several starts near rest, disturbed in every period: time of a period but the first,\n"
     "and of that. `up` counts starts that end within 0.2 of the upright rest.",
