@@ -15,13 +15,13 @@ from pathlib import Path
 import torch
 from PIL import Image
 
+from benchmarks.causes.seen import seen_figure
 from benchmarks.families.unknown import CASES
 from benchmarks.lib import RESULTS
 from benchmarks.lib.command import parser_of
 from torchgco import compose
 from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course
-from torchgco.plotting.seen import seen_figure
 
 DPI = 100
 WIDTH = 900  # pixels

@@ -12,10 +12,11 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
 from benchmarks.lib.recorded import solve
+from benchmarks.paper import drawing
 from benchmarks.paper.flights import Flight
+from benchmarks.paper.planar_animation import Picture, planar_animation
 from torchgco.plotting import missions as draw
-from torchgco.plotting import trajectory
-from torchgco.plotting.animation import Picture, mission_animation, planar_animation
+from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.course import VIEWS, flight
 from torchgco.plotting.style import INK, PALETTE, SMALL, legend
 from torchgco.solution import Fate
@@ -66,11 +67,11 @@ def snapshots(part: Flight) -> Figure:
         call = part.sampled[step]
         for ax, plane in zip(figure.axes[2 * i : 2 * i + 2], VIEWS, strict=True):
             if call is not None:
-                trajectory.draw_samples(ax, call.samples(SAMPLES), plane)
-                trajectory.draw_plan(ax, call.plan[:, call.problem.position].numpy(), plane)
+                drawing.draw_samples(ax, call.samples(SAMPLES), plane)
+                drawing.draw_plan(ax, call.plan[:, call.problem.position].numpy(), plane)
     held = figure.legends[0].legend_handles
     figure.legends[0].remove()
-    legend(figure, [*(handle for handle in held if handle is not None), *trajectory.handles("samples", "plan")])
+    legend(figure, [*(handle for handle in held if handle is not None), *drawing.handles("samples", "plan")])
     return figure
 
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from benchmarks.paper import drawing
 from benchmarks.paper.runs import Solve, Step
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.style import INK, PALETTE, legend, panels, tidy
@@ -30,7 +31,7 @@ def caught(alone: Solve, guided: Solve) -> Figure:
     _guide(right, step, samples=0)
     _path(right, guided, step.path)
     some = np.flatnonzero(step.guided)[np.linspace(0, step.guided.sum() - 1, 4).round().astype(int)]
-    draw.draw_pulls(right, step.path[some], step.centers[some])
+    drawing.draw_pulls(right, step.path[some], step.centers[some])
     _finish(figure, [left, right], alone, "infeasible", "region", "plan", "pull")
     return figure
 
@@ -158,7 +159,7 @@ def _chosen(steps: Sequence[Step]) -> list[Step]:
 
 
 def _scene(ax: Axes, solve: Solve, title: str) -> None:
-    draw.draw_obstacles(ax, solve.centers, solve.radii, solve.margin)
+    drawing.draw_obstacles(ax, solve.centers, solve.radii, solve.margin)
     draw.draw_ends(ax, *solve.ends)
     draw.frame(ax, LOW, HIGH)
     tidy(ax, title, grid=None)
@@ -172,9 +173,9 @@ def _path(ax: Axes, solve: Solve, positions: np.ndarray) -> None:
 def _guide(ax: Axes, step: Step, samples: int = SAMPLES) -> None:
     if step.sampling is not None:
         if samples > 0:
-            draw.draw_samples(ax, step.sampling.samples(samples))
-        draw.draw_plan(ax, step.sampling.plan[:, :2].numpy())
-        draw.draw_region(ax, step.centers, step.radii)
+            drawing.draw_samples(ax, step.sampling.samples(samples))
+        drawing.draw_plan(ax, step.sampling.plan[:, :2].numpy())
+        drawing.draw_region(ax, step.centers, step.radii)
 
 
 def _finish(figure: Figure, axes: Sequence[Axes], solve: Solve, *names: str) -> None:
@@ -182,4 +183,4 @@ def _finish(figure: Figure, axes: Sequence[Axes], solve: Solve, *names: str) -> 
     for ax in axes:
         ax.label_outer()
     draw.time_bar(figure, axes, solve.dt * solve.problem.N)
-    legend(figure, draw.handles("knot", *names, "obstacle", "inflated", "start", "goal"))
+    legend(figure, drawing.handles("knot", *names, "obstacle", "inflated", "start", "goal"))

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.paper import drawing
 from benchmarks.paper.runs import Solve
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.convergence import convergence_figure
@@ -32,7 +33,7 @@ def plans(solves: Sequence[Solve]) -> Figure:
         ax.set_xlabel("")
     draw.time_bar(figure, grid.flat, solves[0].dt * solves[0].problem.N)
     names = ("knot", "infeasible", "samples", "plan", "obstacle", "inflated", "start", "goal")
-    legend(figure, draw.handles(*names, plan="MPPI's result; in (c) a proposal along a path"))
+    legend(figure, drawing.handles(*names, plan="MPPI's result; in (c) a proposal along a path"))
     return figure
 
 
@@ -53,13 +54,13 @@ def costs(solves: Sequence[Solve]) -> Figure:
 
 
 def _view(ax: Axes, solve: Solve, plane: draw.Plane) -> None:
-    draw.draw_obstacles(ax, solve.centers, solve.radii, solve.margin, plane, opacity=0.5)
+    drawing.draw_obstacles(ax, solve.centers, solve.radii, solve.margin, plane, opacity=0.5)
     last = next((step for step in reversed(solve.steps) if step.sampling is not None), None)
     if last is not None and last.sampling is not None:
-        draw.draw_samples(ax, last.sampling.samples(SAMPLES), plane)
-        draw.draw_plan(ax, last.sampling.plan.numpy(), plane)
+        drawing.draw_samples(ax, last.sampling.samples(SAMPLES), plane)
+        drawing.draw_plan(ax, last.sampling.plan.numpy(), plane)
     if solve.proposal is not None:
-        draw.draw_plan(ax, solve.proposal, plane, width=4.0)
+        drawing.draw_plan(ax, solve.proposal, plane, width=4.0)
     draw.draw_trajectory(ax, solve.positions, solve.infeasible(solve.positions), plane)
     start, goal = solve.ends
     draw.draw_ends(ax, start, goal, np.nan, plane)

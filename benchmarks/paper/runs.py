@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.paper.drawing import inside
 from torchgco import compose
 from torchgco.base.draws import DrawKey
 from torchgco.guidance import GCO, MPPI
 from torchgco.kernels import open_loop
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.plotting.trajectory import inside
 from torchgco.problem.problem import Problem
 from torchgco.search import PathProposals
 from torchgco.search.proposals import propose

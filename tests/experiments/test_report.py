@@ -90,9 +90,11 @@ def test_trajectories_are_made_from_the_controls_and_drawn(flown: Path) -> None:
         seen.update(controls=solutions["U"].shape)
         return {"gco": np.zeros((2, 4, 6))}
 
-    write_report(flown, roll_out)
+    text = write_report(flown, roll_out, printed="one")
     assert seen == {"controls": (1, 2, 3, 2)}
-    assert (flown / "figures" / "layouts.png").is_file()
+    drawn = {path.name for path in (flown / "figures").iterdir()}
+    assert {"layouts.png", "study.png", "study.pdf"} <= drawn
+    assert "1/2 50 %" in text and "|" not in text
 
 
 def test_a_folder_without_trials_is_named(tmp_path: Path) -> None:

@@ -261,7 +261,9 @@ def test_a_layout_digest_depends_only_on_what_is_flown() -> None:
     codes = layout_digests(scene(), PLANE)
     assert len(set(codes.values())) == 2
     assert layout_digests(scene().take([1]), PLANE) == {1: codes[1]}
-    assert layout_digests(scene().pad(4), PLANE) == codes, "absent obstacles do not count"
+    absent = np.full((2, 2, 2), np.nan)
+    padded = Layouts(np.concatenate((scene().centers, absent), 1), np.concatenate((scene().radii, absent[..., 0]), 1))
+    assert layout_digests(padded, PLANE) == codes, "absent obstacles do not count"
     assert layout_digests(scene(best_cost=np.ones(2)), PLANE) == codes
     assert layout_digests(scene(velocities=0 * scene().centers), PLANE) == codes
     assert layout_digests(scene(), PLANE | {"name": "other", "radius": 0.10, "stages": 5.0}) == codes

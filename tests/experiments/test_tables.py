@@ -76,7 +76,7 @@ def sweep(tmp_path: Path) -> Path:
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports draw nothing: their figures take most of the time of a small report."""
-    monkeypatch.setattr(report, "_figures", lambda parts: {})
+    monkeypatch.setattr(report, "drawings", lambda part: {})
 
 
 def read(text: str, form: str) -> pd.DataFrame:

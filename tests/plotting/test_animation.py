@@ -7,9 +7,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from torchgco.base.errors import InputError
 from torchgco.plotting import animation
-from torchgco.plotting.animation import Picture, mission_animation, planar_animation
+from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.bodies import Ball
 from torchgco.plotting.course import Course
 
@@ -86,17 +85,3 @@ def test_colours_stay_those_of_the_drawing(tmp_path: Path) -> None:
     (first, *_), _ = pictures(mission_animation(frame, plans, course(0.0), PERIOD, tmp_path / "a.gif"))
     colours = {tuple(colour) for colour in first.reshape(-1, 3).tolist()}
     assert {(255, 255, 255), (0x56, 0xB4, 0xE9)} <= colours  # paper, vehicle
-
-
-def test_pictures_of_a_planar_solve_stay_as_long_as_asked(tmp_path: Path) -> None:
-    path = np.stack((np.linspace(-1.0, 1.0, 20), np.zeros(20)), axis=-1)
-    many = np.stack([path + np.array([0.0, 0.1 * i]) for i in range(4)])
-    shown = [Picture("caught", path[None], seconds=0.3), Picture("candidates", many, path[None], 0.5)]
-    ends = path[0], path[-1]
-    target = planar_animation(shown, np.zeros((1, 2)), np.array([0.3]), ends, tmp_path / "a.gif", 0.1, 0.2)
-    found, duration = pictures(target)
-    assert duration == 800 and len(found) == 2 and changed(*found) > 100
-    red = (np.abs(found[0].astype(int) - [0xD0, 0, 0]).sum(axis=-1) < 60).sum()
-    assert red > 10  # crosses inside the circle
-    with pytest.raises(InputError, match="iterates"):
-        planar_animation([], np.zeros((1, 2)), np.array([0.3]), ends, tmp_path / "b.gif")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.collections import PatchCollection, PathCollection
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from torchgco.plotting import trajectory as draw
@@ -31,21 +31,3 @@ def test_dots_and_crosses_are_thinned_apart(ax: Axes) -> None:
     assert len(np.asarray(dots.get_offsets())) == 2
     (crosses,) = [line for line in ax.lines if line.get_marker() == "x"]
     assert np.array(crosses.get_data()).T.tolist() == [[0.0, 0.0]]
-
-
-def test_inside_leaves_out_absent_spheres_and_touching_knots() -> None:
-    points = np.array([[0.0, 0.0], [0.4995, 0.0], [0.49, 0.0], [9.0, 9.0]])
-    centers, radii = np.array([[0.0, 0.0], [np.nan, np.nan], [9.0, 9.0]]), np.array([0.5, np.nan, 0.0])
-    assert draw.inside(points, centers, radii).tolist() == [True, False, True, False]
-
-
-def test_only_guided_knots_and_present_obstacles_have_a_circle(ax: Axes) -> None:
-    draw.draw_region(ax, PATH, np.array([np.inf, 0.1, 0.2, np.inf]))
-    draw.draw_obstacles(ax, PATH[:2], np.array([0.3, np.nan]), margin=0.1)
-    counts = [len(part.get_paths()) for part in ax.collections if isinstance(part, PatchCollection)]
-    assert counts == [2, 1, 1]
-
-
-def test_a_legend_takes_other_words() -> None:
-    plan, goal = draw.handles("plan", "goal", plan="along a path")
-    assert (plan.get_label(), goal.get_label()) == ("along a path", "goal")

@@ -201,16 +201,6 @@ def test_take():
         assert message in str(caught.value)
 
 
-def test_pad():
-    padded = example().pad(4)
-    assert padded.radii.shape == (2, 4) and padded.velocities is not None
-    assert np.isnan(padded.radii[:, 2:]).all() and np.isnan(padded.velocities[:, 2:]).all()
-    assert np.array_equal(padded.centers[:, :2], example().centers, equal_nan=True)
-    assert example().pad(2) == example()
-    with pytest.raises(InputError, match=r"layouts\.pad: expected at least the 2 obstacles there are, got 1"):
-        example().pad(1)
-
-
 def test_concatenate_pads_and_fills():
     still = Layouts(
         **{

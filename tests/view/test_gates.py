@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from tests.constraints.test_gates import AHEAD, BALLS, PLACES, SQUARES, points
-from torchgco.view.outlines import outlines_of
+from torchgco.view.document import outlines_of
 
 
 def test_rings_lie_on_their_balls_across_the_way() -> None:

@@ -18,9 +18,8 @@ from torchgco.judging.contact import contacts
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.view import document
-from torchgco.view.cells import merged
 from torchgco.view.flights import flights_of, violated, whole
-from torchgco.view.shapes import SHAPES, Shapes, once, shapes_of, turns
+from torchgco.view.shapes import SHAPES, Shapes, merged, once, shapes_of, turns
 from torchgco.view.vehicles import Look, look_of
 
 

@@ -169,6 +169,24 @@ def check_shape(value: Tensor, shape: tuple[int | str, ...], field: str) -> None
         raise InputError(field, f"shape ({', '.join(map(str, shape))})", tuple(value.shape))
 
 
+def per_row(value: Any, field: str, dims: Dimensions, *size: int | str) -> Tensor:
+    """Numbers (B, *size), given so, or as (*size) for all problems.
+
+    Raises:
+        InputError: not numbers, or of another shape.
+    """
+    found = tensor(value, field, dims.like)
+    found = found.expand(dims.B, *found.shape) if found.dim() == len(size) else found
+    check_shape(found, (dims.B, *size), field)
+    return found
+
+
+def check_finite(value: Tensor, field: str, expected: str = "finite numbers") -> None:
+    """Raise InputError where a number isn't finite."""
+    if not bool(torch.isfinite(value).all()):
+        raise InputError(field, expected, "NaN or infinity")
+
+
 def lead(parameter: Tensor | float, component: Tensor) -> Tensor | float:
     """A model parameter shaped to multiply a component (B, ...) of states with leading batch axis.
 

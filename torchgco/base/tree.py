@@ -36,6 +36,11 @@ class PerElement(Brief):
         return changed(self, changes) if changes else self
 
 
+def passed_on(part: str, *names: str) -> tuple[Any, ...]:
+    """Properties that are those of a part: `knots, dt = passed_on("inner", "knots", "dt")`."""
+    return tuple(property(lambda self, name=name: getattr(getattr(self, part), name)) for name in names)
+
+
 def is_users(part: object) -> bool:
     """Whether a part's code is a user's: a class from elsewhere, or one of torchgco's that calls a user's function."""
     return getattr(part, "calls_function", False) or type(part).__module__.partition(".")[0] != "torchgco"

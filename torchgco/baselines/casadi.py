@@ -17,14 +17,13 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
 from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Call, Callback, Progress, Solver
+from torchgco.solvers.contracts import Call, Callback, Progress, Solver, check_states
 from torchgco.solvers.timing import Chooser
 
 if TYPE_CHECKING:
@@ -168,8 +167,7 @@ class PreparedCasADi(Solver):
         """
         problem = self.problem
         problem.check_controls(U0, "U0")
-        check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
-        check_tensor(X0, "X0", problem.x0)
+        check_states(X0, problem)
         return self._all(X0, U0, None)
 
     def _all(self, X0: Tensor, U0: Tensor, callback: Callback | None) -> Solution:

@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown, theirs, undefined
 from torchgco.base.mixing import foreign, why
 from torchgco.base.options import check_options
 from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
-from torchgco.base.tree import PerElement, is_users
+from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.costs.base import add_blocks
 
@@ -107,11 +107,8 @@ class WrappedConstraint(Constraint):
 
     keeps_rows: ClassVar[bool] = False  # whether rows, and by how much they are violated, are those of the other one
 
-    sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
-    geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
-    knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
-    bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
-    row_radii = property(lambda self: self.constraint.row_radii)  # type: ignore[assignment]
+    sense, geometric, knots = passed_on("constraint", "sense", "geometric", "knots")
+    bare, row_radii = passed_on("constraint", "bare", "row_radii")
     calls_function = property(lambda self: is_users(self.constraint))
 
     def grown(self, by: Tensor) -> Self:
@@ -119,6 +116,13 @@ class WrappedConstraint(Constraint):
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         return self.constraint.start_is_clear(x0)
+
+
+def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
+    """Add gradients (B, K, c) and Hessians (B, K, c, c) of components `at` to homogeneous blocks H of n states."""
+    H[:, knots, at, n] += gradient
+    H[:, knots, n, at] += gradient
+    H[:, knots, at, at] += hessian
 
 
 def innermost(constraint: Constraint) -> Constraint:
@@ -131,12 +135,13 @@ def count_of(index: slice | Tensor, of: int) -> int:
     return len(range(of)[index]) if isinstance(index, slice) else len(index)
 
 
-def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> slice | Tensor:
-    """Knots as a slice where they are contiguous, else as indices; negative ones count from the end.
+def resolve_knots(knots: Knots | None, last: int, field: str, device: torch.device, first: int = 1) -> slice | Tensor:
+    """Knots as a slice where they are contiguous, else as indices; negative ones count from the end. None: first..last.
 
     Raises:
         InputError: no knot, a repeated knot, a knot that is no whole number or outside 0..last.
     """
+    knots = slice(first, last + 1) if knots is None else knots
     try:
         chosen = list(range(last + 1)[knots]) if isinstance(knots, slice) else [whole(k) for k in knots]
     except (TypeError, ValueError):
@@ -197,11 +202,8 @@ class FunctionConstraint(Constraint):
         check_options(self, self.name if isinstance(self.name, str) else "constraint")
         if self.geometric and self.of != "x":
             raise InputError(f"{self.name}.geometric", "a function of x alone", f"of={self.of!r}")
-        last = dims.N if self.of == "x" else dims.N - 1
-        default = slice(1, dims.N + 1) if self.of == "x" else slice(0, dims.N)
-        knots = resolve_knots(
-            default if self.knots is None else self.knots, last, f"{self.name}.knots", dims.like.device
-        )
+        last, first = (dims.N, 1) if self.of == "x" else (dims.N - 1, 0)
+        knots = resolve_knots(self.knots, last, f"{self.name}.knots", dims.like.device, first)
         where = f"{self.name}.function"
         if not callable(self.function):
             raise InputError(where, f"a function of {' and '.join(self.of)}", shown(self.function))

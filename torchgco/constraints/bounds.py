@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape, tensor
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots
 
 LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
@@ -43,8 +43,7 @@ class _Bounds(Constraint):
         if self.above is not None and self.lower.dim() == 2:  # bound already; other knots may not fit another problem
             return self
         name, size, last = self.label, dims.m if self.of == "u" else dims.n, dims.N - 1 if self.of == "u" else dims.N
-        default = slice(self._first_knot, last + 1)
-        knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", dims.like.device)
+        knots = resolve_knots(self.knots, last, f"{name}.knots", dims.like.device, self._first_knot)
         shape = dims.B, count_of(knots, last + 1), size
         lower = self._checked(self.lower, f"{name}.lower", shape, dims, torch.inf)
         upper = self._checked(self.upper, f"{name}.upper", shape, dims, -torch.inf)
@@ -229,8 +228,7 @@ class RateBounds(_Bounds):
         previous = previous.expand(1, dims.m) if previous.dim() == 0 else previous
         previous = previous.unsqueeze(0) if previous.dim() == 1 else previous
         check_shape(previous, (1 if previous.shape[0] == 1 else dims.B, dims.m), "rate_bounds.previous")
-        if not bool(torch.isfinite(previous).all()):
-            raise InputError("rate_bounds.previous", "finite numbers", "NaN or infinity")
+        check_finite(previous, "rate_bounds.previous")
         return super(RateBounds, replace(self, previous=previous)).bind(dims)
 
     @property

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
 from torchgco.constraints.base import Constraint, innermost, whole
-from torchgco.constraints.norms import NO_ROW, NormBounds
-from torchgco.costs.base import add_blocks
+from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
 
 
 @dataclass(frozen=True)
@@ -73,15 +72,15 @@ class Gates(Constraint):
         if not bool((normals.norm(dim=-1) > 0).all()):
             raise InputError("gates.normals", "vectors other than 0", normals.tolist())
         half = _sizes(self.half_widths, "gates.half_widths", dims, G)
-        squares = GateSquares(centers, _axes(normals), half, places, torch.tensor(at, device=centers.device))
-        return squares.bind(dims)
+        components = torch.tensor(at, device=centers.device)
+        return GateSquares(centers, _axes(normals), half, places, components=components).bind(dims)
 
 
 @dataclass(frozen=True)
 class GateBalls(NormBounds):
     """Gates that are balls, bound: at the other knots from 1 to N there is no bound."""
 
-    places: Tensor | None = field(default=None, kw_only=True)  # (B, G) int64: their knots
+    places: Tensor = field(kw_only=True)  # (B, G) int64: their knots
 
     # Never shared by all problems: a batch of one that is repeated has as many rows of each as any other.
     batched: ClassVar[tuple[str, ...]] = ("upper", "center", "places")
@@ -92,33 +91,29 @@ class GateBalls(NormBounds):
     @property
     def centers(self) -> Tensor:
         """(B, G, d), m."""
-        assert self.places is not None
         return self.center.gather(1, (self.places - 1).unsqueeze(-1).expand(-1, -1, self.center.shape[-1]))
 
     @property
     def sizes(self) -> Tensor:
         """Their radii (B, G), m."""
-        assert self.places is not None
         return self.upper.gather(1, self.places - 1)
 
     def write(self, centers: Tensor, sizes: Tensor) -> None:
         """Put other gates (B, G, d) of other radii (B, G) in the places of these, in this memory."""
-        assert self.places is not None
         self.center.scatter_(1, (self.places - 1).unsqueeze(-1).expand_as(centers), centers)
         self.upper.scatter_(1, self.places - 1, sizes)
 
 
 @dataclass(frozen=True)
-class GateSquares(Constraint):
+class GateSquares(Vectors):
     """Gates that are squares, bound: rows A p - b <= 0, per knot those before a plane, or beyond one."""
 
     centers: Tensor  # (B, G, d), m
     axes: Tensor  # (B, G, d, d): normal, then the directions of the sides, as rows
     half_widths: Tensor  # (B, G), m
     places: Tensor  # (B, G) int64: the knots before the planes
-    components: Tensor  # (d,) int64: the position's states
-    slopes: Tensor | None = field(default=None, repr=False)  # (B, N, p, d), once bound
-    limits: Tensor | None = field(default=None, repr=False)  # (B, N, p)
+    slopes: Tensor = field(default=None, repr=False)  # type: ignore[assignment]  # (B, N, p, d), once bound
+    limits: Tensor = field(default=None, repr=False)  # type: ignore[assignment]  # (B, N, p)
     knots: Any = None
 
     batched: ClassVar[tuple[str, ...]] = ("centers", "axes", "half_widths", "places", "slopes", "limits")
@@ -139,7 +134,6 @@ class GateSquares(Constraint):
 
     def write(self, normals: Tensor | None = None) -> None:
         """Make the rows of the centres and half widths as they are, and of other normals (B, G, d), in this memory."""
-        assert self.slopes is not None and self.limits is not None
         if normals is not None:
             self.axes.copy_(_axes(normals))
         (B, G, _), p, half = self.centers.shape, self.slopes.shape[2], self.half_widths.unsqueeze(-1)
@@ -152,17 +146,10 @@ class GateSquares(Constraint):
             self.slopes[at], self.limits[at] = rows, room + (rows @ self.centers.unsqueeze(-1))[..., 0]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        p = X[:, self.knots][..., self.components]
-        assert self.slopes is not None and self.limits is not None
-        return (self.slopes * p.unsqueeze(-2)).sum(-1) - self.limits
+        return (self.slopes * self._vectors(X, U).unsqueeze(-2)).sum(-1) - self.limits
 
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        J = X.new_zeros(*g.shape, X.shape[-1])
-        assert self.slopes is not None
-        J[..., self.components] = self.slopes
-        add = H.new_zeros(*g.shape[:2], *H.shape[2:])
-        add_blocks(add, X.shape[-1], (g.unsqueeze(-2) @ J).squeeze(-2), None, J.mT @ (h.unsqueeze(-1) * J), None)
-        H[:, self.knots] += add
+    def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.slopes
 
 
 def _balls(at: list[int], centers: Tensor, radius: Tensor, places: Tensor, dims: Dimensions) -> GateBalls:
@@ -189,9 +176,7 @@ def _axes(normals: Tensor) -> Tensor:
 
 def _each(value: Any, name: str, dims: Dimensions, size: tuple[int, ...], G: int | None = None) -> Tensor:
     """Vectors (B, G, d): given so, or as (G, d) for all problems."""
-    found = tensor(value, name, dims.like)
-    found = found.expand(dims.B, *found.shape) if found.dim() == 2 else found
-    check_shape(found, (dims.B, "G" if G is None else G, *size), name)
+    found = per_row(value, name, dims, "G" if G is None else G, *size)
     if found.shape[1] == 0 or not bool(torch.isfinite(found).all()):
         raise InputError(name, "one gate at least, of finite numbers", found.tolist())
     return found.contiguous()

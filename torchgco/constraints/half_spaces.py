@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, check_tensor
-from torchgco.constraints.base import Constraint, Sense
+from torchgco.constraints.base import Constraint, add_at
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,6 @@ class HalfSpaces(Constraint):
     knots: Any = None
     position: Any = None
 
-    sense: ClassVar[Sense] = "inequality"
     batched: ClassVar[tuple[str, ...]] = ("normals", "offsets")
 
     def bind(self, dims: Dimensions) -> Self:
@@ -48,11 +47,8 @@ class HalfSpaces(Constraint):
         return self.offsets - sum(n[..., i] * p[..., i : i + 1] for i in range(3))  # type: ignore[operator]
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, at, one = self.normals, self.position, X.shape[-1]
-        gradient = -(g.unsqueeze(-1) * n).sum(-2)
-        H[:, self.knots, at, one] += gradient
-        H[:, self.knots, one, at] += gradient
-        H[:, self.knots, at, at] += (h.unsqueeze(-1) * n).mT @ n
+        n, gradient = self.normals, -(g.unsqueeze(-1) * self.normals).sum(-2)
+        add_at(H, self.knots, self.position, X.shape[-1], gradient, (h.unsqueeze(-1) * n).mT @ n)
 
 
 def stacked(planes: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:

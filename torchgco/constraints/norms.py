@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, tensor
+from torchgco.base.shapes import Dimensions, check_finite, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
@@ -24,7 +24,7 @@ OF_ATTITUDE = "quaternion"
 
 
 @dataclass(frozen=True)
-class _Vectors(Constraint):
+class Vectors(Constraint):
     """A constraint on some components of the state, or of the control, at a knot."""
 
     components: Tensor | None = field(default=None, repr=False, kw_only=True)  # (c,) int64, once bound
@@ -50,7 +50,7 @@ class _Vectors(Constraint):
 
 
 @dataclass(frozen=True)
-class NormBounds(_Vectors):
+class NormBounds(Vectors):
     """lower <= |z - center| <= upper, with z some states or some controls of a knot.
 
         speed = NormBounds(("x", [3, 4, 5]), upper=5.0)  # m/s
@@ -84,11 +84,10 @@ class NormBounds(_Vectors):
         name = self.label
         kind, components = _chosen(self.of, self.components, ("x", "u"), dims, f"{name}.of")
         knots, K = _knots(self.knots, kind, dims, f"{name}.knots")
-        bounds = {}
-        for side in ("lower", "upper"):
-            given = getattr(self, side)
-            bounds[side] = None if given is None else _per_knot(given, f"{name}.{side}", dims, K)
-        lower, upper = bounds["lower"], bounds["upper"]
+        lower, upper = (
+            None if given is None else _per_knot(given, f"{name}.{side}", dims, K)
+            for side, given in (("lower", self.lower), ("upper", self.upper))
+        )
         if lower is not None and not bool((torch.isfinite(lower) & (lower >= 0)).all()):
             raise InputError(f"{name}.lower", "finite numbers of at least 0", lower.tolist())
         if upper is not None and not bool((upper > 0).all()):
@@ -100,9 +99,7 @@ class NormBounds(_Vectors):
         upper = None if upper is None or not bool(torch.isfinite(upper).any()) else upper
         if lower is None and upper is None:
             raise InputError(name, "a lower bound above 0 or a finite upper bound", "neither")
-        center = self.center
-        if center is not None:
-            center = _points(center, f"{name}.center", dims, K, len(components))
+        center = None if self.center is None else _points(self.center, f"{name}.center", dims, K, len(components))
         return replace(self, of=kind, components=components, knots=knots, lower=lower, upper=upper, center=center)
 
     def _away(self, X: Tensor, U: Tensor) -> Tensor:
@@ -112,12 +109,10 @@ class NormBounds(_Vectors):
     def _sides(self) -> list[tuple[float, Tensor, Tensor]]:
         """Of the upper and the lower bounds that there are: +-1, the bounds (B|1, K|1) or 1, where there are any."""
         sides = []
-        if self.upper is not None:
-            there = torch.isfinite(self.upper)
-            sides.append((1.0, torch.where(there, self.upper, 1.0), there.to(self.upper)))
-        if self.lower is not None:
-            there = self.lower > 0
-            sides.append((-1.0, torch.where(there, self.lower, 1.0), there.to(self.lower)))
+        for sign, bound in ((1.0, self.upper), (-1.0, self.lower)):
+            if bound is not None:
+                there = torch.isfinite(bound) & (bound > 0)
+                sides.append((sign, torch.where(there, bound, 1.0), there.to(bound)))
         return sides
 
     @property
@@ -162,7 +157,7 @@ class NormBounds(_Vectors):
 
 
 @dataclass(frozen=True)
-class Cone(_Vectors):
+class Cone(Vectors):
     """A vector stays within `angle` of an axis: |v| cos(angle) <= axis . v.
 
         tilt = Cone([0, 0, 1], math.radians(30), ("quaternion", range(6, 10)))  # the body's z axis
@@ -212,11 +207,9 @@ class Cone(_Vectors):
         angle = _per_knot(self.angle, "cone.angle", dims, K)
         if not bool(((angle > 0) & (angle < math.pi)).all()):
             raise InputError("cone.angle", "angles in rad, above 0 and below pi", angle.tolist())
-        apex = self.apex
-        if apex is not None and attitude:
-            raise InputError("cone.apex", "none for a quaternion", shown(apex))
-        if apex is not None:
-            apex = _points(apex, "cone.apex", dims, K, d)
+        if self.apex is not None and attitude:
+            raise InputError("cone.apex", "none for a quaternion", shown(self.apex))
+        apex = None if self.apex is None else _points(self.apex, "cone.apex", dims, K, d)
         return replace(
             self, axis=axis, angle=angle, of=kind, components=components, knots=knots, apex=apex,
             attitude=attitude,
@@ -288,7 +281,7 @@ def within_norms(U: Tensor, constraints: Iterable[Constraint]) -> Tensor:
 
     Sizes move first, then directions: what had none, as a norm's lower bound has no slope there, takes the cone's.
     """
-    parts = [part for part in constraints if isinstance(part, _Vectors) and part.of == "u"]  # type: ignore[attr-defined]
+    parts = [part for part in constraints if isinstance(part, Vectors) and part.of == "u"]  # type: ignore[attr-defined]
     found = U.clone()
     for part in (part for part in parts if isinstance(part, NormBounds)):
         _put(found, part, part.moved_inside(found))
@@ -298,7 +291,7 @@ def within_norms(U: Tensor, constraints: Iterable[Constraint]) -> Tensor:
     return found
 
 
-def _put(U: Tensor, part: _Vectors, vectors: Tensor) -> None:
+def _put(U: Tensor, part: Vectors, vectors: Tensor) -> None:
     some = U[:, part.knots]  # type: ignore[attr-defined]
     some[..., part.components] = vectors
     U[:, part.knots] = some  # type: ignore[attr-defined]
@@ -326,9 +319,8 @@ def _chosen(
 
 def _knots(knots: Any, kind: str, dims: Dimensions, field: str) -> tuple[slice | Tensor, int]:
     """The knots at which a constraint holds, and how many."""
-    last = dims.N - 1 if kind == "u" else dims.N
-    default = slice(0 if kind == "u" else 1, last + 1)
-    found = resolve_knots(default if knots is None else knots, last, field, dims.like.device)
+    last, first = (dims.N - 1, 0) if kind == "u" else (dims.N, 1)
+    found = resolve_knots(knots, last, field, dims.like.device, first)
     return found, count_of(found, last + 1)
 
 
@@ -351,6 +343,5 @@ def _points(value: Any, field: str, dims: Dimensions, K: int, size: int) -> Tens
     if not fits:
         expected = f"shape ({size},), ({dims.B}, {size}), or per knot ({dims.B} or 1, {K}, {size})"
         raise InputError(field, expected, tuple(given.shape))
-    if not bool(torch.isfinite(found).all()):
-        raise InputError(field, "finite numbers", "NaN or infinity")
+    check_finite(found, field)
     return found

@@ -58,9 +58,7 @@ class Separation(Constraint):
             raise InputError("separation.min_distance", expected, f"shape {tuple(distance.shape)}")
         if not bool((torch.isfinite(distance) & (distance > 0)).all()):
             raise InputError("separation.min_distance", "finite numbers above 0 m", distance.tolist())
-        knots = resolve_knots(
-            slice(1, dims.N + 1) if self.knots is None else self.knots, dims.N, "separation.knots", distance.device
-        )
+        knots = resolve_knots(self.knots, dims.N, "separation.knots", distance.device)
         states, pairs = states.to(distance.device), pairs.to(distance.device)
         return replace(self, positions=states, pairs=pairs, min_distance=distance.reshape(-1), knots=knots)
 

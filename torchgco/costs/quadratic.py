@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks
-from torchgco.base.shapes import Dimensions, check_shape, lead, tensor
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, lead, tensor
 from torchgco.costs.base import Cost, add_blocks
 from torchgco.costs.in_free_time import QuadraticInFreeTime
 
@@ -207,8 +207,7 @@ def _vector(value: Any, field: str, size: int, B: int, N: int | None, like: Tens
     else:
         v = v[(None,) * (3 - v.dim())] if v.dim() < 3 else v
         check_shape(v, (_one_of(v, 0, B), _one_of(v, 1, N), size), f"cost.{field}")
-    if not bool(torch.isfinite(v).all()):
-        raise InputError(f"cost.{field}", "finite numbers", "NaN or infinity")
+    check_finite(v, f"cost.{field}")
     return v
 
 
@@ -238,8 +237,7 @@ def check_semidefinite(Q: Tensor, R: Tensor, Qf: Tensor, H: Tensor | None) -> No
         Q, R, H = (W.expand(*lead_axes, *W.shape[2:]) for W in (Q, R, H))
         blocks["H"] = torch.cat((torch.cat((Q, H.mT), -1), torch.cat((H, R), -1)), -2)
     for field, W in blocks.items():
-        if not bool(torch.isfinite(W).all()):
-            raise InputError(f"cost.{field}", "finite numbers", "NaN or infinity")
+        check_finite(W, f"cost.{field}")
         scale = float(W.abs().max()) if W.numel() else 0.0
         if float((W - W.mT).abs().max()) > 1e-9 * max(scale, 1.0):
             raise InputError(f"cost.{field}", "a symmetric matrix", "an unsymmetric one")

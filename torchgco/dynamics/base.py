@@ -13,7 +13,7 @@ from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Seconds, check_options
 from torchgco.base.shapes import Dimensions
-from torchgco.base.tree import PerElement, is_users
+from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS
 
@@ -104,10 +104,7 @@ class WrappedDynamics(Dynamics):
 
     model: Dynamics
 
-    n = property(lambda self: self.model.n)  # type: ignore[assignment]
-    m = property(lambda self: self.model.m)  # type: ignore[assignment]
-    dt = property(lambda self: self.model.dt)  # type: ignore[assignment]
-    position = property(lambda self: self.model.position)  # type: ignore[assignment]
+    n, m, dt, position = passed_on("model", "n", "m", "dt", "position")
     calls_function = property(lambda self: is_users(self.model))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,15 +37,10 @@ def listed(words: Sequence[object], most: int = PLACES_SHOWN) -> str:
 
 def knots_told(knots: Sequence[int], t: Tensor | None) -> str:
     """Knots as runs, with their times t (N+1,), s, where these are known."""
-    runs: list[list[int]] = []
-    for k in knots:
-        if runs and runs[-1][-1] == k - 1:
-            runs[-1].append(k)
-        else:
-            runs.append([k])
+    runs = np.split(np.array(knots), np.flatnonzero(np.diff(knots) != 1) + 1)
 
-    def told(run: list[int]) -> str:
-        ends = run[:1] if len(run) == 1 else [run[0], run[-1]]
+    def told(run: np.ndarray) -> str:
+        ends = list(dict.fromkeys((int(run[0]), int(run[-1]))))
         seconds = "" if t is None else f" (t = {' to '.join(f'{float(t[k]):.3g}' for k in ends)} s)"
         return " to ".join(map(str, ends)) + seconds
 

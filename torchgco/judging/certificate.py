@@ -145,9 +145,8 @@ def _certified(
 
 def frame_columns(certificate: Certificate) -> dict[str, Any]:
     """The certificate as arrays, by the names of a study's columns."""
-    names = {"clearance": "clearance_full"}
     parts = vars(certificate).items()
-    return {names.get(name, name): value.cpu().numpy() for name, value in parts}
+    return {"clearance_full" if name == "clearance" else name: value.cpu().numpy() for name, value in parts}
 
 
 # One problem: every tensor below has a batch of one ---------------------------------------------------------------
@@ -219,15 +218,6 @@ def _oscillating_chords(swings: BoundOscillatingBoxes, X: Tensor) -> Tensor:
     return (oscillating_distances(swings, X[None, :, swings.position])[1] - radii)[0]
 
 
-def _field_chords(field: BoundField, X: Tensor) -> Tensor:
-    return segment_distances(field, X[None, :, field.position])[0].unsqueeze(-1) - field.vehicle_radius
-
-
-def _body_chords(body: BoundBody, X: Tensor) -> Tensor:
-    """Less what the balls leave their chords by where the vehicle turns evenly from knot to knot."""
-    return _ball_chords(body, X, body.points.bulge(X.unsqueeze(0))[0])
-
-
 def _ball_chords(body: BoundBody, X: Tensor, bulge: Tensor) -> Tensor:
     """Distances (N, P M) of the chords of all balls, less `bulge` (N, P)."""
     centers, found = body.points.at(X.unsqueeze(0))[0], []
@@ -243,8 +233,9 @@ CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     SpheresInFreeTime: lambda part, X: _sphere_chords(part.along(X.unsqueeze(0)), X),
     BoundBoxes: _box_chords,
     BoundOscillatingBoxes: _oscillating_chords,
-    BoundField: _field_chords,
-    BoundBody: _body_chords,
+    BoundField: lambda map, X: segment_distances(map, X[None, :, map.position])[0].unsqueeze(-1) - map.vehicle_radius,
+    # Less what the balls leave their chords by where the vehicle turns evenly from knot to knot.
+    BoundBody: lambda body, X: _ball_chords(body, X, body.points.bulge(X.unsqueeze(0))[0]),
 }
 
 
@@ -283,7 +274,7 @@ def _acceleration(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
 
 
 def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    cost = _local(problem.cost.total, X, U)
+    cost = gradients(problem.cost.total, X, U)
     active = _active_rows(problem, X, U)
     gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
     reduced, terms, start = _reduced(problem, X, U, gX, gU)
@@ -301,7 +292,7 @@ def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]
         torch.where(torch.isfinite(c), lam if constraint.sense == "equality" else lam.clamp(min=0.0), 0.0)
         for constraint, lam, c in zip(problem.constraints, multipliers, rows, strict=True)
     ]  # a bound at infinity pushes nobody
-    reduced, terms, start = _reduced(problem, X, U, *_local(_lagrangian(problem, lams), X, U))
+    reduced, terms, start = _reduced(problem, X, U, *gradients(_lagrangian(problem, lams), X, U))
     free = _free(problem)
     rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
     unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
@@ -327,7 +318,7 @@ def _of_factors(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor
     bounds: list[Any] = list(problem.constraints[len(multipliers) :])
     if not bounds:
         return []
-    reduced, _, start = _reduced(problem, X, U, *_local(_lagrangian(problem, multipliers), X, U))
+    reduced, _, start = _reduced(problem, X, U, *gradients(_lagrangian(problem, multipliers), X, U))
     found = []
     for part in bounds:
         slopes = reduced[:, part.knots] if part.of == "u" else start[0].unsqueeze(1)
@@ -367,36 +358,23 @@ def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
     return rest
 
 
-def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, Tensor]]]:
-    """Per constraint with rows that may be active: whether it is an equality, and the rows' gradients (`_local`)."""
+def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, ...]]]:
+    """Per constraint with rows that may be active: whether it is an equality, and the rows' gradients, (q, N+1, n) by X
+    and (q, N, m) by U, without dynamics."""
     found = []
     for constraint in problem.constraints:
         equality = constraint.sense == "equality"
-        spare = _spare(constraint, X, U)[0]
+        is_obstacle = isinstance(constraint, Obstacles)
+        spare = (constraint.distances(X) if is_obstacle else -constraint.value(X, U))[0]  # m, or in the units of c
         knots, columns = (spare <= (torch.inf if equality else ACTIVE_WITHIN)).nonzero(as_tuple=True)
         q = knots.numel()
         if q > 0:
             twins = constraint.take(torch.zeros(q, dtype=torch.int64, device=X.device))
             which = torch.arange(q, device=X.device), knots, columns
             rows = lambda x, u, twins=twins, which=which: twins.value(x, u)[which]
-            found.append((equality, _local(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
+            # Row j is computed from repetition j of the trajectory.
+            found.append((equality, gradients(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
     return found
-
-
-def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
-    """Slack of each row (1, K, p): m for obstacles, else in the units of c."""
-    if isinstance(constraint, Obstacles):
-        return constraint.distances(X)
-    return -constraint.value(X, U)
-
-
-def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of rows(X, U) (q,) with respect to X (q, N+1, n) and U (q, N, m), without dynamics.
-
-    Row j is computed from repetition j of the trajectory.
-    """
-    gX, gU = gradients(rows, X, U)
-    return gX, gU
 
 
 def _reduced(

@@ -70,7 +70,7 @@ def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return np.array(found).reshape(-1, places.shape[1])
 
 
-def _depth(part: Obstacles, places: np.ndarray, dt: float, states: np.ndarray | None = None) -> np.ndarray:
+def _depth(part: Obstacles, places: np.ndarray, dt: float, states: np.ndarray | None) -> np.ndarray:
     """How deep (P,), m, the pieces between places (P+1, d), `dt` seconds apart, are in contact with a part.
 
     Args:

@@ -33,7 +33,6 @@ def passes(constraint: Constraint, X: Tensor) -> Passes | None:
 
 
 def _balls(gates: GateBalls, p: Tensor) -> Passes:
-    assert gates.places is not None
     before, at, after = (_knots(p, gates.places + shift) - gates.centers for shift in (-1, 0, 1))
     away = torch.minimum(segment_distance(before, at), segment_distance(at, after))
     return Passes(away, away <= gates.sizes + ADMITTED)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import check_shape, check_tensor, computing_on, tensor
+from torchgco.base.shapes import check_finite, check_shape, check_tensor, computing_on, tensor
 from torchgco.constraints.base import CONTACT_FACTOR, Constraint
 from torchgco.constraints.gates import has_gates
 from torchgco.constraints.separation import Separation
@@ -175,8 +175,7 @@ def _goal(problem: Problem, center: Any, radius: Any) -> tuple[Tensor, Tensor] |
         center = tensor(center, "goal", problem.x0)
         d = problem.position.stop - problem.position.start
         check_shape(center, (d,) if center.dim() == 1 else (problem.B, d), "goal")
-        if not bool(torch.isfinite(center).all()):
-            raise InputError("goal", "finite numbers", "NaN or infinity")
+        check_finite(center, "goal")
     if radius is None:
         radius = _own_goal(problem).radius
     else:

@@ -68,12 +68,7 @@ def segment_distances(field: BoundField, p: Tensor) -> Tensor:
 
 def path_distances(field: DistanceField, which: int, p: Tensor) -> Tensor:
     """The same for points p (K, d), float64, and one of a field's maps, (K-1,)."""
-    return _distances(solids_of(field)[which], p)
-
-
-def _distances(solid: Solid, p: Tensor) -> Tensor:
-    """The same for one problem, (K-1,), with p (K, d)."""
-    a, along = p[:-1], p.diff(dim=0)
+    solid, a, along = solids_of(field)[which], p[:-1], p.diff(dim=0)
     finite = torch.isfinite(a).all(-1) & torch.isfinite(along).all(-1)
     found = torch.where(finite, torch.inf, torch.nan).double()
     rows = finite.nonzero().flatten().numpy()
@@ -109,8 +104,7 @@ def _measured(solid: Solid, a: Tensor, along: Tensor, middle: np.ndarray, least:
 
 def solids_of(field: DistanceField) -> list[Solid]:
     """What each of a field's maps holds; kept as long as the map."""
-    key = field.source
-    kept = _kept.setdefault(key, {})
+    kept = _kept.setdefault(field.source, {})
     if field.unknown not in kept:
         kept[field.unknown] = _solids(field)
     return kept[field.unknown]
@@ -123,10 +117,7 @@ def _solids(field: DistanceField) -> list[Solid]:
     source = field.source
     if not isinstance(source, OccupancyGrid):
         return [Solid(points, 0.0, source.radius, _tree(points)) for points in source.clouds()]
-    cells = source.is_occupied
-    if field.unknown == "occupied":
-        cells = cells | source.is_unknown
-    each = cells if source.batch is not None else cells[None]
+    each = source.held(field.unknown)
     origins = np.broadcast_to(source.origin, (len(each), source.d))
     solids = []
     for one, origin in zip(each, origins, strict=True):

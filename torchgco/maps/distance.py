@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.notices import AFTER
 from torchgco.base.options import check_value
 from torchgco.maps.grid import OccupancyGrid
-from torchgco.maps.lookup import Lattice, distances
+from torchgco.maps.lookup import Lattice, lengths, squares
 from torchgco.maps.points import PointCloud
 
 FINE_NODES = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
@@ -165,7 +165,7 @@ class DistanceField:
         origins, maps = torch.from_numpy(self.origin).to(p.device), torch.arange(G, device=p.device)
         lattice = Lattice(self.nodes(p.device), maps, origins, self.spacing, smooth)
         cores = torch.full((G,), 0.5 * self.spacing, dtype=p.dtype, device=p.device)
-        return distances(lattice, flat, cores).reshape(p.shape[:-1])
+        return lengths(squares(lattice, flat, cores), cores.unsqueeze(-1)).reshape(p.shape[:-1])
 
 
 def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> DistanceField:
@@ -178,11 +178,7 @@ def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> Dista
         raise InputError("field.refine", "1 to 8 steps per cell", refine)
     _check_count([refine * size + 1 for size in grid.shape])
     spacing = grid.resolution / refine
-    cells = grid.is_occupied
-    if unknown == "occupied":
-        cells = cells | grid.is_unknown
-    each = cells if grid.batch is not None else cells[None]
-    values = np.stack([_signed_distances(one, refine, spacing) for one in each])
+    values = np.stack([_signed_distances(one, refine, spacing) for one in grid.held(unknown)])
     origin = np.broadcast_to(grid.origin, (len(values), grid.d)).copy()
     return DistanceField(values, origin, spacing, grid, unknown)
 

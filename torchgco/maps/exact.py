@@ -29,8 +29,7 @@ def distance_within(
         return np.inf
     near = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
     values = source.occupied[which][near] if source.batch is not None else source.occupied[near]
-    part = OccupancyGrid(values, origin + h * first, h)
-    held = part.is_occupied | part.is_unknown if unknown == "occupied" else part.is_occupied
+    (held,) = OccupancyGrid(values, origin + h * first, h).held(unknown)
     low = origin + h * (first + np.argwhere(held))
     least = np.linalg.norm(p - np.clip(p, low, low + h), axis=1).min(initial=np.inf)
     return float(least) if least <= within else np.inf

@@ -11,13 +11,13 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions
-from torchgco.constraints.base import Constraint, Sense, count_of, resolve_knots
+from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.maps.distance import ALL_FREE, DistanceField
 from torchgco.maps.exact import distance_within
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
 from torchgco.maps.points import PointCloud
-from torchgco.obstacles.base import ABSENT, CONTACT_FACTOR, Obstacles
+from torchgco.obstacles.base import ABSENT, CONTACT_FACTOR, OwnKind
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import dimension, vehicle_radii
 
@@ -53,7 +53,6 @@ class Field(Constraint):
     interpolation: Interpolation = "smooth"
     knots: Any = None
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -72,11 +71,9 @@ class Field(Constraint):
         if field.batch not in (None, dims.B):
             raise InputError("field.field", f"one map for all, or {dims.B} maps", field.batch)
         vehicle = vehicle_radii(self.vehicle_radius, "field.vehicle_radius", dims)
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
-        knots = resolve_knots(knots, dims.N, "field.knots", like.device)
-        which = torch.zeros(dims.B, dtype=torch.int64, device=like.device)
-        if field.batch is not None:
-            which = torch.arange(dims.B, device=like.device)
+        knots = resolve_knots(self.knots, dims.N, "field.knots", like.device, dims.obstacles_from)
+        every = torch.arange(dims.B, device=like.device)
+        which = torch.zeros_like(every) if field.batch is None else every
         origins = torch.as_tensor(field.origin, dtype=like.dtype, device=like.device)[which]
         empty = torch.as_tensor(field.values.reshape(len(field.values), -1).min(-1) >= ALL_FREE, device=like.device)
         absent = empty[which].unsqueeze(-1)
@@ -86,7 +83,7 @@ class Field(Constraint):
 
 
 @dataclass(frozen=True)
-class BoundField(Obstacles):
+class BoundField(OwnKind):
     """A field shaped for its problem: one obstacle, the map."""
 
     field: DistanceField  # of all maps; a batch's subsets share it
@@ -101,9 +98,6 @@ class BoundField(Obstacles):
     stops: Tensor | None = None  # (B,)
 
     batched: ClassVar[tuple[str, ...]] = ("which", "origins", "vehicle_radius", "absent", "stops")
-
-    def bind(self, dims: Dimensions) -> Self:
-        return self
 
     @property
     def lattice(self) -> Lattice:
@@ -135,30 +129,13 @@ class BoundField(Obstacles):
     def sizes(self) -> Tensor:
         return (self.vehicle_radius + self.field.thickness).unsqueeze(-1)
 
-    def row_shape(self, N: int) -> tuple[int, int]:
-        return count_of(self.knots, N + 1), 1
+    def rows(self, p: Tensor, t: Tensor) -> Tensor:
+        square = self.vehicle_radius.square().unsqueeze(-1) - squares(self.lattice, p, self.cores)
+        return torch.where(self.absent, ABSENT, self.factors.unsqueeze(-1) * square).unsqueeze(-1)
 
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.counted(self._rows(X[:, self.knots, self.position]), ABSENT, X.shape[1])
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        rows = self._rows(x[..., self.position])
-        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, at = X.shape[-1], self.position
-        g, h = self.counted(g, 0.0, X.shape[1]), self.counted(h, 0.0, X.shape[1])
-        _, slopes = squares_and_slopes(self.lattice, X[:, self.knots, at], self.cores)
-        slopes = torch.where(self.absent.unsqueeze(-1), 0.0, -self.factors[:, None, None] * slopes)
-        gradient = g * slopes
-        H[:, self.knots, at, n] += gradient
-        H[:, self.knots, n, at] += gradient
-        H[:, self.knots, at, at] += h.unsqueeze(-1) * slopes.unsqueeze(-1) * slopes.unsqueeze(-2)
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        """Depth beneath the full surface, (B, K, 1), m."""
-        depth = (-self.signed_distance(X[:, self.knots, self.position], self.times(X))).clamp(min=0.0)
-        return self.counted(depth, 0.0, X.shape[1])
+    def slopes(self, p: Tensor, t: Tensor) -> Tensor:
+        _, slopes = squares_and_slopes(self.lattice, p, self.cores)
+        return torch.where(self.absent.unsqueeze(-1), 0.0, -self.factors[:, None, None] * slopes).unsqueeze(-2)
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
         distance = lengths(squares(self.lattice, p, self.cores), self.cores.unsqueeze(-1))
@@ -227,13 +204,3 @@ class BoundField(Obstacles):
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, vehicle_radius=self.vehicle_radius + by)
-
-    def stopping_at(self, knots: Tensor) -> Self:
-        return replace(self, stops=knots.to(self.origins.dtype))
-
-    def _rows(self, p: Tensor) -> Tensor:
-        """c (B, K, 1) at points (B, K, d); an empty map is c = -1 everywhere."""
-        c = self.factors.unsqueeze(-1) * (
-            self.vehicle_radius.square().unsqueeze(-1) - squares(self.lattice, p, self.cores)
-        )
-        return torch.where(self.absent, ABSENT, c).unsqueeze(-1)

@@ -166,6 +166,11 @@ class OccupancyGrid:
         """Whether cells are unknown, of the shape of `occupied`."""
         return np.zeros(1, bool) & self.occupied if self.occupied.dtype == np.bool_ else np.isnan(self.occupied)
 
+    def held(self, unknown: str) -> np.ndarray:
+        """Which cells of each grid are occupied, (G, X, Y[, Z]) bool, and `unknown` ones where these are "occupied"."""
+        cells = self.is_occupied | self.is_unknown if unknown == "occupied" else self.is_occupied
+        return cells if self.batch is not None else cells[None]
+
     def single(self, which: int) -> OccupancyGrid:
         """The grid of one problem, which all share."""
         if self.batch is None:
@@ -206,15 +211,20 @@ def number(value: Any, field: str) -> float:
 
 def coordinates(value: Any, field: str) -> np.ndarray:
     """Numbers as a new array of float64; InputError for all else."""
-    if isinstance(value, Tensor):
-        value = value.detach().cpu().numpy()
-    try:
-        held = np.asarray(value)
-    except (TypeError, ValueError):  # lists of different length
-        raise InputError(field, "numbers", shown(value)) from None
+    held = _array(value, field, "numbers")
     if held.dtype.kind not in "iuf":
         raise InputError(field, "numbers", shown(value))
     return np.array(held, float)
+
+
+def _array(value: Any, field: str, expected: str) -> np.ndarray:
+    """An array of what an array, a tensor or nested lists hold."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError):  # lists of different length
+        raise InputError(field, expected, shown(value)) from None
 
 
 def _cells(value: Any) -> np.ndarray:
@@ -223,12 +233,7 @@ def _cells(value: Any) -> np.ndarray:
     Raises:
         InputError: neither bools nor numbers, or numbers out of range.
     """
-    if isinstance(value, Tensor):
-        value = value.detach().cpu().numpy()
-    try:
-        cells = np.asarray(value)
-    except (TypeError, ValueError):
-        raise InputError("grid.occupied", "an array of bools or numbers", shown(value)) from None
+    cells = _array(value, "grid.occupied", "an array of bools or numbers")
     if cells.dtype == np.bool_:
         return cells
     if cells.dtype.kind not in "iuf":

@@ -64,11 +64,6 @@ def _parts(p: Tensor) -> tuple[Tensor, ...]:
     return p.split(max(1, LOOKUPS_AT_ONCE // max(1, len(p))), dim=1)
 
 
-def distances(lattice: Lattice, p: Tensor, cores: Tensor) -> Tensor:
-    """Distances (B, K), m, of which G is the square, or its tangent nearer than the core."""
-    return lengths(squares(lattice, p, cores), cores.unsqueeze(-1))
-
-
 def lengths(square: Tensor, core: Tensor) -> Tensor:
     """The distances whose squares, or tangents to them nearer than a core, are `square`."""
     least = core.square()

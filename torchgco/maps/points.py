@@ -80,13 +80,12 @@ class PointCloud:
         if self.batch is not None:
             raise InputError("cloud.points", "one cloud; `single` takes one of several", f"{self.batch} clouds")
         (points,) = self.clouds()
-        points = points if len(points) else np.full((1, self.d), np.nan)
-        low = np.nan_to_num(points.min(0)) - self.radius - side
-        count = np.ceil((np.nan_to_num(points.max(0)) + self.radius + side - low) / side)
+        ends = points if len(points) else np.zeros((1, self.d))
+        low = ends.min(0) - self.radius - side
+        count = np.ceil((ends.max(0) + self.radius + side - low) / side)
         if np.prod(count) > LARGEST_GRID:
             raise InputError("resolution", f"cells of which the cloud takes at most {LARGEST_GRID:,}", resolution)
         occupied = np.zeros(count.astype(int), bool)
-        points = points[np.isfinite(points[:, 0])]
         own, reach = np.floor((points - low) / side).astype(int), int(np.ceil(self.radius / side))
         for offset in np.ndindex(*[2 * reach + 1] * self.d):
             cell = own + np.array(offset) - reach

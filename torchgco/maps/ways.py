@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -60,8 +61,7 @@ class Ways:
         The nearest of all where none of these is free.
         """
         at = np.rint((np.asarray(point, float) - self.origin) / self.spacing).astype(int)
-        low = np.clip(at - 2, 0, np.array(self.distance.shape) - 1)
-        high = np.clip(at + 2, 0, np.array(self.distance.shape) - 1)
+        low, high = (np.clip(at + by, 0, np.array(self.distance.shape) - 1) for by in (-2, 2))
         near = np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), -1).reshape(-1, len(low))
         apart = np.linalg.norm(self.origin + self.spacing * near - point, axis=1)
         free = self.distance[tuple(near.T)] > self.radius
@@ -97,15 +97,11 @@ class Ways:
         """The costs of steps between neighbours, each once, as a sparse matrix (V, V)."""
         from scipy.sparse import csr_matrix
 
-        shape, d = self.distance.shape, self.distance.ndim
+        shape = self.distance.shape
         numbers = np.arange(self.distance.size, dtype=np.int32).reshape(shape)
         rate = 1.0 + self.weight * np.clip(1.0 - (self.distance - self.radius) / max(self.near, 1e-9), 0.0, 1.0)
         rows, columns, costs = [], [], []
-        for step in product((-1, 0, 1), repeat=d):
-            if step <= (0,) * d:  # each pair once
-                continue
-            a = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, shape, strict=True))
-            b = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, shape, strict=True))
+        for step, a, b in neighbours(shape):
             long = self.spacing * float(np.linalg.norm(step))
             free = self.distance[a] + self.distance[b] - long > 2.0 * self.radius
             rows.append(numbers[a][free])
@@ -113,6 +109,15 @@ class Ways:
             costs.append(0.5 * long * (rate[a][free] + rate[b][free]))
         ends = np.concatenate(rows), np.concatenate(columns)
         return csr_matrix((np.concatenate(costs), ends), (self.distance.size,) * 2)
+
+
+def neighbours(shape: Sequence[int]) -> Iterator[tuple[tuple[int, ...], tuple[slice, ...], tuple[slice, ...]]]:
+    """The steps between neighbours in an array, diagonal ones too, each once; where they begin, and where they end."""
+    for step in product((-1, 0, 1), repeat=len(shape)):
+        if step > (0,) * len(shape):
+            begin, end = ([max(0, sign * s) for s in step] for sign in (-1, 1))
+            at = lambda low, high: tuple(slice(i, n - j) for i, j, n in zip(low, high, shape, strict=True))
+            yield step, at(begin, end), at(end, begin)
 
 
 def length(way: Array) -> float:

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from torchgco.base.brief import brief
 from torchgco.base.errors import ScaleWarning, undefined
-from torchgco.base.shapes import MISTAKES
+from torchgco.base.shapes import MISTAKES, Dimensions
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
-from torchgco.constraints.base import Constraint, Sense
+from torchgco.constraints.base import Constraint, add_at, count_of
 
 ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
@@ -92,7 +92,6 @@ class Obstacles(Constraint):
     `certificate.CHORDS`. Kernels in C are optional.
     """
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     absent: Tensor  # (B, M) bool
@@ -186,6 +185,44 @@ class Obstacles(Constraint):
     def times(self, X: Tensor) -> Tensor:
         """t = k dt (K,) at the constraint's knots, s."""
         return torch.arange(X.shape[1], dtype=X.dtype, device=X.device)[self.knots] * self.dt
+
+
+class OwnKind(Obstacles):
+    """A kind of torchgco's own, once bound: a row per obstacle and knot, of the position and the time alone."""
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    def rows(self, p: Tensor, t: Tensor) -> Tensor:
+        """c (B, K, M) at points p (B, K, d), m, at times t (K,) or (1,), s; `ABSENT` of what isn't there."""
+        raise undefined(self, "rows")
+
+    def slopes(self, p: Tensor, t: Tensor) -> Tensor:
+        """The derivatives (B, K, M, d) of the rows by p."""
+        raise undefined(self, "slopes")
+
+    def row_shape(self, N: int) -> tuple[int, int]:
+        return count_of(self.knots, N + 1), self.absent.shape[1]
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.counted(self.rows(X[:, self.knots, self.position], self.times(X)), ABSENT, X.shape[1])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        rows = self.rows(x[..., self.position], x.new_full((1,), k * self.dt))
+        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        g, h = (self.counted(part, 0.0, X.shape[1]) for part in (g, h))
+        J = self.slopes(X[:, self.knots, self.position], self.times(X))
+        gradient, hessian = (g.unsqueeze(-2) @ J).squeeze(-2), (h.unsqueeze(-1) * J).mT @ J
+        add_at(H, self.knots, self.position, X.shape[-1], gradient, hessian)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Depth beneath the full surface, (B, K, M), m."""
+        return self.counted((-self.distances(X)).clamp(min=0.0), 0.0, X.shape[1])
+
+    def stopping_at(self, knots: Tensor) -> Self:
+        return replace(self, stops=knots.to(self.vehicle_radius.dtype))  # type: ignore[type-var]
 
 
 def warn_of_small(obstacles: Obstacles, field: str) -> None:

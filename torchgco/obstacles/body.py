@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
-from torchgco.base.tree import PerElement
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
+from torchgco.base.tree import PerElement, passed_on
 from torchgco.constraints.base import CONTACT_FACTOR, TOUCH
 from torchgco.obstacles.attitude import Attitude, attitude_of
 from torchgco.obstacles.base import Obstacles, Solids, places_of
@@ -64,8 +64,7 @@ class Body:
         if radii.dim() == 0:
             radii = radii.expand(len(offsets))
         check_shape(radii, (len(offsets),), "body.radii")
-        if not bool(torch.isfinite(offsets).all()):
-            raise InputError("body.offsets", "finite numbers", "NaN or infinity")
+        check_finite(offsets, "body.offsets")
         if not bool(((radii >= 0) & torch.isfinite(radii)).all()):
             raise InputError("body.radii", "finite radii of at least 0 m", radii.tolist())
         if self.attitude not in ("heading", "quaternion") and not callable(self.attitude):
@@ -233,16 +232,12 @@ class BoundBody(Obstacles):
     batched: ClassVar[tuple[str, ...]] = ("balls", "inner", "points")
 
     inscribed = property(lambda self: self.inner)  # type: ignore[assignment]
-    knots = property(lambda self: self.inner.knots)  # type: ignore[assignment]
-    position = property(lambda self: self.inner.position)  # type: ignore[assignment]
-    dt = property(lambda self: self.inner.dt)  # type: ignore[assignment]
-    stops = property(lambda self: self.inner.stops)  # type: ignore[assignment]
+    knots, position, dt, stops, moving = passed_on("inner", "knots", "position", "dt", "stops", "moving")
     # Of the largest ball: a length that tells the vehicle's size.
-    vehicle_radius = property(lambda self: self._sized())  # type: ignore[assignment]
+    vehicle_radius = property(lambda self: self.radii.amax(-1))  # type: ignore[assignment]
     absent = property(lambda self: self._joined("absent"))  # type: ignore[assignment]
     margins = property(lambda self: self._joined("margins"))  # type: ignore[assignment]
     sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
-    moving = property(lambda self: self.inner.moving)  # type: ignore[assignment]
     radii = property(lambda self: torch.stack([ball.vehicle_radius for ball in self.balls], dim=-1))  # (B, P), m
     # Of the smallest ball about the position that holds the body, (B,), m.
     reach = property(lambda self: (self.points.offsets.norm(dim=-1) + self.radii).amax(-1))
@@ -358,9 +353,6 @@ class BoundBody(Obstacles):
 
     def _of_each(self, change: Callable[[Any], Any]) -> Self:
         return replace(self, balls=tuple(map(change, self.balls)), inner=change(self.inner))
-
-    def _sized(self) -> Tensor:
-        return torch.stack([ball.vehicle_radius for ball in self.balls]).amax(0)
 
     def _joined(self, name: str) -> Tensor:
         return torch.cat([getattr(ball, name) for ball in self.balls], dim=-1)

@@ -59,7 +59,11 @@ class Cuboids(Solids):
         return _square(excess(at_share(begin, along, nearest(begin, along, half)), half))
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        return signed_distance(self.seen_from(points), self.halves()) - self.radii.unsqueeze(1)
+        return self.distance_at(self.seen_from(points))
+
+    def distance_at(self, local: Coordinates) -> Tensor:
+        """The same at coordinates (B, V, M) along the sides of each box."""
+        return signed_distance(local, self.halves()) - self.radii.unsqueeze(1)
 
     def deeper(self, points: Tensor, than: Tensor) -> Tensor:
         # Most points lie outside of the bounds of most boxes.
@@ -100,14 +104,18 @@ class Cuboids(Solids):
 
         On a box with sides of length 0, such as the axis of a capsule, to a side across which its length is 0.
         """
-        local, half = self.seen_from(points), self.halves()
+        return self.normals_at(self.seen_from(points))
+
+    def normals_at(self, local: Coordinates) -> Tensor:
+        """The same at coordinates (B, V, M) along the sides of each box."""
+        half = self.halves()
         away = torch.stack(excess(local, half), dim=-1)
         square = away.square().sum(-1, keepdim=True)
         outside = away / torch.where(square > 0, square, 1.0).sqrt()
-        place = torch.stack(local, dim=-1)
+        place = torch.stack(list(local), dim=-1)
         inner = place.abs() - torch.stack(half, dim=-1)
         # The first of the nearest sides; of two opposite sides at equal distance, the positive one.
-        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(points.dtype)
+        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(place.dtype)
         inside = torch.where(place < 0, -side, side)
         normal = torch.where(square > 0, outside, inside)
         return (self.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)

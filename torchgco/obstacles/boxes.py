@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape
+from torchgco.base.shapes import Dimensions, check_finite, check_shape
 from torchgco.base.tree import take
-from torchgco.constraints.base import Constraint, Sense, count_of, resolve_knots
-from torchgco.obstacles.base import ABSENT, Obstacles, picked
+from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.obstacles.attitude import in_plane
+from torchgco.obstacles.base import ABSENT, OwnKind, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
@@ -56,7 +57,6 @@ class Boxes(Constraint):
     radii: Any = None
     knots: Any = None
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
@@ -77,14 +77,11 @@ class Boxes(Constraint):
             expected = "finite half sides above 0 m; 0 m too where the box is rounded"
             raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
         axes = _axes(self.rotations, absent, d, dims)
-        vehicle = vehicle_radii(self.vehicle_radius, "boxes.vehicle_radius", dims)
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
-        knots = resolve_knots(knots, dims.N, "boxes.knots", half.device)
-        return BoundBoxes.prepare(centers, half, axes, absent, radii, vehicle, knots, dims)
+        return BoundBoxes.prepare(self, "boxes", dims, centers, half, axes, absent, radii)
 
 
 @dataclass(frozen=True)
-class BoundBoxes(Obstacles):
+class BoundBoxes(OwnKind):
     """Boxes, sharp or rounded, shaped for their problem."""
 
     centers: Tensor  # (B, M, d)
@@ -106,24 +103,23 @@ class BoundBoxes(Obstacles):
     @classmethod
     def prepare(
         cls,
+        given: Any,
+        name: str,
+        dims: Dimensions,
         centers: Tensor,
         half_sizes: Tensor,
         axes: Tensor,
         absent: Tensor,
         radii: Tensor,
-        vehicle_radius: Tensor,
-        knots: Any,
-        dims: Dimensions,
     ) -> BoundBoxes:
-        """Boxes of checked numbers (B, ...), whatever those of absent boxes are."""
+        """Boxes of checked numbers (B, ...), whatever those of absent boxes are, with radius and knots as `given`."""
         assert dims.position is not None
+        vehicle = vehicle_radii(given.vehicle_radius, f"{name}.vehicle_radius", dims)
+        knots = resolve_knots(given.knots, dims.N, f"{name}.knots", centers.device, dims.obstacles_from)
         centers, half = (torch.where(absent.unsqueeze(-1), 0.0, part) for part in (centers, half_sizes))
-        inflated = torch.where(absent, 0.0, radii + vehicle_radius.unsqueeze(-1))
+        inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
         depths = inflated + half.amin(-1)
-        return cls(centers, half, axes, absent, vehicle_radius, inflated, depths, knots, dims.position, dims.dt or 0.0)
-
-    def bind(self, dims: Dimensions) -> Self:
-        return self
+        return cls(centers, half, axes, absent, vehicle, inflated, depths, knots, dims.position, dims.dt or 0.0)
 
     @property
     def margins(self) -> Tensor:
@@ -133,30 +129,11 @@ class BoundBoxes(Obstacles):
     def sizes(self) -> Tensor:
         return self.depths
 
-    def row_shape(self, N: int) -> tuple[int, int]:
-        return count_of(self.knots, N + 1), self.absent.shape[1]
+    def rows(self, p: Tensor, t: Tensor) -> Tensor:
+        return torch.where(self.absent.unsqueeze(1), ABSENT, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
 
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.counted(self._rows(X[:, self.knots, self.position]), ABSENT, X.shape[1])
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        rows = self._rows(x[..., self.position])
-        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, at = X.shape[-1], self.position
-        g, h = self.counted(g, 0.0, X.shape[1]), self.counted(h, 0.0, X.shape[1])
-        cp = -2.0 * self.depths[:, None, :, None] * self.inflated().normals(X[:, self.knots, at])
-        gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
-        H[:, self.knots, at, n] += gradient
-        H[:, self.knots, n, at] += gradient
-        H[:, self.knots, at, at] += (h.unsqueeze(-1) * cp).mT @ cp
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        """Depth beneath the full surface, (B, K, M), m."""
-        p = X[:, self.knots, self.position]
-        depth = (-self.signed_distance(p, self.times(X))).clamp(min=0.0)
-        return self.counted(depth, 0.0, X.shape[1])
+    def slopes(self, p: Tensor, t: Tensor) -> Tensor:
+        return -2.0 * self.depths[:, None, :, None] * self.inflated().normals(p)
 
     def worst(self, X: Tensor, U: Tensor) -> Tensor:
         parts = self._parts(X.shape[1])
@@ -192,9 +169,6 @@ class BoundBoxes(Obstacles):
             parts[name] = parts[name].masked_fill(absent.view(*absent.shape, *([1] * (parts[name].dim() - 2))), 0.0)
         return replace(self, absent=absent, **parts)
 
-    def stopping_at(self, knots: Tensor) -> Self:
-        return replace(self, stops=knots.to(self.centers.dtype))
-
     def inflated(self) -> Cuboids:
         return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)
 
@@ -209,10 +183,6 @@ class BoundBoxes(Obstacles):
         size = max(B, 1) if self.absent.is_cuda else max(1, BOX_GAPS_AT_ONCE // max(1, points * M))
         return [slice(first, first + size) for first in range(0, max(B, 1), size)]
 
-    def _rows(self, p: Tensor) -> Tensor:
-        """c (B, K, M) at points (B, K, d); an absent box is c = -1 everywhere."""
-        return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
-
 
 def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
     """The directions (B, M, d, d) of the sides; those of absent boxes are the axes of space."""
@@ -222,8 +192,7 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
     if d == 2:
         angle = per_problem(rotations, "boxes.rotations", 2, dims)
         check_shape(angle, tuple(absent.shape), "boxes.rotations")
-        cos, sin = angle.cos(), angle.sin()
-        axes = torch.stack((torch.stack((cos, sin), dim=-1), torch.stack((-sin, cos), dim=-1)), dim=-2)
+        axes = in_plane(angle).mT
     else:
         turns = per_problem(rotations, "boxes.rotations", 3, dims)
         check_shape(turns, (*absent.shape, 4), "boxes.rotations")
@@ -233,6 +202,5 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
             raise InputError("boxes.rotations", "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
         axes = from_quaternions(turns / length)
     axes = torch.where(absent[..., None, None], straight, axes)
-    if not bool(torch.isfinite(axes).all()):
-        raise InputError("boxes.rotations", "finite numbers for every box that is there", "NaN or infinity")
+    check_finite(axes, "boxes.rotations", "finite numbers for every box that is there")
     return axes.contiguous()

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
-from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.constraints.base import Constraint
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import from_quaternions
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.inputs import dimension, own_radii, points, vehicle_radii
+from torchgco.obstacles.inputs import dimension, own_radii, points
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,6 @@ class Capsules(Constraint):
     vehicle_radius: Any = 0.0
     knots: Any = None
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
@@ -58,10 +57,7 @@ class Capsules(Constraint):
         if bool((radii[~absent] == 0).any()):
             raise InputError("capsules.radii", "radii above 0 m", 0.0)
         half, axes = _single_side(ends - starts, absent)
-        vehicle = vehicle_radii(self.vehicle_radius, "capsules.vehicle_radius", dims)
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
-        knots = resolve_knots(knots, dims.N, "capsules.knots", starts.device)
-        return BoundBoxes.prepare(0.5 * (starts + ends), half, axes, absent, radii, vehicle, knots, dims)
+        return BoundBoxes.prepare(self, "capsules", dims, 0.5 * (starts + ends), half, axes, absent, radii)
 
 
 def _single_side(along: Tensor, absent: Tensor) -> tuple[Tensor, Tensor]:

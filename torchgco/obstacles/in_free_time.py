@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.shapes import Dimensions
+from torchgco.base.tree import passed_on
 from torchgco.constraints.norms import NO_ROW
 from torchgco.obstacles.base import TOUCH, Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
@@ -30,13 +31,8 @@ class SpheresInFreeTime(Obstacles):
 
     batched: ClassVar[tuple[str, ...]] = ("spheres",)
 
-    absent = property(lambda self: self.spheres.absent)  # type: ignore[assignment]
-    vehicle_radius = property(lambda self: self.spheres.vehicle_radius)  # type: ignore[assignment]
-    position = property(lambda self: self.spheres.position)  # type: ignore[assignment]
-    dt = property(lambda self: self.spheres.dt)  # type: ignore[assignment]
-    knots = property(lambda self: self.spheres.knots)  # type: ignore[assignment]
-    margins = property(lambda self: self.spheres.margins)  # type: ignore[assignment]
-    moving = property(lambda self: self.spheres.moving)  # type: ignore[assignment]
+    absent, vehicle_radius, position = passed_on("spheres", "absent", "vehicle_radius", "position")
+    dt, knots, margins, moving = passed_on("spheres", "dt", "knots", "margins", "moving")
 
     def bind(self, dims: Dimensions) -> Self:
         return self

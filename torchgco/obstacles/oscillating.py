@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape
-from torchgco.constraints.base import Constraint, Sense
-from torchgco.obstacles.base import ABSENT, TOUCH, Obstacles, least, picked
+from torchgco.base.shapes import Dimensions, check_finite, check_shape
+from torchgco.base.tree import passed_on
+from torchgco.constraints.base import Constraint
+from torchgco.obstacles.base import ABSENT, TOUCH, OwnKind, least, picked
 from torchgco.obstacles.body import Body
-from torchgco.obstacles.box_geometry import Cuboids, excess, segment_distance, signed_distance
+from torchgco.obstacles.box_geometry import Cuboids, segment_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
 from torchgco.obstacles.inputs import per_problem
 
@@ -39,7 +40,6 @@ class OscillatingBoxes(Constraint):
     rates: Any
     phases: Any
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
@@ -56,8 +56,7 @@ class OscillatingBoxes(Constraint):
             check_shape(part, (B, M, part.shape[2], d), f"boxes.{name}")
             check_shape(part, tuple(sines[0].shape) if sines else tuple(part.shape), f"boxes.{name}")
             part = torch.where(boxes.absent[..., None, None], 0.0, part)
-            if not bool(torch.isfinite(part).all()):
-                raise InputError(f"boxes.{name}", "finite numbers for every box that is there", "NaN or infinity")
+            check_finite(part, f"boxes.{name}", "finite numbers for every box that is there")
             sines.append(part)
         if M == 0:
             return boxes  # none of them moves: what is asked of moving obstacles alone isn't asked of none
@@ -66,7 +65,7 @@ class OscillatingBoxes(Constraint):
 
 
 @dataclass(frozen=True)
-class BoundOscillatingBoxes(Obstacles):
+class BoundOscillatingBoxes(OwnKind):
     """Oscillating boxes shaped for their problem."""
 
     boxes: BoundBoxes  # in the middle of their motion
@@ -78,39 +77,21 @@ class BoundOscillatingBoxes(Obstacles):
 
     batched: ClassVar[tuple[str, ...]] = ("boxes", "amplitudes", "rates", "phases")
 
-    absent = property(lambda self: self.boxes.absent)  # type: ignore[assignment]
-    vehicle_radius = property(lambda self: self.boxes.vehicle_radius)  # type: ignore[assignment]
-    position = property(lambda self: self.boxes.position)  # type: ignore[assignment]
-    margins = property(lambda self: self.boxes.margins)  # type: ignore[assignment]
-    sizes = property(lambda self: self.boxes.sizes)  # type: ignore[assignment]
+    absent, vehicle_radius, position = passed_on("boxes", "absent", "vehicle_radius", "position")
+    margins, sizes = passed_on("boxes", "margins", "sizes")
     moving = property(lambda self: bool((self.amplitudes != 0).any()))  # type: ignore[assignment]
-
-    def bind(self, dims: Dimensions) -> Self:
-        return self
 
     def places(self, t: Tensor) -> Tensor:
         """Centres (B, K, M, d), m, at times t (K,), s."""
         angle = t.view(1, -1, 1, 1, 1) * self.rates.unsqueeze(1) + self.phases.unsqueeze(1)
         return self.boxes.centers.unsqueeze(1) + (self.amplitudes.unsqueeze(1) * angle.sin()).sum(-2)
 
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._rows(X[:, self.knots, self.position], self.times(X))
+    def rows(self, p: Tensor, t: Tensor) -> Tensor:
+        c = -2.0 * self.boxes.depths.unsqueeze(1) * self._outside(p, t)
+        return torch.where(self.absent.unsqueeze(1), ABSENT, c)
 
-    def at(self, x: Tensor, k: int) -> Tensor:
-        return self._rows(x[..., self.position], x.new_full((1,), k * self.dt))
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, at = X.shape[-1], self.position
-        p, t = X[:, self.knots, at], self.times(X)
-        cp = -2.0 * self.boxes.depths[:, None, :, None] * self._normals(p, t)
-        gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
-        H[:, self.knots, at, n] += gradient
-        H[:, self.knots, n, at] += gradient
-        H[:, self.knots, at, at] += (h.unsqueeze(-1) * cp).mT @ cp
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        """Depth beneath the full surface, (B, K, M), m."""
-        return (-self.signed_distance(X[:, self.knots, self.position], self.times(X))).clamp(min=0.0)
+    def slopes(self, p: Tensor, t: Tensor) -> Tensor:
+        return -2.0 * self.boxes.depths[:, None, :, None] * self._solids.normals_at(self._local(p, t))
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
         return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p, t))
@@ -153,20 +134,4 @@ class BoundOscillatingBoxes(Obstacles):
 
     def _outside(self, p: Tensor, t: Tensor) -> Tensor:
         """Distances (B, K, M) from the full surfaces, as if none were absent."""
-        distance = signed_distance(self._local(p, t), self._solids.halves())
-        return distance - self.boxes.inflated_radii.unsqueeze(1)
-
-    def _rows(self, p: Tensor, t: Tensor) -> Tensor:
-        c = -2.0 * self.boxes.depths.unsqueeze(1) * self._outside(p, t)
-        return torch.where(self.absent.unsqueeze(1), ABSENT, c)
-
-    def _normals(self, p: Tensor, t: Tensor) -> Tensor:
-        """Unit vectors (B, K, M, d) along which the distances of points (B, K, d) grow."""
-        local, half = self._local(p, t), self._solids.halves()
-        away, place = torch.stack(excess(local, half), dim=-1), torch.stack(local, dim=-1)
-        square = away.square().sum(-1, keepdim=True)
-        outside = away / torch.where(square > 0, square, 1.0).sqrt()
-        inner = place.abs() - torch.stack(half, dim=-1)
-        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(p.dtype)
-        normal = torch.where(square > 0, outside, torch.where(place < 0, -side, side))
-        return (self.boxes.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)
+        return self._solids.distance_at(self._local(p, t))

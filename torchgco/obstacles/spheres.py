@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape, space_of
-from torchgco.constraints.base import Constraint, Sense, count_of, resolve_knots
-from torchgco.obstacles.base import ABSENT, TOUCH, Obstacles, Solids, least, picked
-from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of
+from torchgco.constraints.base import Constraint, add_at, resolve_knots
+from torchgco.obstacles.base import TOUCH, OwnKind, Solids, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, per_problem, points, vehicle_radii
 
@@ -45,7 +44,6 @@ class Spheres(Constraint):
     velocities: Any = None
     knots: Any = None
 
-    sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
@@ -61,27 +59,22 @@ class Spheres(Constraint):
             velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
             check_shape(velocities, tuple(centers.shape), "obstacles.velocities")
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
-            if not bool(torch.isfinite(velocities).all()):
-                raise InputError("obstacles.velocities", "finite velocities of every sphere", "NaN or infinity")
-        if velocities is not None and dims.dt is None:
-            raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
+            check_finite(velocities, "obstacles.velocities", "finite velocities of every sphere")
+            if dims.dt is None:
+                raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
         if centers.shape[1] == 0:
             velocities = None  # none of them moves: what is asked of moving obstacles alone isn't asked of none
-        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
-        return BoundSpheres.prepare(
-            torch.where(absent.unsqueeze(-1), 0.0, centers),
-            torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1)),
-            velocities,
-            absent,
-            vehicle,
-            resolve_knots(knots, dims.N, "obstacles.knots", radii.device),
-            dims.position,
+        centers = torch.where(absent.unsqueeze(-1), 0.0, centers)
+        inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
+        knots, dt = (
+            resolve_knots(self.knots, dims.N, "obstacles.knots", radii.device, dims.obstacles_from),
             dims.dt or 0.0,
         )
+        return BoundSpheres.prepare(centers, inflated, velocities, absent, vehicle, knots, dims.position, dt)
 
 
 @dataclass(frozen=True)
-class BoundSpheres(Obstacles):
+class BoundSpheres(OwnKind):
     """Spheres shaped for their problem, with the matrices of the one-product evaluation prepared."""
 
     centers: Tensor  # (B, M, d), at t = 0
@@ -131,25 +124,13 @@ class BoundSpheres(Obstacles):
             weights, torch.cat(first, dim=-1), torch.cat(second, dim=-1),
         )  # fmt: skip
 
-    def bind(self, dims: Dimensions) -> Self:
-        return self
-
-    def row_shape(self, N: int) -> tuple[int, int]:
-        return count_of(self.knots, N + 1), self.absent.shape[1]
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        p = X[:, self.knots, self.position]
-        return self.counted(torch.bmm(self._features(p, self._times(X)), self.weights), ABSENT, X.shape[1])
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        p = x[..., self.position]
-        rows = torch.bmm(self._features(p, x.new_tensor(k * self.dt)), self.weights)
-        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
+    def rows(self, p: Tensor, t: Tensor) -> Tensor:
+        return torch.bmm(self._features(p, t.unsqueeze(-1)), self.weights)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         # With c_p = -2 (p - o):  sum g c_p = 2 (sum g o - p sum g),  sum h c_p c_p' = 4 sum h (o - p)(o - p)'.
         p = X[:, self.knots, self.position]
-        d, n, t = p.shape[-1], X.shape[-1], self._times(X)
+        d, t = p.shape[-1], self.times(X).unsqueeze(-1)
         g, h = self.counted(g, 0.0, X.shape[1]), self.counted(h, 0.0, X.shape[1])
         g_sum, g_o = self._first_moments(g, t, d)
         h_sum, h_o = self._first_moments(h, t, d)
@@ -157,10 +138,7 @@ class BoundSpheres(Obstacles):
         gradient = 2.0 * (g_o - p * g_sum)
         cross = p.unsqueeze(-1) * h_o.unsqueeze(-2)
         hessian = 4.0 * (h_oo - cross - cross.mT + h_sum.unsqueeze(-1) * _outer(p, p).unflatten(-1, (d, d)))
-        at = self.position
-        H[:, self.knots, at, n] += gradient
-        H[:, self.knots, n, at] += gradient
-        H[:, self.knots, at, at] += hessian
+        add_at(H, self.knots, self.position, X.shape[-1], gradient, hessian)
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """Penetration depth r_obs + r_veh - |p_obs - p|, m, by plain differences."""
@@ -169,7 +147,7 @@ class BoundSpheres(Obstacles):
 
     def gaps(self, X: Tensor) -> Tensor:
         """Distance |p_obs,i(k) - p_k| (B, K, M), m; infinite where absent."""
-        return self._gaps(X[:, self.knots, self.position], self._times(X))
+        return self._gaps(X[:, self.knots, self.position], self.times(X))
 
     @property
     def moving(self) -> bool:
@@ -180,7 +158,7 @@ class BoundSpheres(Obstacles):
         return self.inflated_radii
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
-        return self._gaps(p, t.unsqueeze(-1)) - self.inflated_radii.unsqueeze(1)
+        return self._gaps(p, t) - self.inflated_radii.unsqueeze(1)
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         o = self.centers.unsqueeze(1)
@@ -194,33 +172,26 @@ class BoundSpheres(Obstacles):
         return replace(self, inflated_radii=radii, vehicle_radius=self.vehicle_radius + by, weights=weights)
 
     def later(self, t: float) -> BoundSpheres:
-        if self.velocities is None:
-            return self
-        moved = self.prepare(
-            self.centers + t * self.velocities, self.inflated_radii, self.velocities, self.absent, self.vehicle_radius,
-            self.knots, self.position, self.dt,
-        )  # fmt: skip
-        return replace(moved, stops=self.stops)
+        return self if self.velocities is None else self._with(centers=self.centers + t * self.velocities)
 
     def paced(self, factor: Tensor) -> BoundSpheres:
         """The same spheres, which move `factor` (B,) times as far from knot to knot."""
-        if self.velocities is None:
-            return self
-        faster = self.prepare(
-            self.centers, self.inflated_radii, factor.view(-1, 1, 1) * self.velocities, self.absent,
-            self.vehicle_radius, self.knots, self.position, self.dt,
-        )  # fmt: skip
-        return replace(faster, stops=self.stops)
+        return self if self.velocities is None else self._with(velocities=factor.view(-1, 1, 1) * self.velocities)
 
     def chosen(self, at: Tensor) -> BoundSpheres:
         absent = (at < 0) | picked(self.absent, at)
-        centers = torch.where(absent.unsqueeze(-1), 0.0, picked(self.centers, at))
+        centers, velocities = (
+            None if part is None else torch.where(absent.unsqueeze(-1), 0.0, picked(part, at))
+            for part in (self.centers, self.velocities)
+        )
         radii = torch.where(absent, 0.0, picked(self.inflated_radii, at))
-        velocities = None
-        if self.velocities is not None:
-            velocities = torch.where(absent.unsqueeze(-1), 0.0, picked(self.velocities, at))
-        some = self.prepare(centers, radii, velocities, absent, self.vehicle_radius, self.knots, self.position, self.dt)
-        return replace(some, stops=self.stops)
+        return self._with(centers=centers, inflated_radii=radii, velocities=velocities, absent=absent)
+
+    def _with(self, **changes: Tensor | None) -> BoundSpheres:
+        """The same with other numbers, and the matrices of these."""
+        names = "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "knots", "position", "dt"
+        numbers: dict[str, Any] = {name: getattr(self, name) for name in names} | changes
+        return replace(self.prepare(**numbers), stops=self.stops)
 
     def inflated(self) -> Solids | None:
         return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
@@ -235,20 +206,13 @@ class BoundSpheres(Obstacles):
         gap = _from_origin(away[:, :-1], away.diff(dim=1)) - (1.0 - share) * self.inflated_radii.unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
-    def stopping_at(self, knots: Tensor) -> Self:
-        return replace(self, stops=knots.to(self.centers.dtype))
-
     def _gaps(self, p: Tensor, t: Tensor) -> Tensor:
-        """Distances (B, K, M) of points p (B, K, d) from the centres at times t (K, 1); infinite where absent."""
+        """Distances (B, K, M) of points p (B, K, d) from the centres at times t (K,); infinite where absent."""
         o = self.centers.unsqueeze(1)
         if self.velocities is not None:
             o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
         gap = (p.unsqueeze(2) - o).square().sum(-1).sqrt()
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
-
-    def _times(self, X: Tensor) -> Tensor:
-        """t = k dt at the constraint's knots, (K, 1)."""
-        return self.times(X).unsqueeze(-1)
 
     def _features(self, p: Tensor, t: Tensor) -> Tensor:
         q = [p, p.square().sum(-1, keepdim=True), torch.ones_like(p[..., :1])]

@@ -33,12 +33,9 @@ def clearance_figure(trials: pd.DataFrame) -> Figure:
     height there is the share of collisions. Clearances that aren't finite are counted below the axis; a line ends
     below 100 % where there are some.
     """
-    tasks = [(title, task) for title, task in tasks_of(trials) if _drawable(task, "clearance")]
-    figure, axes = panels(len(tasks), 2, SIZE)
-    for ax, (title, task) in zip(axes, tasks, strict=True):
-        _steps(ax, _by_solver(task, "clearance"), "clearance [m]", mark=0.0)
-        tidy(ax, title)
-    _legend(figure, trials, "surface (0.95 of both radii)")
+    figure, shown = _panels(trials, "clearance", "surface (0.95 of both radii)")
+    for ax, values in shown:
+        _steps(ax, values, "clearance [m]", mark=0.0)
     return figure
 
 
@@ -50,17 +47,26 @@ def violation_figure(trials: pd.DataFrame) -> Figure:
 
     Violations below 1e-12, zero included, are drawn there. Success requires a violation left of the line at 1e-3.
     """
-    tasks = [(title, task) for title, task in tasks_of(trials) if _drawable(task, "violation")]
-    figure, axes = panels(len(tasks), 2, SIZE)
-    for ax, (title, task) in zip(axes, tasks, strict=True):
-        decades = {name: np.log10(values.clip(LOWEST)) for name, values in _by_solver(task, "violation").items()}
+    figure, shown = _panels(trials, "violation", "tolerance")
+    for ax, values in shown:
+        decades = {name: np.log10(held.clip(LOWEST)) for name, held in values.items()}
         # A linear axis of exponents: its lower end stands for all below.
         _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(SUCCESS_VIOLATION))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.xaxis.set_major_formatter(FuncFormatter(_power))
-        tidy(ax, title)
-    _legend(figure, trials, "tolerance")
     return figure
+
+
+def _panels(trials: pd.DataFrame, column: str, mark: str) -> tuple[Figure, list[tuple[Axes, dict[str, np.ndarray]]]]:
+    """A figure, and for each task its axes and the column's values by solver; `mark` names the dashed line."""
+    tasks = [(title, task) for title, task in tasks_of(trials) if _drawable(task, column)]
+    figure, axes = panels(len(tasks), 2, SIZE)
+    for ax, (title, _) in zip(axes, tasks, strict=True):
+        tidy(ax, title)
+    colours = solver_colours(trials["solver"].unique())
+    handles = [Line2D([], [], color=colour, linewidth=1.6, label=solver) for solver, colour in colours.items()]
+    legend(figure, [*handles, Line2D([], [], color=INK, linestyle="--", linewidth=1.2, label=mark)])
+    return figure, [(ax, _by_solver(task, column)) for ax, (_, task) in zip(axes, tasks, strict=True)]
 
 
 def _power(exponent: float, _: object) -> str:
@@ -98,9 +104,3 @@ def _steps(ax: Axes, values: dict[str, np.ndarray], label: str, mark: float) -> 
     lost = {name: int((~np.isfinite(held)).sum()) for name, held in values.items()}
     missing = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
     ax.set_xlabel(f"{label}\nnot finite, hence not shown: {missing}" if missing else label)
-
-
-def _legend(figure: Figure, trials: pd.DataFrame, mark: str) -> None:
-    colours = solver_colours(trials["solver"].unique())
-    handles = [Line2D([], [], color=colour, linewidth=1.6, label=solver) for solver, colour in colours.items()]
-    legend(figure, [*handles, Line2D([], [], color=INK, linestyle="--", linewidth=1.2, label=mark)])

@@ -21,11 +21,11 @@ def outlines(problem: Problem, b: int) -> list[Outline]:
     gates = gates_of(problem.take(torch.tensor([b], device=problem.x0.device)))
     if gates is None:
         return []
-    centers, sizes = gates.centers[0].cpu().numpy(), gates.sizes[0].cpu().numpy()
+    centers, sizes = (part[0].detach().cpu().double().numpy() for part in (gates.centers, gates.sizes))
     if isinstance(gates, GateBalls):
         return [(center[None], float(size)) for center, size in zip(centers, sizes, strict=True)]
     assert isinstance(gates, GateSquares)
-    axes, found = gates.axes[0].cpu().numpy(), []
+    axes, found = gates.axes[0].cpu().double().numpy(), []
     for center, size, own in zip(centers, sizes, axes, strict=True):
         signs = np.array([s for s in product((-1.0, 1.0), repeat=len(own) - 1)])
         if len(own) == 3:

@@ -161,17 +161,15 @@ class _Map:
     def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> _Map:
         world = world_of(problem, courses[0].b)
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
-        boxes = [view(scene, [0], kept, others) for scene in world.scenes]
-        box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
-        moving = [c for scene in world.scenes for course in courses for c in moving_corners(scene, 0, course.paths[0])]
-        box = np.stack([np.min([box[0], *(c[0] for c in moving)], 0), np.max([box[1], *(c[1] for c in moving)], 0)])
+        gates, inside = outlines(problem, courses[0].b), [view(scene, [0], kept, others) for scene in world.scenes]
         for course in courses:
+            for scene in world.scenes:
+                inside += moving_corners(scene, 0, course.paths[0])
             if world.body is not None and course.keeps:
-                reached = extent(world.body, course.X[: len(flown(course.paths[0]))])
-                box = np.stack([np.minimum(box[0], reached.min(0)), np.maximum(box[1], reached.max(0))])
-        gates = outlines(problem, courses[0].b)
-        for corners, radius in gates:
-            box = np.stack([np.minimum(box[0], corners.min(0) - radius), np.maximum(box[1], corners.max(0) + radius)])
+                inside.append(extent(world.body, course.X[: len(flown(course.paths[0]))]))
+        inside += [corners + sign * radius for corners, radius in gates for sign in (-1.0, 1.0)]
+        points = np.concatenate(inside)
+        box = np.stack([points.min(axis=0), points.max(axis=0)])
         return cls(world, courses, planes, box, gates)
 
     @property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -73,9 +72,9 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
         for ax in row:
             ax.set_xlabel(_words(variable))
             tidy(ax, title if ax is row[0] else "")
-    kind = (lambda colour, name: Line2D([], [], color=colour, marker="o", label=name)) if numeric else _patch
-    handles: list[Artist] = [kind(colour, solver) for solver, colour in colours.items()]
-    legend(figure, handles)
+    lines = [Line2D([], [], color=colour, marker="o", label=solver) for solver, colour in colours.items()]
+    patches = [Patch(color=colour, label=solver) for solver, colour in colours.items()]
+    legend(figure, lines if numeric else patches)
     return figure
 
 
@@ -95,10 +94,6 @@ def _effort(rows: pd.DataFrame) -> tuple[str, str, str] | None:
 def _words(variable: str) -> str:
     """A swept variable for a reader: no key of the command line, with its unit where it has one."""
     return WORDS.get(variable, variable.split(".")[-1].replace("_", " "))
-
-
-def _patch(colour: str, name: str) -> Patch:
-    return Patch(color=colour, label=name)
 
 
 def _as_rate(ax: Axes, name: str) -> None:

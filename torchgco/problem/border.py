@@ -92,8 +92,6 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     Raises:
         InputError: names the method, what was expected, and what it returned.
     """
-    if not is_users(dynamics):
-        return
     check_names(dynamics)
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
@@ -146,8 +144,6 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     Raises:
         InputError: as `check_dynamics`.
     """
-    if not is_users(cost):
-        return
     rows, X, U, k = _ends(x0), _states(x0, N + 1), _controls(x0, N, m), torch.arange(N)
     wanted = f"a number in {x0.dtype}, the type of x0, per state and control"
     stage: Callable[..., Any] = lambda i, x, u, k=k: cost.take(i).stage(x, u, k)
@@ -183,8 +179,6 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     Raises:
         InputError: as `check_dynamics`.
     """
-    if not is_users(constraint):
-        return
     rows, X, U = _ends(x0), _states(x0, N + 1), _controls(x0, N, m)
     value = lambda i, X, U: constraint.take(i).value(X, U)
     K = len(torch.arange(N + 1)[constraint.knots])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row, space_of
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.norms import NormBounds
@@ -58,18 +58,12 @@ class Goal(PerElement):
             raise InputError("goal.required", "True or False", shown(self.required))
         if self.state is not None:
             return self._bound_state(dims)
-        d = space_of(dims, "goal")
-        position = tensor(self.position, "goal.position", dims.like)
-        position = position.expand(dims.B, -1) if position.dim() == 1 else position
-        check_shape(position, (dims.B, d), "goal.position")
-        if not bool(torch.isfinite(position).all()):
-            raise InputError("goal.position", "finite numbers", "NaN or infinity")
+        position = per_row(self.position, "goal.position", dims, space_of(dims, "goal"))
+        check_finite(position, "goal.position")
         return Goal(position.contiguous(), self._bound_radius(dims), self.required)
 
     def _bound_radius(self, dims: Dimensions) -> Tensor:
-        radius = tensor(self.radius, "goal.radius", dims.like)
-        radius = radius.expand(dims.B) if radius.dim() == 0 else radius
-        check_shape(radius, (dims.B,), "goal.radius")
+        radius = per_row(self.radius, "goal.radius", dims)
         if not bool((radius > 0).all() & torch.isfinite(radius).all()):
             raise InputError("goal.radius", "finite numbers above 0 m", float(radius.min()))
         return radius.contiguous()
@@ -79,9 +73,7 @@ class Goal(PerElement):
             raise InputError("goal.state", "a state with required=True; or a position and a radius", "required=False")
         if self.position is not None and not self._is_bound:
             raise InputError("goal.position", "none beside a state", shown(self.position))
-        state = tensor(self.state, "goal.state", dims.like)
-        state = state.expand(dims.B, -1) if state.dim() == 1 else state
-        check_shape(state, (dims.B, dims.n), "goal.state")
+        state = per_row(self.state, "goal.state", dims, dims.n)
         free = torch.isnan(state)
         if bool(torch.isinf(state).any() | (free != free[:1]).any() | free.all()):
             raise InputError("goal.state", "finite numbers, NaN in the same components of all problems", state.tolist())
@@ -109,8 +101,7 @@ class Goal(PerElement):
             assert bound is not None and dims.position is not None
             at = list(range(dims.n))[dims.position]
             return GoalBall(("x", at), upper=bound.radius, knots=[dims.N], center=bound.position).bind(dims)
-        state = tensor(self.state, "goal.state", dims.like)
-        return GoalState(state.expand(dims.B, -1) if state.dim() == 1 else state).bind(dims)
+        return GoalState(per_row(self.state, "goal.state", dims, dims.n)).bind(dims)
 
     @classmethod
     def derived(cls, state: Tensor | None, dims: Dimensions) -> Goal | None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
-from torchgco.base.tree import Rows, cast, field_names, is_users
+from torchgco.base.tree import Rows, cast, field_names, is_users, take
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -248,17 +248,8 @@ class Problem:
             index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
         if _is_whole(index, self.B):
             return self
-        parts = {
-            "dynamics": self.dynamics.take(index),
-            "cost": self.cost.take(index),
-            "constraints": tuple(c.take(index) for c in self.constraints),
-            "x0": self.x0[index],
-            "goal": None if self.goal is None else self.goal.take(index),
-            "horizon": None if self.horizon is None else self.horizon[index],
-            "free_start": None if self.free_start is None else self.free_start[index],
-            "time": None if self.time is None else self.time.take(index),
-        }
-        part = self._with(parts, known=self.known)
+        names = "dynamics", "cost", "constraints", "x0", "goal", "horizon", "free_start", "time"
+        part = self._with({name: take(getattr(self, name), index) for name in names}, known=self.known)
         if self.B == 1 or self.one is not None:
             object.__setattr__(part, "one", self.one or self)
         if self.given is not None:

@@ -84,20 +84,10 @@ def _cost(cost: Cost, n: int, r: int) -> Cost:
 
 def _quadratic(cost: BoundQuadratic, r: int) -> BoundQuadratic:
     """The same cost, which is no matter of r further states."""
-    square = 0 if cost.diagonal else r
-    sizes = {
-        "Q": (r, square),
-        "Qf": (r, square),
-        "x_ref": (r, 0),
-        "xf_ref": (r, 0),
-        "q": (r, 0),
-        "qf": (r, 0),
-        "H": (r, 0),
-    }
     parts = {}
-    for name, (last, other) in sizes.items():
-        value = getattr(cost, name)
-        parts[name] = None if value is None else torch.nn.functional.pad(value, (0, last, 0, other))
+    for name in ("Q", "Qf", "x_ref", "xf_ref", "q", "qf", "H"):
+        value, more = getattr(cost, name), r if name in ("Q", "Qf") and not cost.diagonal else 0
+        parts[name] = None if value is None else torch.nn.functional.pad(value, (0, r, 0, more))
     return replace(cost, **parts)
 
 

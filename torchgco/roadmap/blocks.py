@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchgco.maps.ways import neighbours
 from torchgco.roadmap.clearances import Clearances
 from torchgco.roadmap.lattice import Array, Lattice
 from torchgco.roadmap.native_maps import SURE_SPACINGS, WAY_PARTS, Graph, String, Sweep, library_for
@@ -124,12 +124,7 @@ class Blocks:
 
         V, number = len(weight), self.block.reshape(self.counts)
         pairs = []
-        for move in product((-1, 0, 1), repeat=3):
-            if move <= (0, 0, 0):
-                continue
-            axes = list(zip(move, self.counts, strict=True))
-            here = tuple(slice(max(0, -k), n - max(0, k)) for k, n in axes)
-            there = tuple(slice(max(0, k), n - max(0, -k)) for k, n in axes)
+        for _, here, there in neighbours(self.counts):
             both = np.stack((number[here].ravel(), number[there].ravel()))
             pairs.append(np.sort(both[:, (both[0] != both[1]) & (both >= 0).all(0)], axis=0))
         a, b = np.unique(np.concatenate(pairs, axis=1), axis=1).astype(np.int64)

@@ -8,21 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from torch import Tensor
 
 from torchgco.maps.ways import length
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.mapped import CLOSE_UNITS, Price, even, in_each, in_one, one_of_each_class, ways_of
+from torchgco.roadmap.mapped import CLOSE_UNITS, Price, even, in_one, one_of_each_class, ways_of
 from torchgco.roadmap.search import HOPS
 
 ROOMY = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide
 AVERAGED = 0.8  # units: the standard deviation over which the corners of a path with few of them are averaged
-
-
-def clear_path_in_maps(scene: Scene, overlap: float) -> tuple[Tensor, Tensor]:
-    """A path of each problem that keeps clear of obstacles as far as its way allows: as `Roadmap.paths`, with one."""
-    return in_each(scene, 1, overlap, _clear_path)
 
 
 def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
@@ -45,8 +39,8 @@ def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
     return in_one(scene, b, overlap, search)
 
 
-def _clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
-    """The cheapest path (HOPS+1, d), its corners averaged; none, or one."""
+def clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
+    """A path (HOPS+1, d) that keeps clear of obstacles as far as its way allows, its corners averaged; none, or one."""
     ways = ways_of(lattice, ends, price, radius, ROOMY * unit)
     if ways is None:
         return []

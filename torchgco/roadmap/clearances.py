@@ -5,6 +5,7 @@ Most of a large map is far from every sensible way, and what is far from obstacl
 
 from __future__ import annotations
 
+import ctypes
 from functools import cached_property
 from itertools import product
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from torchgco.roadmap.native_maps import SURE_SPACINGS, Map, map_of, measured
+from torchgco.roadmap.native_maps import SURE_SPACINGS, Map, library_for, map_of
 
 Nodes = NDArray[np.int64]
 Numbers = NDArray[np.float64]
@@ -88,8 +89,9 @@ class Clearances:
     @cached_property
     def everywhere(self) -> NDArray[np.float32]:
         """At all nodes."""
-        found = measured(self.native, self.size)
-        if found is not None:
+        if (library := library_for(self.d)) is not None:
+            found = np.empty(self.size, np.float32)
+            library.tgco_measure(ctypes.byref(self.native), found.ctypes.data_as(ctypes.c_void_p))
             return found
         rows = np.indices(self.size[1:].tolist()).reshape(self.d - 1, -1).T
         values = np.empty((int(self.size[0]), len(rows)), np.float32)

@@ -94,9 +94,7 @@ class Scene:
 
     def take(self, rows: Tensor) -> Scene:
         """The same of some problems."""
-        cost = self.traversal_cost
-        obstacles = take(self.obstacles, rows)
-        gates = None if self.gates is None else self.gates[rows]
+        cost, (obstacles, gates) = self.traversal_cost, take((self.obstacles, self.gates), rows)
         return Scene(self.start[rows], self.goal[rows], obstacles, lambda points, some: cost(points, rows[some]), gates)
 
 

@@ -199,7 +199,10 @@ def paths(
     ways = ways_of(lattice, ends, price, radius, CLOSE_UNITS * unit)
     if ways is None:
         return []
-    found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
+    if lattice.d == 2:  # the cheapest way of each homotopy class
+        found = [ways.taut(v) for v in itertools.islice(one_of_each_class(ways).values(), count)]
+    else:
+        found = _in_space(ways, count, unit)
     return [path for path in found if len(path) <= corners]
 
 
@@ -216,11 +219,6 @@ def ways_of(lattice: Lattice, ends: Array, price: Price, radius: float, margin: 
         if np.isfinite(ways.total).any():
             return ways
     return None
-
-
-def _in_the_plane(ways: Ways, count: int) -> list[Array]:
-    """The cheapest way of each homotopy class, drawn taut."""
-    return [ways.taut(v) for v in itertools.islice(one_of_each_class(ways).values(), count)]
 
 
 def one_of_each_class(ways: Ways) -> dict[int, int]:
@@ -265,7 +263,7 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
         if len(found) == count:
             break
         path = ways.taut(int(v))
-        points = _spread(path)
+        points = even(path, COMPARED)
         if all(_apart(points, other) > unit for other in found):
             found.append(path)
     return found + _beside(ways, found, count - len(found), unit)
@@ -279,15 +277,10 @@ def _beside(ways: Ways, found: list[Array], count: int, unit: float) -> list[Arr
     for _ in range(count):
         path = ways.beside(weight)
         weight[ways.near(path, unit)] *= 1.0 + DIVERSITY
-        points = _spread(path)
+        points = even(path, COMPARED)
         if all(_apart(points, other) > unit for other in (*found, *others)):
             others.append(path)
     return others
-
-
-def _spread(path: Array) -> Array:
-    """Points (COMPARED, d) at equal shares of a path's length."""
-    return even(path, COMPARED)
 
 
 def even(path: Array, count: int) -> Array:

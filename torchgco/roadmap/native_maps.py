@@ -100,13 +100,3 @@ def map_of(values: NDArray[np.float32], low: NDArray[np.int64], size: NDArray[np
         whole[: values.ndim] = part
     shape, before, count = map(torch.from_numpy, three)
     return Map.complete(values=torch.from_numpy(values), shape=shape, low=before, size=count, **numbers)
-
-
-def measured(of: Map, size: NDArray[np.int64]) -> NDArray[np.float32] | None:
-    """Clearances at all nodes; None where C can't serve."""
-    library = library_for(len(size))
-    if library is None:
-        return None
-    values = torch.empty(tuple(size.tolist()), dtype=torch.float32)
-    library.tgco_measure(ctypes.byref(of), ctypes.c_void_p(values.data_ptr()))
-    return values.numpy()

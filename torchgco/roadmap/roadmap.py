@@ -18,11 +18,11 @@ from torch import Tensor
 from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.tree import take
 from torchgco.roadmap import native as roadmap
-from torchgco.roadmap.clear import clear_path_in_maps, clear_ways
+from torchgco.roadmap.clear import clear_path, clear_ways
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
 from torchgco.roadmap.lattice import Array
-from torchgco.roadmap.mapped import paths_in_maps
+from torchgco.roadmap.mapped import in_each, paths_in_maps
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import DIVERSITY, HOPS, TorchSearch
 
@@ -101,7 +101,7 @@ class Roadmap:
         Elsewhere none: edges of the graph keep to the middle between neighbours.
         """
         if scene.obstacles.maps:
-            return clear_path_in_maps(scene, self.max_overlap)
+            return in_each(scene, 1, self.max_overlap, clear_path)
         straight = torch.stack((scene.start, scene.goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1)
         return straight, torch.zeros_like(scene.start[:, 0], dtype=torch.bool)
 

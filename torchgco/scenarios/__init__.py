@@ -18,6 +18,12 @@ from torchgco.scenarios.vehicle import Task, Vehicle
 from torchgco.scenarios.woods import Woods
 from torchgco.scenarios.yard import Yard
 
+# The random families, each an option `scenario=` of the command line under its `name`.
+FAMILIES: tuple[type[Scenario], ...] = (
+    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
+    Floors, GateForest, Race, Parking,
+)  # fmt: skip
+
 __all__ = [
     "Crossing",
     "Cylinders",

@@ -127,6 +127,15 @@ def equal_spheres(centers: np.ndarray, radius: float) -> dict[str, np.ndarray]:
     return {"centers": centers[None], "radii": np.where(np.isnan(centers[:, 0]), np.nan, radius)[None]}
 
 
+def upright_capsules(axes: np.ndarray, height: Sequence[float], radii: np.ndarray) -> dict[str, np.ndarray]:
+    """The fields of Layouts for one layout of capsules at `axes` (K, 2) with ends at z = `height`, radii (K,), m."""
+    low, high = height
+    half = np.zeros((1, len(axes), 3))
+    half[..., 2] = 0.5 * (high - low)
+    centers = np.column_stack([axes, np.full(len(axes), 0.5 * (low + high))])
+    return {"box_centers": centers[None], "box_half_sizes": half, "box_radii": radii[None]}
+
+
 def uniform_clear(
     rng: np.random.Generator,
     region: Sequence[Sequence[float]],

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchgco.base.options import Within
 from torchgco.scenarios import checks
-from torchgco.scenarios.base import uniform_clear
+from torchgco.scenarios.base import uniform_clear, upright_capsules
 from torchgco.scenarios.layouts import Layouts
 from torchgco.scenarios.quadrotor import Quadrotor
 
@@ -45,11 +45,5 @@ class Cylinders(Quadrotor):
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         clear = ((self.start[:2], self.clearance), (self.goal[:2], self.clearance))
         axes = uniform_clear(rng, self.region, self.num_obstacles, clear)
-        low, high = self.height
-        half = np.zeros((1, self.num_obstacles, 3))
-        half[..., 2] = 0.5 * (high - low)
-        return self._layout(
-            box_centers=np.column_stack([axes, np.full(self.num_obstacles, 0.5 * (low + high))])[None],
-            box_half_sizes=half,
-            box_radii=rng.uniform(self.radii[0], self.radii[1], (1, self.num_obstacles)),
-        )
+        radii = rng.uniform(self.radii[0], self.radii[1], self.num_obstacles)
+        return self._layout(**upright_capsules(axes, self.height, radii))

@@ -11,7 +11,7 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.base.options import INCREASING, Above, AtMost, Within
 from torchgco.scenarios import checks
-from torchgco.scenarios.base import MAX_DRAWS, Family, uniform_clear
+from torchgco.scenarios.base import MAX_DRAWS, Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts
 from torchgco.scenarios.quadrotor import Quadrotor
 
@@ -88,12 +88,13 @@ class GateForest(Quadrotor):
             raise InputError("scenario.density", expected, f"{self.density}, which makes {spheres}")
         keep_clear = [(place.tolist(), self.clearance) for place in places]
         centers = uniform_clear(rng, np.column_stack([low, high]).tolist(), spheres, keep_clear)
-        return Layouts(
-            centers=centers[None], radii=np.full((1, spheres), self.obstacle_radius), start=places[0], goal=places[-1],
-            gate_centers=places[None, 1:-1], gate_radii=np.full((1, count), self.gate_radius),
-            vehicle_radius=self.vehicle_radius, goal_radius=self.goal_radius, dt=self.dt,
-            stages=self.stages * (count + 1), free_time=np.array([self.time_least, self.time_most, 1.0]),
-        )  # fmt: skip
+        drawn = self._layout(
+            **equal_spheres(centers, self.obstacle_radius),
+            gate_centers=places[None, 1:-1],
+            gate_radii=np.full((1, count), self.gate_radius),
+            free_time=np.array([self.time_least, self.time_most, 1.0]),
+        )
+        return replace(drawn, goal=places[-1], stages=self.stages * (count + 1))
 
     def _course(self, rng: np.random.Generator, legs: int) -> np.ndarray:
         """Start, gates and goal (legs + 1, 3), m: each at least the least spacing from all others."""

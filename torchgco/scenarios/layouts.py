@@ -18,7 +18,7 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.memory import free_memory
-from torchgco.base.options import Natural, check_value
+from torchgco.base.options import check_value
 from torchgco.maps.distance import DistanceField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.scenarios import checks, stored_maps
@@ -26,6 +26,7 @@ from torchgco.scenarios.stored_maps import map_arrays, map_of
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")
+SPHERES = (*REQUIRED, "velocities")
 CONTROLS = ("control_lower", "control_upper")
 BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 SINES = ("box_amplitudes", "box_rates", "box_phases")
@@ -33,8 +34,7 @@ GATES = ("gate_centers", "gate_radii")
 TIME = "free_time"
 BINDS = "goal_required"
 NAMED_ARRAYS = (
-    *REQUIRED,
-    "velocities",
+    *SPHERES,
     *BOXES,
     *SINES,
     *GATES,
@@ -114,38 +114,25 @@ class Layouts:
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
 
     def __post_init__(self) -> None:
-        def put(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
         centers, radii = checks.obstacles(self.centers, self.radii)
-        put("centers", centers)
-        put("radii", radii)
-        put("velocities", checks.velocities(self.velocities, centers))
+        moving = checks.velocities(self.velocities, centers)
         boxes = checks.boxes(self.box_centers, self.box_half_sizes, self.box_rotations, self.box_radii, centers)
-        for name, value in zip(BOXES, boxes, strict=True):
-            put(name, value)
-        sines = checks.sines([getattr(self, name) for name in SINES], self.box_centers)
-        for name, value in zip(SINES, sines, strict=True):
-            put(name, value)
-        for name, value in zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True):
-            put(name, value)
-        put(TIME, checks.free_time(self.free_time, self.velocities))
-        put(BINDS, checks.required(self.goal_required))
-        for name in ("start", "goal"):
-            put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
+        checked: dict[str, Any] = {"centers": centers, "radii": radii, "velocities": moving}
+        checked |= zip(BOXES, boxes, strict=True)
+        checked |= zip(SINES, checks.sines([getattr(self, name) for name in SINES], boxes[0]), strict=True)
+        checked |= zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True)
+        checked |= {TIME: checks.free_time(self.free_time, moving), BINDS: checks.required(self.goal_required)}
+        checked |= {name: checks.states(getattr(self, name), f"layouts.{name}", centers) for name in ("start", "goal")}
+        checked |= {name: checks.scalar(name, getattr(self, name)) for name in SHARED}
+        checked |= zip(CONTROLS, checks.control_bounds(self.control_lower, self.control_upper), strict=True)
+        checked |= {"stages": checks.stages(self.stages, len(centers)), "ids": checks.ids(self.ids, len(centers))}
+        checked |= {"best_cost": checks.best_cost(self.best_cost, len(centers))}
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "map", self._checked_map())
         lengths = {state.shape[1] for state in (self.start, self.goal) if state is not None} - {centers.shape[2]}
         if self.start is not None and self.goal is not None and len(lengths) > 1:
             raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
-        for name in checks.SCALARS:
-            if name != "stages":
-                put(name, checks.scalar(name, getattr(self, name)))
-        put("stages", checks.stages(self.stages, len(centers)))
-        lower, upper = checks.control_bounds(self.control_lower, self.control_upper)
-        put("control_lower", lower)
-        put("control_upper", upper)
-        put("best_cost", checks.best_cost(self.best_cost, len(centers)))
-        put("ids", checks.ids(self.ids, len(centers)))
-        put("map", self._checked_map())
         check_value(self.name, str, "layouts.name")
 
     def _checked_map(self) -> DistanceField | None:
@@ -215,27 +202,12 @@ class Layouts:
         index = checks.indices(indices, "layouts.take")
         if index.max() >= self.count:
             raise InputError("layouts.take", f"positions in 0..{self.count - 1}", int(index.max()))
-        rows = ("centers", "radii", "velocities", *BOXES, *SINES, *GATES, "start", "goal", "best_cost", "ids")
+        rows = (*SPHERES, *BOXES, *SINES, *GATES, "start", "goal", "best_cost", "ids")
         held = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
         held = {name: value[index] for name, value in held.items()}
         if isinstance(self.stages, np.ndarray):
             held["stages"] = self.stages[index]
         return replace(self, map=None if self.map is None else self.map.take(index), **held)
-
-    def pad(self, obstacles: int) -> Layouts:
-        """The same layouts with M = `obstacles` spheres, absent ones added last; InputError if there are more."""
-        present = self.radii.shape[1]
-        missing = check_value(obstacles, Natural, "layouts.pad") - present
-        if missing < 0:
-            raise InputError("layouts.pad", f"at least the {present} obstacles there are", obstacles)
-        if missing == 0:
-            return self
-
-        def padded(value: np.ndarray) -> np.ndarray:
-            return np.pad(value, _behind(value, missing), constant_values=np.nan)
-
-        velocities = None if self.velocities is None else padded(self.velocities)
-        return replace(self, centers=padded(self.centers), radii=padded(self.radii), velocities=velocities)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the arrays to `path` (npz): all of it or, if interrupted, nothing."""
@@ -293,30 +265,61 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
         raise InputError("layouts", "at least one part to concatenate", "none")
     _same("dimension", [part.dimension for part in parts])
     shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SHARED, *CONTROLS, TIME, BINDS)}
-    width = max(part.radii.shape[1] for part in parts)
-    parts = [part.pad(width) for part in parts]
-    joined = ("start", "goal", "velocities", "best_cost")
-    columns = {name: [getattr(part, name) for part in parts] for name in joined}
     for name in ("start", "goal"):
-        _same(name, [None if state is None else state.shape[1] for state in columns[name]])
-    if any(value is not None for value in columns["velocities"]):
-        columns["velocities"] = [
-            np.zeros_like(part.centers) if part.velocities is None else part.velocities for part in parts
-        ]
-    if any(value is not None for value in columns["best_cost"]):
-        columns["best_cost"] = [
-            np.full(part.count, np.nan) if part.best_cost is None else part.best_cost for part in parts
-        ]
-    columns |= _joined_boxes(parts) | _joined_sines(parts) | _joined_gates(parts)
+        _same(name, [None if (states := getattr(part, name)) is None else states.shape[1] for part in parts])
     return Layouts(
-        centers=np.concatenate([part.centers for part in parts]),
-        radii=np.concatenate([part.radii for part in parts]),
-        **{name: None if column[0] is None else np.concatenate(column) for name, column in columns.items()},
+        **_joined(parts, SPHERES),
+        **_joined(parts, (*BOXES, *SINES)),
+        **_joined(parts, GATES),
+        **{name: _joined_rows(parts, name) for name in ("start", "goal", "best_cost")},
         **shared,
         stages=_joined_stages(parts),
         map=_joined_map(parts),
         name="+".join(dict.fromkeys(part.name for part in parts)),
         ids=np.concatenate([part.ids for part in parts]),
+    )
+
+
+def _joined(parts: Sequence[Layouts], names: Sequence[str]) -> dict[str, Any]:
+    """Arrays of the obstacles or gates of all parts, NaN where a part has fewer; without those that no part has.
+
+    Args:
+        names: of arrays with the same rows; the first holds their places.
+    """
+    counts = [0 if (places := getattr(part, names[0])) is None else places.shape[1] for part in parts]
+    joined = {}
+    for name in names if max(counts) or names == SPHERES else ():
+        held = [getattr(part, name) for part in parts]
+        if all(value is None for value in held):
+            continue
+        rows = zip(parts, counts, held, strict=True)
+        held = [_unmoved(name, part, count) if value is None else value for part, count, value in rows]
+        if name in SINES:  # as many for each
+            most = max(value.shape[2] for value in held)
+            held = [np.pad(value, [(0, 0), (0, 0), (0, most - value.shape[2]), (0, 0)]) for value in held]
+        behind = [[(0, 0), (0, max(counts) - value.shape[1]), (0, 0), (0, 0)][: value.ndim] for value in held]
+        padded = [np.pad(value, by, constant_values=np.nan) for value, by in zip(held, behind, strict=True)]
+        joined[name] = np.concatenate(padded)
+    return joined
+
+
+def _unmoved(name: str, part: Layouts, count: int) -> np.ndarray:
+    """What an array that a part lacks would hold of `count` obstacles: they are at rest, sharp and not turned."""
+    if name in SINES:
+        return np.zeros((part.count, count, 0, part.dimension))
+    if name == "box_rotations" and part.dimension == 3:
+        return np.tile((1.0, 0.0, 0.0, 0.0), (part.count, count, 1))
+    flat = name in ("box_rotations", "box_radii", "gate_radii")
+    return np.zeros((part.count, count) if flat else (part.count, count, part.dimension))
+
+
+def _joined_rows(parts: Sequence[Layouts], name: str) -> np.ndarray | None:
+    """An array with a row per layout, NaN in parts without it; None where no part has it."""
+    held = [getattr(part, name) for part in parts]
+    if all(value is None for value in held):
+        return None
+    return np.concatenate(
+        [np.full(part.count, np.nan) if x is None else x for part, x in zip(parts, held, strict=True)]
     )
 
 
@@ -338,60 +341,6 @@ def _joined_map(parts: Sequence[Layouts]) -> DistanceField | None:
         raise InputError("layouts.map", "the same in all parts", "none in some")
     every = [[one] if one.batch is not None else [one] * part.count for one, part in zip(maps, parts, strict=True)]
     return DistanceField.joined([one for some in every for one in some])
-
-
-def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
-    """The boxes of all parts, padded to the same number; None where no part has any."""
-    width = max(0 if part.box_centers is None else part.box_centers.shape[1] for part in parts)
-    optional = [name for name in BOXES[2:] if any(getattr(part, name) is not None for part in parts)]
-    columns: dict[str, list[Any]] = {name: [] for name in BOXES}
-    for part in parts:
-        none = np.empty((part.count, 0, part.dimension))
-        centers = none if part.box_centers is None else part.box_centers
-        halves = none if part.box_half_sizes is None else part.box_half_sizes
-        count, turns, radii = centers.shape[1], part.box_rotations, part.box_radii
-        if turns is None:  # no turn: an angle of 0, or its quaternion
-            turns = np.zeros((part.count, count))
-            turns = turns if part.dimension == 2 else np.tile((1.0, 0.0, 0.0, 0.0), (part.count, count, 1))
-        radii = np.zeros((part.count, count)) if radii is None else radii
-        for name, value in zip(BOXES, (centers, halves, turns, radii), strict=True):
-            columns[name].append(np.pad(value, _behind(value, width - count), constant_values=np.nan))
-    kept = () if width == 0 else (*BOXES[:2], *optional)
-    return {name: column if name in kept else [None] for name, column in columns.items()}
-
-
-def _joined_sines(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
-    """The sines of the boxes of all parts, as many for each; boxes of parts without any rest. None where none moves."""
-    counts = [0 if part.box_centers is None else part.box_centers.shape[1] for part in parts]
-    sines = max((part.box_amplitudes.shape[2] for part in parts if part.box_amplitudes is not None), default=0)
-    columns: dict[str, list[Any]] = {name: [] for name in SINES}
-    for part, count in zip(parts, counts, strict=True):
-        for name in SINES:
-            value = getattr(part, name)
-            value = np.zeros((part.count, count, sines, part.dimension)) if value is None else value
-            value = np.pad(value, [(0, 0), (0, 0), (0, sines - value.shape[2]), (0, 0)])
-            columns[name].append(np.pad(value, _behind(value, max(counts) - count), constant_values=np.nan))
-    return columns if sines and max(counts) else {name: [None] for name in SINES}
-
-
-def _joined_gates(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
-    """The gates of all parts, as many for each; None where no part has any."""
-    if all(part.gate_centers is None for part in parts):
-        return {name: [None] for name in GATES}
-    most = max(0 if part.gate_centers is None else part.gate_centers.shape[1] for part in parts)
-    columns: dict[str, list[Any]] = {name: [] for name in GATES}
-    for part in parts:
-        none = np.empty((part.count, 0, part.dimension)), np.empty((part.count, 0))
-        centers = none[0] if part.gate_centers is None else part.gate_centers
-        radii = none[1] if part.gate_radii is None else part.gate_radii
-        for name, value in zip(GATES, (centers, radii), strict=True):
-            columns[name].append(np.pad(value, _behind(value, most - radii.shape[1]), constant_values=np.nan))
-    return columns
-
-
-def _behind(value: np.ndarray, missing: int) -> list[tuple[int, int]]:
-    """The widths with which np.pad adds `missing` rows along the second axis."""
-    return [(0, 0), (0, missing), (0, 0), (0, 0)][: value.ndim]
 
 
 def _same(name: str, values: list[Any]) -> Any:

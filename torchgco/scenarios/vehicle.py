@@ -259,11 +259,10 @@ class Vehicle:
         if self.state_lower is None and self.state_upper is None:
             return []
         given = (self.state_lower, -inf), (self.state_upper, inf)
-        sides = [
-            [none] * self.dynamics.n if side is None else [none if bound is None else bound for bound in side]
-            for side, none in given
-        ]
-        return [StateBounds(sides[0], sides[1])]
+        lower, upper = (
+            [none if bound is None else bound for bound in side or [None] * self.dynamics.n] for side, none in given
+        )
+        return [StateBounds(lower, upper)]
 
     def _required(self, goal: Tensor, center: Tensor, radius: float) -> Goal:
         """The goal that has to be met, at states (B, n)."""

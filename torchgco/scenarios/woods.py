@@ -8,7 +8,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError
 from torchgco.scenarios import checks
-from torchgco.scenarios.base import uniform_clear
+from torchgco.scenarios.base import uniform_clear, upright_capsules
 from torchgco.scenarios.layouts import Layouts
 from torchgco.scenarios.quadrotor import Quadrotor
 
@@ -48,11 +48,5 @@ class Woods(Quadrotor):
         count = int(rng.poisson(self.expected_count))
         clear = ((self.start[:2], self.clearance), (self.goal[:2], self.clearance))
         axes = uniform_clear(rng, self.region, count, clear)
-        low, high = self.height
-        half = np.zeros((1, count, 3))
-        half[..., 2] = 0.5 * (high - low)
-        return self._layout(
-            box_centers=np.column_stack([axes, np.full(count, 0.5 * (low + high))])[None],
-            box_half_sizes=half,
-            box_radii=rng.uniform(self.radii[0], self.radii[1], (1, count)),
-        )
+        radii = rng.uniform(self.radii[0], self.radii[1], count)
+        return self._layout(**upright_capsules(axes, self.height, radii))

@@ -27,7 +27,6 @@ from torchgco.solution import Solution
 
 EXACT_STEP = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
 EXACT_COSTATES = 1e-5  # share of the largest costate by which that step may change one
-SERVED = "a problem in float64"
 
 
 def asks_for_gradients(problem: Problem) -> bool:
@@ -60,9 +59,8 @@ def check_smoothing(problem: Problem, smoothing: Any) -> float:
 
 def refuse_forms(problem: Problem, what: str) -> None:
     """Raise InputError for forms of problems that have no derivatives here, of which `what` asks for them."""
-    for got, refused in ((problem.x0.dtype, problem.x0.dtype != torch.float64),):
-        if refused:
-            raise InputError("problem", f"{SERVED}, for {what}", got)
+    if problem.x0.dtype != torch.float64:
+        raise InputError("problem", f"a problem in float64, for {what}", problem.x0.dtype)
 
 
 def _captures(problem: Problem) -> bool:

@@ -115,7 +115,7 @@ class Forward(Last):
         return X, U, lam, lagrangian.clone()
 
 
-class Adjoint(torch.autograd.Function):
+class Adjoint(Last):
     """Gradients by the residual's parts, from upstream ones of X, U, multipliers and costs, of which it is linear.
 
     It is a function of its own, of the parts too, for two reasons: a rule for many right hand sides at once, and that a
@@ -135,10 +135,6 @@ class Adjoint(torch.autograd.Function):
     def backward(ctx: Any, x: Tensor, u: Tensor, gaps: Tensor, rows: Tensor, cost: Tensor) -> tuple[Any, ...]:
         X, U, _, lam = ctx.system.once(x, u, gaps, rows)
         return None, X, U, lam, cost.clone(), *(torch.zeros_like(part, device=x.device) for part in ctx.parts)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> NoReturn:
-        raise RuntimeError(NO_SECOND)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], system: System, *given: Tensor) -> tuple[Any, Any]:

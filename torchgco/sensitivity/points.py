@@ -9,7 +9,6 @@ are ones of the same problem with larger obstacles: these are tried next, and th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,9 +71,8 @@ class Points:
 
     def take(self, rows: Tensor) -> Points:
         """Those of the problems `rows`, places (b,)."""
-        own: dict[str, Any] = {name: getattr(self, name)[rows] for name in ("growth", "active", "costates", "reason")}
-        own |= {name: None if (part := getattr(self, name)) is None else part[rows] for name in ("give", "gap")}
-        return Points(self.solution.take(rows), self.problem.take(rows), **own)
+        tensors = self.growth, self.active, self.costates, self.reason, self.give, self.gap
+        return Points(self.solution.take(rows), self.problem.take(rows), *take(tensors, rows))
 
 
 def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> Points:

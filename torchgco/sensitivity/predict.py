@@ -61,14 +61,8 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
         refuse_forms(one, "a prediction")
         if for_solvers(one) is not one:
             expected = "a problem with one horizon, a fixed time and no RateBounds, for a prediction"
-            got = (
-                "horizons per problem"
-                if one.horizon is not None
-                else "RateBounds"
-                if one.time is None
-                else "a free time"
-            )
-            raise InputError("problem", expected, got)
+            got = "RateBounds" if one.time is None else "a free time"
+            raise InputError("problem", expected, got if one.horizon is None else "horizons per problem")
     _check_same(before, changed)
     with torch.no_grad(), computing_on(changed.x0.device):
         points = points_of(current(before), solution.detach())
@@ -79,12 +73,9 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
 
 def _check_same(before: Problem, changed: Problem) -> None:
     """Raise InputError unless both problems have the same numbers of states, stages and rows."""
-
-    def form(problem: Problem) -> tuple[object, ...]:
-        return problem.B, problem.N, problem.n, problem.m, problem.row_shapes
-
-    if form(before) != form(changed):
-        raise InputError("changed", f"a problem with B, N, n, m, rows as before, {form(before)}", form(changed))
+    was, now = ((one.B, one.N, one.n, one.m, one.row_shapes) for one in (before, changed))
+    if was != now:
+        raise InputError("changed", f"a problem with B, N, n, m, rows as before, {was}", now)
 
 
 def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:

@@ -114,32 +114,28 @@ class AugmentedLagrangian(Solver):
             by_arrival: an iterate that has arrived at a stated goal is preferred to any that hasn't.
         """
         loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
-        B = call.problem.B
-        every = torch.arange(B, device=call.rows.device)
-        run_all(loop, every, max(1, B if self.slots is None else self.slots))
+        run_all(loop, max(1, self.slots or call.problem.B))
         return loop.result
 
 
+@dataclass(eq=False)
 class OuterLoop:
     """The outer loops of one call (Algorithm 4); statuses are (b,) int64, RUNNING until a problem ends."""
 
-    def __init__(
-        self,
-        solver: AugmentedLagrangian,
-        call: Call,
-        guidance: Guidance | None,
-        penalty: Penalty | None,
-        recorder: Recorder | None,
-        guide_first: bool,
-        by_arrival: bool,
-    ) -> None:
-        self.solver, self.call, self.guidance, self.penalty, self.recorder = solver, call, guidance, penalty, recorder
-        self.guide_first, self.by_arrival = guide_first, by_arrival
-        self.rules = solver.inner.rules
-        self._result: SolveEnd | None = None
-        self.stopped = 0  # problems that guidance has stopped
-        self.limit = 1 if recorder is not None else solver.inner.max_iterations
-        self._passes: OuterPasses | None = None  # of the running problems
+    solver: AugmentedLagrangian
+    call: Call
+    guidance: Guidance | None
+    penalty: Penalty | None
+    recorder: Recorder | None
+    guide_first: bool
+    by_arrival: bool
+    stopped: int = 0  # problems that guidance has stopped
+    _result: SolveEnd | None = None
+    _passes: OuterPasses | None = None  # of the running problems
+
+    def __post_init__(self) -> None:
+        self.rules = self.solver.inner.rules
+        self.limit = 1 if self.recorder is not None else self.solver.inner.max_iterations
 
     @property
     def result(self) -> SolveEnd:
@@ -293,8 +289,8 @@ class OuterLoop:
     def _begin_inner(self, running: Problem, s: State, rows: Tensor) -> None:
         """The next inner solve of `rows` of the running problems: L_M with its new multipliers and penalty."""
         s.regularisation[rows] = 0.0
-        penalty = None if s.penalty is None else take(s.penalty, rows)
-        lagrangian = Lagrangian(running.take(rows), take(s.multipliers, rows), penalty, self.rules.phr)
+        multipliers, penalty = take((s.multipliers, s.penalty), rows)
+        lagrangian = Lagrangian(running.take(rows), multipliers, penalty, self.rules.phr)
         s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
         s.inner[rows] = s.rung[rows] = 0
 
@@ -364,14 +360,14 @@ class OuterLoop:
             self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, now))
 
 
-def run_all(work: OuterLoop, rows: Tensor, slots: int) -> None:
-    """Run the problems `rows` to their end, at most `slots` at a time.
+def run_all(work: OuterLoop, slots: int) -> None:
+    """Run all problems of a call to their end, at most `slots` at a time.
 
     Nested loops would wait for the slowest problem of the batch at three levels. Here every problem is at its own place
     in the loops. A problem that ends frees its slot for a waiting one; if none waits, the running batch shrinks.
     """
-    waiting = rows[slots:]
-    state, status = work.begin(rows[:slots])
+    first, waiting = torch.arange(work.call.problem.B, device=work.call.rows.device).tensor_split([slots])
+    state, status = work.begin(first)
     work.regroup(state.rows)
     running, waiting = _replaced(work, state, status, waiting)
     passes = 0

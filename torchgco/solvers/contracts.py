@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import torch
@@ -121,8 +122,8 @@ class Call:
         part = self.problem.take(index)
         if part is self.problem:
             return self
-        warm = None if self.warm is None else take(self.warm, index)
-        U0, ids, rows, outer, X0 = take((self.U0, self.ids, self.rows, self.outer, self.X0), index)
+        held = self.U0, self.ids, self.rows, self.outer, self.warm, self.X0
+        U0, ids, rows, outer, warm, X0 = take(held, index)
         return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline, X0)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
@@ -137,6 +138,12 @@ def check_ids(ids: Any, problem: Problem) -> None:
     device = problem.x0.device
     if not isinstance(ids, Tensor) or (ids.shape, ids.dtype, ids.device) != ((problem.B,), torch.int64, device):
         raise InputError("ids", f"an int64 tensor ({problem.B},) on {device}", describe(ids))
+
+
+def check_states(X0: Any, problem: Problem) -> None:
+    """Raise InputError unless X0 is (B, N+1, n) of the problem's dtype and device."""
+    check_tensor(X0, "X0", problem.x0)
+    check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
 
 
 class Solver(Brief):
@@ -188,12 +195,15 @@ class Solver(Brief):
                 Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
                 return replace(Solution.empty(problem), account=Account(problem, self))
             whole = for_solvers(problem, self.joins_knots)
+            if X0 is not None:
+                check_states(X0, problem)
+            made = partial(Call.checked, whole, seed=seed, ids=ids, callback=callback, max_seconds=max_seconds)
             if problem.time is not None:
-                return self._in_time(problem, whole, U0, seed, ids, warm, callback, max_seconds, X0)
+                return self._in_time(problem, whole, U0, warm, X0, made)
             if problem.horizon is not None:
                 problem.check_controls(U0)
                 U0 = at_rest_after(problem, U0)
-            call = Call.checked(whole, U0, seed, ids, warm, callback, max_seconds)
+            call = made(U0, warm=warm)
             self.announce(call.problem)
             call = call if X0 is None else self._from_states(call, X0, problem)
             if problem.free_start is not None and bool(problem.free_start.any()) and not self.frees_start(call.problem):
@@ -209,21 +219,15 @@ class Solver(Brief):
         problem: Problem,
         whole: Problem,
         U0: Tensor,
-        seed: int,
-        ids: Tensor | None,
         warm: Multipliers | None,
-        callback: Callback | None,
-        max_seconds: float | None,
         X0: Tensor | None,
+        made: Callable[..., Call],
     ) -> Solution:
-        """`solve` of a problem with a free time, which is `whole` for solvers."""
+        """`solve` of a problem with a free time, which is `whole` for solvers; `made` makes a call of it."""
         problem.check_controls(U0)
-        if X0 is not None:
-            check_tensor(X0, "X0", problem.x0)
-            check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
         lifted = None if warm is None else lifted_multipliers(problem, whole, warm)
         U = torch.cat((U0, U0.new_ones(*U0.shape[:2], whole.m - problem.m)), dim=-1)
-        call = Call.checked(whole, U, seed, ids, lifted, callback, max_seconds)
+        call = made(U, warm=lifted)
         self.announce(call.problem)
         chooser = self.choosing_time(call.problem)
         if chooser is None:
@@ -249,8 +253,6 @@ class Solver(Brief):
 
     def _from_states(self, call: Call, X0: Tensor, problem: Problem) -> Call:
         """The call with states (B, N+1, n) of the user's problem to begin with; InputError where that can't be."""
-        check_tensor(X0, "X0", problem.x0)
-        check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
         if not self.take_states(call.problem):
             able = "interior_point or, without obstacles, gco; or ipopt"
             raise InputError("X0", f"None, or a solver that can begin with states: {able}", type(self).__name__)

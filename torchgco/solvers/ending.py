@@ -22,9 +22,8 @@ from torchgco.problem.problem import Problem
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
 FIRST, STRONGER, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
-HIDES = (
-    0.1  # the error of a curvature by rounding, times the states' and controls' size squared, as a share of that unit
-)
+# The error of a curvature by rounding, times the states' and controls' size squared, as a share of that unit.
+HIDES = 0.1
 
 
 def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+ORDER = ["element", "attempt", "iteration"]  # of a trace's rows
+
+
 class Recorder:
     """Collects one small tensor per pass and column; the table is made once, at the end."""
 
@@ -48,15 +51,10 @@ class Recorder:
         """
         import pandas as pd
 
-        columns = (
-            {name: torch.cat([row[name] for row in self._passes]).cpu().numpy() for name in self._passes[0]}
-            if self._passes
-            else {}
-        )
-        frame = pd.DataFrame(columns)
         if not self._passes:
-            return frame
-        return in_units(frame, unit, constant).sort_values(["element", "attempt", "iteration"], ignore_index=True)
+            return pd.DataFrame()
+        columns = {name: torch.cat([row[name] for row in self._passes]).cpu().numpy() for name in self._passes[0]}
+        return in_units(pd.DataFrame(columns), unit, constant).sort_values(ORDER, ignore_index=True)
 
 
 def in_units(trace: pd.DataFrame, unit: Tensor, constant: Tensor) -> pd.DataFrame:
@@ -76,5 +74,4 @@ def appended(trace: pd.DataFrame | None, later: pd.DataFrame | None) -> pd.DataF
 
     before = trace.groupby("element")["attempt"].max()
     own = later.assign(attempt=later["attempt"] + later["element"].map(before).fillna(0).astype(int))
-    whole = pd.concat((trace, own))
-    return whole.sort_values(["element", "attempt", "iteration"], ignore_index=True)
+    return pd.concat((trace, own)).sort_values(ORDER, ignore_index=True)

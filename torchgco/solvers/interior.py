@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
@@ -30,7 +29,7 @@ from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Call, Progress, Solver
+from torchgco.solvers.contracts import Call, Progress, Solver, check_states
 from torchgco.solvers.ending import STATIONARY, constant_cost, least_cost, start_status
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.rules import RAW
@@ -141,8 +140,7 @@ class InteriorPoint(Solver):
             InputError: X0 or U0 don't fit the problem.
         """
         problem = current_problem(problem)
-        check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
-        check_tensor(X0, "X0", problem.x0)
+        check_states(X0, problem)
         return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
 
     def solved(

@@ -1,4 +1,7 @@
-"""The two forms of the algorithm: as the paper prints it, and as it runs by default. All that differs is here."""
+"""The two forms of the algorithm, as the paper prints it and as it runs by default: what differs around inner solves.
+
+What differs in these, `ilqr.descent` says.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +22,12 @@ class Rules:
             in their own.
         phr: the terms of an inequality are those of Powell, Hestenes and Rockafellar; else as printed (see
             `lagrangian.penalty_weights`).
-        accept_last: the last step of a line search is accepted even if L_M rises; else it is refused.
-        damped: a failed line search raises mu_r (Levenberg-Marquardt); else it ends the inner solve.
         ends: a solve ends where it has converged, and mu grows only while the violation is over its tolerance; else
             only the outer limit ends it, and mu always grows.
     """
 
     in_cost_units: bool
     phr: bool
-    accept_last: bool
-    damped: bool
     ends: bool
 
     def in_units(self, call: Call) -> tuple[Call, Tensor]:
@@ -36,6 +35,6 @@ class Rules:
         return call.in_cost_units() if self.in_cost_units else (call, torch.ones_like(call.problem.x0[:, 0]))
 
 
-PRINTED = Rules(in_cost_units=False, phr=False, accept_last=True, damped=False, ends=False)
-STANDARD = Rules(in_cost_units=True, phr=True, accept_last=False, damped=True, ends=True)
+PRINTED = Rules(in_cost_units=False, phr=False, ends=False)
+STANDARD = Rules(in_cost_units=True, phr=True, ends=True)
 RAW = replace(STANDARD, in_cost_units=False)

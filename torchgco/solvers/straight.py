@@ -43,7 +43,6 @@ class Legs:
         gates, at = gates_of(problem), problem.dynamics.position
         if gates is None or at is None:
             return None
-        assert gates.places is not None
         first, last = torch.zeros_like(gates.places[:, :1]), torch.full_like(gates.places[:, :1], problem.N)
         stops = torch.cat((problem.x0[:, None, at], gates.centers, end[:, None, at]), dim=1)
         return cls(stops, torch.cat((first, gates.places, last), dim=1))

@@ -105,10 +105,6 @@ def expand(a: np.ndarray, sizes: Sequence[int], **_: Any) -> np.ndarray:
     return np.broadcast_to(a, [have if want == -1 else want for have, want in zip(own, sizes, strict=True)])
 
 
-def repeat(a: np.ndarray, repeats: Sequence[int]) -> np.ndarray:
-    return np.tile(a, repeats)
-
-
 def pieces(a: np.ndarray, sizes: Sequence[int], dim: int = 0) -> list[np.ndarray]:
     return np.split(a, np.cumsum(sizes)[:-1].tolist(), axis=dim)
 

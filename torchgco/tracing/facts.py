@@ -218,9 +218,6 @@ class Facts:
                 self.note(NO_ATTRIBUTE)
         return None
 
-    def _method(self, method: types.MethodType) -> None:
-        self._all((method.__func__, method.__self__))
-
     def _builtin(self, function: types.BuiltinFunctionType) -> None:
         of = function.__self__
         name = of.__name__ if isinstance(of, (type, types.ModuleType)) else ""
@@ -242,9 +239,6 @@ class Facts:
         if not is_trusted(found.__objclass__.__module__) and not found.__objclass__.__module__.startswith("torch._C"):
             raise Unseen(found.__name__)
         self.same(found)
-
-    def _partial(self, part: functools.partial) -> None:
-        self._all((part.func, part.args, part.keywords, vars(part)))
 
     def _module(self, module: types.ModuleType) -> None:
         if is_library(module):
@@ -394,7 +388,7 @@ _WALKS: dict[type, Callable[[Facts, Any], object]] = {
     slice: lambda facts, part: facts._all((part.start, part.stop, part.step)),
     types.SimpleNamespace: lambda facts, space: facts._items(vars(space)),
     types.FunctionType: Facts._function,
-    types.MethodType: Facts._method,
+    types.MethodType: lambda facts, method: facts._all((method.__func__, method.__self__)),
     types.BuiltinFunctionType: Facts._builtin,
     types.MethodWrapperType: lambda facts, method: facts._all((method.__self__, method.__name__)),
     **dict.fromkeys(
@@ -403,6 +397,6 @@ _WALKS: dict[type, Callable[[Facts, Any], object]] = {
     **dict.fromkeys((staticmethod, classmethod), lambda facts, method: facts.walk(method.__func__)),
     property: lambda facts, found: facts._all((found.fget, found.fset, found.fdel)),
     functools.cached_property: lambda facts, found: facts.walk(found.func),
-    functools.partial: Facts._partial,
+    functools.partial: lambda facts, part: facts._all((part.func, part.args, part.keywords, vars(part))),
     types.ModuleType: Facts._module,
 }

@@ -32,20 +32,12 @@ def _casadi() -> Any:
 
 def _elementwise(function: Scalar, inputs: int) -> Callable:
     """`function` of scalars, on arrays that are broadcast to one shape."""
-    over = functools.cache(lambda: np.frompyfunc(_function(function), inputs, 1))
+    of_scalars = lambda: getattr(_casadi(), function) if isinstance(function, str) else function
+    over = functools.cache(lambda: np.frompyfunc(of_scalars(), inputs, 1))
     return lambda *arrays: boxed(over()(*arrays))
 
 
-def _function(function: Scalar) -> Callable:
-    return getattr(_casadi(), function) if isinstance(function, str) else function
-
-
-def _unary(function: Scalar) -> Callable:
-    return _elementwise(function, 1)
-
-
-def _binary(function: Scalar) -> Callable:
-    return _elementwise(function, 2)
+_unary, _binary = (functools.partial(_elementwise, inputs=inputs) for inputs in (1, 2))
 
 
 def _choose(condition: Any, a: Any, b: Any) -> Any:
@@ -76,9 +68,8 @@ def _comparison(compare: Callable) -> Callable:
 
 _where = _elementwise(_choose, 3)
 _add, _sub, _mul = _binary(operator.add), _binary(operator.sub), _binary(operator.mul)
-_lt, _le, _gt, _ge, _eq, _ne = map(
-    _comparison, (operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne)
-)
+COMPARISONS = "aten.lt", "aten.le", "aten.gt", "aten.ge", "aten.eq", "aten.ne"
+_lt, _le, _gt, _ge, _eq, _ne = (_comparison(getattr(operator, name[-2:])) for name in COMPARISONS)
 _truediv, _floor, _fmod = _binary(operator.truediv), _unary("floor"), _binary("fmod")
 
 
@@ -179,10 +170,6 @@ def _sigmoid(a: np.ndarray) -> np.ndarray:
     return _truediv(_where(_lt(a, 0.0), e, 1.0), _add(1.0, e))
 
 
-def _log_sigmoid(a: np.ndarray) -> np.ndarray:
-    return _sub(_where(_lt(a, 0.0), a, 0.0), _unary("log1p")(_falling(a)))
-
-
 _gelu = _unary(lambda x: 0.5 * x * (1.0 + _casadi().erf(x / math.sqrt(2.0))))
 _gelu_by_tanh = _unary(
     lambda x: 0.5 * x * (1.0 + _casadi().tanh(math.sqrt(2.0 / math.pi) * (x + 0.044715 * x * x * x)))
@@ -245,24 +232,11 @@ def _cross(a: np.ndarray, b: np.ndarray, dim: int = -1) -> np.ndarray:
     return np.cross(a, b, axis=dim)
 
 
-def _cumsum(a: np.ndarray, dim: int, **_: Any) -> np.ndarray:
-    return np.cumsum(a, axis=dim)
+FILLED = {"zeros": 0.0, "ones": 1.0, "empty": 0.0}
 
 
-def _filled(value: float) -> Callable:
-    return lambda a, **_: np.full(a.shape, value, dtype=object)
-
-
-def _new(value: float) -> Callable:
-    return lambda a, size, **_: np.full(tuple(size), value, dtype=object)
-
-
-def _new_filled(a: np.ndarray, size: Sequence[int], value: float, **_: Any) -> np.ndarray:
-    return np.full(tuple(size), value, dtype=object)
-
-
-def _same(a: np.ndarray, **_: Any) -> np.ndarray:
-    return a
+def _full(value: float, a: np.ndarray, size: Sequence[int] | None = None, **_: Any) -> np.ndarray:
+    return np.full(a.shape if size is None else tuple(size), value, dtype=object)
 
 
 def is_logical(element: Any) -> bool:
@@ -351,7 +325,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.atan2": _binary("atan2"),
     "aten.hypot": _binary("hypot"),
     "aten.sigmoid": _sigmoid,
-    "aten.log_sigmoid_forward": lambda a: [_log_sigmoid(a), a],
+    "aten.log_sigmoid_forward": lambda a: [_sub(_where(_lt(a, 0.0), a, 0.0), _unary("log1p")(_falling(a))), a],
     "aten.relu": lambda a: _where(_le(a, 0.0), 0.0, a),
     "aten.leaky_relu": lambda a, slope=0.01: _where(_gt(a, 0.0), a, _mul(a, slope)),
     "aten.softplus": _softplus,
@@ -365,18 +339,9 @@ OPERATIONS: dict[str, Callable] = {
     "aten.hardtanh": _hardtanh,
     "aten.maximum": _fmax,
     "aten.minimum": _fmin,
-    "aten.lt": _lt,
-    "aten.le": _le,
-    "aten.gt": _gt,
-    "aten.ge": _ge,
-    "aten.eq": _eq,
-    "aten.ne": _ne,
-    "aten.logical_and": _binary("logic_and"),
-    "aten.logical_or": _binary("logic_or"),
-    "aten.logical_not": _unary("logic_not"),
-    "aten.bitwise_and": _binary("logic_and"),
-    "aten.bitwise_or": _binary("logic_or"),
-    "aten.bitwise_not": _unary("logic_not"),
+    **dict(zip(COMPARISONS, (_lt, _le, _gt, _ge, _eq, _ne), strict=True)),
+    **{f"aten.{kind}_{name}": _binary(f"logic_{name}") for kind in ("logical", "bitwise") for name in ("and", "or")},
+    **{f"aten.{kind}_not": _unary("logic_not") for kind in ("logical", "bitwise")},
     # products and reductions
     "aten.mm": _matmul,
     "aten.bmm": _matmul,
@@ -390,11 +355,9 @@ OPERATIONS: dict[str, Callable] = {
     "aten.amin": _fold(_fmin),
     "aten.any": _truths(_fold(_binary("logic_or"))),
     "aten.all": _truths(_fold(_binary("logic_and"))),
-    "aten.cumsum": _cumsum,
+    "aten.cumsum": lambda a, dim, **_: np.cumsum(a, axis=dim),
     # shapes
-    "aten.view": lambda a, shape: a.reshape(tuple(shape)),
-    "aten.reshape": lambda a, shape: a.reshape(tuple(shape)),
-    "aten._unsafe_view": lambda a, shape: a.reshape(tuple(shape)),
+    **{f"aten.{name}": lambda a, shape: a.reshape(tuple(shape)) for name in ("view", "reshape", "_unsafe_view")},
     "aten.unsqueeze": lambda a, dim: np.expand_dims(a, dim),
     "aten.squeeze": arrays.squeeze,
     "aten.expand": arrays.expand,
@@ -402,7 +365,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.transpose": lambda a, i, j: np.swapaxes(a, i, j),
     "aten.t": lambda a: a.T,
     "aten.flip": lambda a, dims: np.flip(a, tuple(dims)),
-    "aten.repeat": arrays.repeat,
+    "aten.repeat": np.tile,
     "aten.diagonal": lambda a, offset=0, dim1=0, dim2=1: np.diagonal(a, offset, dim1, dim2),
     "aten.cat": lambda parts, dim=0: np.concatenate(list(parts), axis=dim),
     "aten.stack": lambda parts, dim=0: np.stack(list(parts), axis=dim),
@@ -420,20 +383,12 @@ OPERATIONS: dict[str, Callable] = {
     "aten.diagonal_scatter": arrays.diagonal_scatter,
     "aten.index_put": arrays.index_put,
     # copies and new ones
-    "aten.clone": _same,
-    "aten.alias": _same,
-    "aten.detach": _same,
-    "aten.lift_fresh_copy": _same,
-    "aten._to_copy": _same,
+    **{f"aten.{name}": lambda a, **_: a for name in ("clone", "alias", "detach", "lift_fresh_copy", "_to_copy")},
     "prims.convert_element_type": lambda a, dtype: a,
     "aten.copy": lambda a, source, *_: arrays.expand(source, a.shape),
     "aten.fill": lambda a, value: arrays.expand(boxed(value), a.shape),
-    "aten.zeros_like": _filled(0.0),
-    "aten.ones_like": _filled(1.0),
-    "aten.full_like": lambda a, value, **_: np.full(a.shape, value, dtype=object),
-    "aten.new_zeros": _new(0.0),
-    "aten.new_ones": _new(1.0),
-    "aten.new_full": _new_filled,
-    "aten.empty_like": _filled(0.0),
-    "aten.new_empty": _new(0.0),
+    **{f"aten.{name}_like": functools.partial(_full, value) for name, value in FILLED.items()},
+    "aten.full_like": lambda a, value, **_: _full(value, a),
+    **{f"aten.new_{name}": functools.partial(_full, value) for name, value in FILLED.items()},
+    "aten.new_full": lambda a, size, value, **_: _full(value, a, size),
 }

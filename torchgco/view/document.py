@@ -12,14 +12,15 @@ import numpy as np
 from torchgco.base.version import VERSION
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
+from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
-from torchgco.view.flights import Flight
-from torchgco.view.outlines import outlines_of
+from torchgco.view.flights import Flight, constraint_name
 from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
-from torchgco.view.vehicles import Look, Shape
+from torchgco.view.vehicles import Look, Shape, shape_of
 
+RING_CORNERS = 32  # of a gate that is a ball
 SHARED_FROM = 500  # obstacles of one kind from which on layouts with the same ones share them
 
 
@@ -54,6 +55,15 @@ class Document:
     labels: list[dict[str, Any]] = field(default_factory=list)
     parts: list[str] = field(default_factory=list)
     maps: dict[bytes, str] = field(default_factory=dict)  # parts that layouts share, by what they hold
+
+    @classmethod
+    def of(cls, problem: Problem, radius: float = 0.0, **given: Any) -> Document:
+        """The page of a batch of problems, whose vehicle has a `radius`, m, where there are no obstacles."""
+        shape, at = shape_of(problem), problem.position
+        radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=radius)
+        names = [constraint_name(part) for part in problem.constraints]
+        size = {"radius": radius if shape is None else shape.reach, "shape": shape}
+        return cls(dimension=at.stop - at.start, constraints=names, **size, **given)  # type: ignore[arg-type]
 
     def add(
         self,
@@ -139,6 +149,31 @@ def _extent(problem: Problem, b: int) -> list[list[float | None]] | None:
 
 def _numbers(values: np.ndarray) -> list[float | None]:
     return [number(value) for value in values]
+
+
+def outlines_of(problem: Problem, b: int) -> list[list[list[float | None]]]:
+    """Closed lines, each a list of corners (d,), m, of the gates of problem b in their order."""
+    if not (gates := outlines(problem, b)):
+        return []
+    start = problem.x0[b, problem.position].detach().cpu().double().numpy()
+    centers = [corners.mean(axis=0) for corners, _ in gates]
+    ends = centers[-1:] if problem.goal is None else [problem.goal.position[b].detach().cpu().double().numpy()]
+    ways = np.array([*centers[1:], *ends]) - [start, *centers[:-1]]
+    rows = zip(gates, centers, ways, strict=True)
+    found = [_ring(center, radius, way) if radius > 0 else corners for (corners, radius), center, way in rows]
+    return [[_numbers(corner) for corner in outline] for outline in found]
+
+
+def _ring(center: np.ndarray, radius: float, along: np.ndarray) -> np.ndarray:
+    """Corners (V, d) of a circle; in space across the direction `along`."""
+    angle = np.linspace(0.0, 2.0 * np.pi, RING_CORNERS, endpoint=False)
+    if len(center) == 2:
+        return center + radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    size = np.linalg.norm(along)
+    normal = along / size if size > 0 else np.array([1.0, 0.0, 0.0])
+    side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    side /= np.linalg.norm(side)
+    return center + radius * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(normal, side))
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
 from torchgco.view.document import Document
-from torchgco.view.flights import Rows, constraint_name, flights_of
+from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page
 from torchgco.view.searches import search_of
-from torchgco.view.vehicles import look_of, shape_of
+from torchgco.view.vehicles import look_of
 
 
 def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPage:
@@ -33,19 +33,14 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         raise InputError("dynamics.position", "a position in the plane or in space", f"{dimension} states")
     if problem.B == 0:
         raise InputError("problem", "at least one problem to show", "an empty batch")
-    shape = shape_of(problem)
     look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
     flights = flights_of(
         paced(problem, solution.times), look, solution.X, solution.U, name, results, rows, ADMITTED, touching
     )
     t_of, dt = _times(problem, solution)
-    N, radius = problem.N, max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
-    document = Document(
-        title="torchgco", about=f"{problem.B} problems, {problem.N} stages" if problem.B > 1 else f"{problem.N} stages",
-        dimension=dimension, dt=dt, look=look, solvers=[name],
-        radius=radius if shape is None else shape.reach, shape=shape,
-        constraints=[constraint_name(part) for part in problem.constraints],
-    )  # fmt: skip
+    N = problem.N
+    about = f"{problem.B} problems, {N} stages" if problem.B > 1 else f"{N} stages"
+    document = Document.of(problem, title="torchgco", about=about, dt=dt, look=look, solvers=[name])
     for b, flight in enumerate(flights):
         last = N if solution.horizon is None else int(solution.horizon[b])
         t = None if t_of is None else t_of[b, : last + 1]

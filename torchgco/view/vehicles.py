@@ -48,8 +48,7 @@ class Look:
             return _pointing(X[..., self.along])
         if self.heading is None:
             return None
-        half, zero = 0.5 * X[..., self.heading], np.zeros(X.shape[:-1])
-        return np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
+        return _about_z(X[..., self.heading])
 
 
 VEHICLES: dict[type[Dynamics], Look] = {
@@ -80,7 +79,7 @@ def _pointing(p: np.ndarray) -> np.ndarray:
     steps = np.concatenate((steps, np.zeros((len(p), 3 - p.shape[1]))), axis=1)
     moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > NO_WAY)
     if len(moving) == 0:
-        return np.tile([1.0, 0.0, 0.0, 0.0], (len(p), 1))
+        return np.tile(NOT_TURNED, (len(p), 1))
     last = np.searchsorted(moving, np.arange(len(p)), side="right") - 1
     x, y, z = steps[moving[np.maximum(last, 0)]].T
     yaw, pitch = 0.5 * np.arctan2(y, x), -0.5 * np.arctan2(z, np.hypot(x, y))
@@ -123,8 +122,11 @@ def turned(body: BoundBody, X: np.ndarray) -> np.ndarray:
     axes = rotations(body, X).swapaxes(-1, -2)
     found = turns(axes)
     if found is None:
-        return np.tile(np.array(NOT_TURNED), (len(axes), 1))
-    if found.ndim == 2:
-        return found
-    zero = np.zeros(len(found))
-    return np.stack((np.cos(0.5 * found), zero, zero, np.sin(0.5 * found)), axis=-1)
+        return np.tile(NOT_TURNED, (len(axes), 1))
+    return found if found.ndim == 2 else _about_z(found)
+
+
+def _about_z(angle: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4) of turns by angles (...), rad."""
+    zero = np.zeros(angle.shape)
+    return np.stack((np.cos(0.5 * angle), zero, zero, np.sin(0.5 * angle)), axis=-1)

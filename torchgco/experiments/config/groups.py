@@ -26,34 +26,11 @@ from torchgco.dynamics import Airframe
 from torchgco.exploration import SensorMission
 from torchgco.missions import Disturbance, Planner, RaceMission, RacePlanner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
-from torchgco.scenarios import (
-    Crossing,
-    Cylinders,
-    Floors,
-    Forest,
-    ForestMoving,
-    GateForest,
-    LayoutFile,
-    MapFile,
-    Mazes,
-    Parking,
-    PlanarRandom,
-    PlanarTrap,
-    Race,
-    Rooms,
-    Trefoils,
-    Walls,
-    Woods,
-    Yard,
-)
+from torchgco.scenarios import FAMILIES, LayoutFile, MapFile
 from torchgco.scenarios.quadrotor import PLANNING_STATES
 from torchgco.scenarios.vehicle import BUILT_IN
 from torchgco.search import Passes
 
-FAMILIES: tuple[type[Any], ...] = (
-    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
-    Floors, GateForest, Race, Parking,
-)  # fmt: skip
 ANYWHERE = {2: "unicycle", 3: "quadrotor"}  # the model for layouts that give positions alone
 BY_DIMENSION = "torchgco.by_dimension"
 SHARED_FIELDS = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -102,16 +103,31 @@ def plan_of(setup: Setup) -> Plan:
 
 
 @dataclass
-class Flight:
-    """A batch of layouts flown by one solver."""
+class Batch(ABC):
+    """A batch of layouts that one solver flies, and how much of it the bar has shown."""
 
     setup: Setup
     layouts: Layouts
     name: str
     solver: Any
     bar: Bar
+    shown: float = field(default=0.0, kw_only=True)
+
+    @abstractmethod
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
+        """Rows (without success), and what is kept of each flight (L, ...)."""
+
+    def show(self, done: float) -> None:
+        """Move the bar to so many layouts."""
+        self.bar.update(max(0.0, done - self.shown))
+        self.shown = max(self.shown, done)
+
+
+@dataclass
+class Flight(Batch):
+    """Single trajectories."""
+
     stages: int | None = None  # N of the controls returned: the most of the study; None: of these layouts
-    shown: int = 0
     drawn: float = 0.0  # s, when the bar was drawn last
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
@@ -144,7 +160,7 @@ class Flight:
         if (told := short_horizons(task.problem)) is not None:
             self.bar.write(f"{self.name}: {told.replace('problem', 'layout')} (scenario.stages)", sys.stderr)
         solution, seconds, together = self._solve(task.problem, task.U0, ids)
-        self.bar.update(layouts.count - self.shown)
+        self.show(layouts.count)
         statuses = [status.name for status in solution.statuses]
         U = solution.U.detach().to("cpu", torch.float64)
         U[[status in NOT_FLOWN for status in statuses]] = torch.nan
@@ -209,8 +225,7 @@ class Flight:
             state = f"solved {progress.finished}/{progress.total}"
         else:
             state = "candidates {}/{}".format(*progress.candidates)
-        self.bar.update(max(0, progress.finished - self.shown))
-        self.shown = max(self.shown, progress.finished)
+        self.show(progress.finished)
         now = time.monotonic()
         # A bar draws itself only where its count changes, and candidates may be solved for a minute.
         self.bar.set_postfix_str(state, refresh=now - self.drawn > REDRAW)
@@ -232,14 +247,6 @@ def prepare(threads: int, in_c: bool) -> None:
     use_native(in_c)
 
 
-class AnyFlight(Protocol):
-    """A batch of layouts that one solver flies."""
-
-    name: str
-
-    def fly(self) -> tuple[pd.DataFrame, np.ndarray]: ...
-
-
-def fly(flight: AnyFlight) -> Flown:
+def fly(flight: Batch) -> Flown:
     """The flight's rows and controls, under its solver's name."""
     return flight.name, flight.fly()

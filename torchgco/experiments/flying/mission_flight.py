@@ -11,15 +11,13 @@ import pandas as pd
 import torch
 
 from torchgco.base.version import VERSION
-from torchgco.experiments.config.build import Setup
-from torchgco.experiments.flying.progress import Bar
+from torchgco.experiments.flying.flight import Batch
 from torchgco.exploration.safety import safe_arrays
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.passing import Passing
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.tables import clearances, ending, mission_row, packed
-from torchgco.scenarios import Layouts
 
 PLANS_KEPT = 4  # missions in a study, up to which plans are kept and each mission gets figures
 FAILED = (Outcome.COLLISION, Outcome.DIVERGED)
@@ -28,16 +26,10 @@ SINGLE = ("cost", "dynamics_residual", "clearance_full", "bound_violation", "kkt
 
 
 @dataclass
-class MissionFlight:
-    """A batch of missions in lockstep, planned by one solver."""
+class MissionFlight(Batch):
+    """Missions in lockstep, planned by one solver."""
 
-    setup: Setup
-    layouts: Layouts
-    name: str
-    solver: Any
-    bar: Bar
     plans: bool = False  # keep the planned positions, for figures
-    shown: float = 0.0
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
         """Rows (without success), and logs (L, K, W) as `flights.packed` has them, NaN after a mission's end."""
@@ -48,7 +40,7 @@ class MissionFlight:
         ids = torch.as_tensor(layouts.ids)
         progress = partial(self._progress, float(problem.dynamics.dt), mission.duration)
         log = mission.fly(problem, seed=setup.seed, ids=ids, report=progress)
-        self.bar.update(layouts.count - self.shown)
+        self.show(layouts.count)
         arrays, contact, gates = log.arrays(self.plans), Contact.among(problem), Passing.among(problem)
         arrays |= safe_arrays(log, problem)
         nearest = np.fmin.reduce(clearances(arrays, log.period, contact), axis=1, initial=np.inf)
@@ -78,5 +70,4 @@ class MissionFlight:
         done = self.layouts.count - flying * (1 - t / duration)
         count = f", {flying} flying" if self.layouts.count > 1 else ""
         self.bar.set_postfix_str(f"t = {t:.1f} of {duration:g} s{count}", refresh=False)
-        self.bar.update(max(0.0, done - self.shown))
-        self.shown = max(self.shown, done)
+        self.show(done)

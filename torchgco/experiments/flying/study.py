@@ -18,7 +18,7 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
-from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
+from torchgco.experiments.flying.flight import Batch, Flight, Plan, fly, plan_of, prepare
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionFlight
 from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
 from torchgco.experiments.flying.workers import Shared, run_all
@@ -54,7 +54,6 @@ def run_study(
     folder: Path,
     recompose: Recompose,
     accepted: Callable[[], None] = lambda: None,
-    show: Callable[[str], None] = say,
     command: Sequence[str] = (),
     collect: bool = False,
 ) -> bool:
@@ -81,31 +80,31 @@ def run_study(
         accepted()
         with recorded(folder, study.setup, study.plan, command) as ending:
             if study.plan.job is not None:
-                _fly_share(study, store, show)
+                _fly_share(study, store)
                 ending.append("share flown")
                 return False
-            _fly_and_report(study, store, show, collect)
+            _fly_and_report(study, store, collect)
             return True
 
 
-def _fly_share(study: _Study, store: StudyFolder, show: Callable[[str], None]) -> None:
+def _fly_share(study: _Study, store: StudyFolder) -> None:
     """Fly the share of a job, and leave the tables to the process that finishes the study."""
     name = f"Job {study.plan.job} of {study.plan.jobs}"
     if store.finished(study.layouts):
-        show(f"{name}: already done in {store.path}")
+        say(f"{name}: already done in {store.path}")
         return
     missing = {solver: study.plan.share(store.missing(solver), study.layouts.count) for solver in study.solvers}
     _fly(study, store, missing, name)
     if (store.path / DONE).is_file():  # another process flew the rest, and this share, meanwhile
         store.drop_shards()
-    show(f"{name}: {sum(map(len, missing.values()))} trials flown in {store.path}")
+    say(f"{name}: {sum(map(len, missing.values()))} trials flown in {store.path}")
 
 
-def _fly_and_report(study: _Study, store: StudyFolder, show: Callable[[str], None], collect: bool) -> None:
+def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
     folder = store.path
     if store.finished(study.layouts):
-        show(f"Already done in {folder}: nothing was flown again.\n")
-        _update_success(study, store, show)
+        say(f"Already done in {folder}: nothing was flown again.\n")
+        _update_success(study, store)
     else:
         missing = {name: store.missing(name) for name in study.solvers}
         count, left = study.layouts.count * len(study.solvers), sum(map(len, missing.values()))
@@ -113,21 +112,21 @@ def _fly_and_report(study: _Study, store: StudyFolder, show: Callable[[str], Non
             told = f"{left} of {count} trials missing in {folder} (the same command flies them)"
             raise InputError("study.jobs", "a share from every job", told)
         if left < count and not collect:
-            show(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
+            say(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
         _fly(study, store, missing, study.setup.solver_name)
         flown = [store.flown(name) for name in study.solvers]
         rows = pd.concat([rows for rows, _ in flown], ignore_index=True)
         _finish(study, store, rows, np.stack([U for _, U in flown]))
-    show(_report(study, folder))
+    say(_report(study, folder))
     store.close()
     trials = store.table()
     if study.plan.explain:
-        show(explained(study.setup, study.layouts, trials))
+        say(explained(study.setup, study.layouts, trials))
     elif study.setup.mission is None and (told := advised(study.setup, study.layouts, trials)):
-        show(told)
-    show(f"\nTable, arrays and figures: {folder}")
+        say(told)
+    say(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
-        show(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
+        say(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
     if (trials["status"] == Status.INVALID_START.name).all():
         raise InputError("scenario", where_to_start(study.setup, study.layouts), "none")
 
@@ -236,15 +235,11 @@ def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
 
 def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
     """The ids in batches of at most `size` that follow each other without a gap."""
-    batches: list[list[int]] = []
-    for number in ids:
-        if not batches or len(batches[-1]) == size or batches[-1][-1] + 1 != number:
-            batches.append([])
-        batches[-1].append(number)
-    return batches
+    runs = np.split(np.array(ids, int), np.flatnonzero(np.diff(ids) != 1) + 1)
+    return [run[first : first + size].tolist() for run in runs for first in range(0, len(run), size)]
 
 
-def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | MissionFlight:
+def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Batch:
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
     layouts, solver = study.layouts.take(ids), study.solvers[name]
     if study.setup.mission is None:
@@ -281,13 +276,13 @@ def _fly_side_by_side(
     )
 
 
-def _update_success(study: _Study, store: StudyFolder, show: Callable[[str], None]) -> None:
+def _update_success(study: _Study, store: StudyFolder) -> None:
     """Judge the rows of a finished study again where the best costs of its layouts have changed since."""
     trials = store.table()
     new = with_success(trials.assign(sound=sound(trials)), study.layouts, study.rivals)
     if not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object)):
         store.replace(new, study.layouts)
-        show("The best costs of the layouts have changed: best_cost and success were computed again.\n")
+        say("The best costs of the layouts have changed: best_cost and success were computed again.\n")
 
 
 def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

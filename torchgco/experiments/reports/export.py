@@ -15,15 +15,13 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Positive, check_value
 from torchgco.dynamics import QuadrotorPlant
 from torchgco.dynamics.names import controls_of, states_of
-from torchgco.experiments.ending import ended, say
+from torchgco.experiments.ending import say
 from torchgco.experiments.reports.bags import Storage, write_bag
 from torchgco.experiments.reports.finished import Study
-from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
-from torchgco.experiments.results.files import damaged, write
+from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS
-from torchgco.experiments.results.limits import read_table
 from torchgco.problem.sampled import TIME_COLUMN, sampled
 from torchgco.problem.times import times
 
@@ -105,24 +103,11 @@ def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int],
 
 def _missions(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
     """Missions as they were flown."""
-    fine = _time_steps(study)
+    fine = study.time_steps
     kept = {} if fine is None else dict(iter(fine.groupby(["solver", "mission"], sort=False)))
     for (name, number), steps in study.log.groupby(["solver", "mission"], sort=False):  # type: ignore[misc]
         if wanted(name, number):
             yield name, number, _flown(kept.get((name, number), steps), rate)
-
-
-def _time_steps(study: Study) -> pd.DataFrame | None:
-    """The plant's time steps of few missions; None where the study kept none."""
-    path = study.folder / TIME_STEPS
-    if not path.is_file():
-        return None
-    try:
-        return read_table(path, study.trust)
-    except InputError:
-        raise
-    except Exception as error:  # damaged bytes make readers raise nearly anything
-        raise damaged(path, f"is damaged ({type(error).__name__})") from None
 
 
 def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:
@@ -153,7 +138,7 @@ def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> RunParser:
     parser = RunParser(prog="torchgco-export", description="The trajectories of a study as CSV, or as bags of ROS 2.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN")
@@ -169,15 +154,14 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-export`. Returns the exit code, see `ended`."""
+    return _parser().run(arguments, _run)
 
-    def work() -> int:
-        options = _parser().parse_args(arguments)
-        files = write_export(
-            options.run, options.output, options.rate, options.layout, options.solver, options.trust, options.bag
-        )  # fmt: skip
-        parts = [part for path in files for part in ([path] if path.is_file() else path.iterdir())]
-        size = sum(part.stat().st_size for part in parts)
-        say(f"{files[0].parent if files else options.run}: {len(files)} files, {size / 1e6:.2f} MB")
-        return 0
 
-    return ended("torchgco-export", work)
+def _run(options: argparse.Namespace) -> int:
+    files = write_export(
+        options.run, options.output, options.rate, options.layout, options.solver, options.trust, options.bag
+    )  # fmt: skip
+    parts = [part for path in files for part in ([path] if path.is_file() else path.iterdir())]
+    size = sum(part.stat().st_size for part in parts)
+    say(f"{files[0].parent if files else options.run}: {len(files)} files, {size / 1e6:.2f} MB")
+    return 0

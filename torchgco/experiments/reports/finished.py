@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +19,18 @@ from torchgco.experiments.results.folder import (
     MANIFEST,
     MISSION,
     SOLUTIONS,
+    TIME_STEPS,
     TRIALS,
     read_manifest,
     read_trials,
 )
 from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
 from torchgco.view.document import Document
-from torchgco.view.flights import constraint_name
-from torchgco.view.vehicles import Look, shape_of
+from torchgco.view.vehicles import Look
 
 MEASURED_AT_ONCE = 64  # layouts whose trajectories are measured at once
 
@@ -76,7 +75,7 @@ class Study:
         Raises:
             InputError: the file is damaged, takes more than it may, or has other solvers or layouts.
         """
-        held = readable(self.folder / name, partial(read_npz, trust=self.trust))
+        held = readable(self.folder / name, read_npz, trust=self.trust)
         solvers, ids = list(self.manifest.solvers), self.layouts.ids
         named = {"solver", "layout", part} <= held.keys() and held["solver"].tolist() == solvers
         if not named or not np.array_equal(held["layout"], ids):
@@ -89,7 +88,13 @@ class Study:
     @property
     def log(self) -> pd.DataFrame:
         """The control steps of its missions; InputError where the file is damaged, or takes more than it may."""
-        return readable(self.folder / MISSION, partial(read_log, trust=self.trust))
+        return readable(self.folder / MISSION, read_log, trust=self.trust)
+
+    @property
+    def time_steps(self) -> pd.DataFrame | None:
+        """The time steps of its plant, of few missions; None where it kept none. InputError as `log`."""
+        path = self.folder / TIME_STEPS
+        return readable(path, read_table, trust=self.trust) if path.is_file() else None
 
     @property
     def missions(self) -> bool:
@@ -125,15 +130,10 @@ class Study:
 
 def document_of(study: Study, problem: Problem, look: Look) -> Document:
     """The page of a study in the making, from the problems of some of its layouts."""
-    solvers, at = list(study.manifest.solvers), problem.position
-    shape = shape_of(problem)
-    radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=study.vehicle.radius)
+    solvers, dt = list(study.manifest.solvers), problem.dynamics.dt
     count = f"{study.layouts.count} layouts" if study.layouts.count > 1 else "1 layout"
-    return Document(
-        title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
-        about=f"{count}, {study.vehicle.name}, seed {study.seed}, {problem.N} stages of "
-        f"{problem.dynamics.dt:g} s",
-        dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, solvers=solvers,
-        radius=radius if shape is None else shape.reach, shape=shape,
-        constraints=[constraint_name(part) for part in problem.constraints], mission=study.missions,
+    return Document.of(
+        problem, study.vehicle.radius, title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
+        about=f"{count}, {study.vehicle.name}, seed {study.seed}, {problem.N} stages of {dt:g} s",
+        dt=float(dt), look=look, solvers=solvers, mission=study.missions,
     )  # fmt: skip

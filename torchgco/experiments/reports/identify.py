@@ -16,11 +16,11 @@ from torchgco.base.version import VERSION
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.config.checks import NAME_PATTERN
-from torchgco.experiments.ending import ended, say
+from torchgco.experiments.ending import say
 from torchgco.experiments.reports.finished import Study
-from torchgco.experiments.reports.mission_report import TIME_STEPS
 from torchgco.experiments.reports.parser import RunParser
-from torchgco.experiments.results.files import damaged, write
+from torchgco.experiments.results.files import readable, write
+from torchgco.experiments.results.folder import TIME_STEPS
 from torchgco.experiments.results.limits import read_table
 from torchgco.missions.identification import Identified, identify, record
 from torchgco.missions.planning_problem import airframe_of
@@ -58,16 +58,15 @@ def missions(folder: Path, trust: bool = False) -> Recorded:
     path = folder / TIME_STEPS
     if not path.is_file():
         raise InputError("--run", f"a study of at most four missions, with {TIME_STEPS}", folder)
-    try:
-        table = read_table(path, trust)
-        parts = [part for _, part in table.groupby(["solver", "mission"], sort=False)]
-        dt = float(parts[0]["t"].iloc[1] - parts[0]["t"].iloc[0])
-        x, u = (_together(parts, letter, first, count) for letter, first, count in (("x", 0, 17), ("u", 1, 4)))
-    except InputError:
-        raise
-    except Exception as error:  # damaged bytes make readers raise nearly anything
-        raise damaged(path, f"is damaged ({type(error).__name__})") from None
-    return x, u[:, :-1], dt, airframe_of(study.vehicle.dynamics)
+    return *readable(path, _logged, trust=trust), airframe_of(study.vehicle.dynamics)
+
+
+def _logged(path: Path, trust: bool) -> tuple[Tensor, Tensor, float]:
+    """States, commands and the time step of the flights in a file."""
+    parts = [part for _, part in read_table(path, trust).groupby(["solver", "mission"], sort=False)]
+    dt = float(parts[0]["t"].iloc[1] - parts[0]["t"].iloc[0])
+    x, u = (_together(parts, letter, first, count) for letter, first, count in (("x", 0, 17), ("u", 1, 4)))
+    return x, u[:, :-1], dt
 
 
 def _together(parts: Sequence, letter: str, first: int, count: int) -> Tensor:
@@ -109,7 +108,7 @@ def table(before: Airframe, found: Identified) -> str:
     return "\n".join([*lines, f"{'delay':<20} {'':>24} -> {found.delay:g} s"])
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> RunParser:
     parser = RunParser(
         prog="torchgco-identify",
         description="Identify mass, inertia, rotors, limits, delay and drag of a plant; write them as a vehicle.",
@@ -125,23 +124,22 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-identify`. Returns the exit code, see `ended`."""
+    return _parser().run(arguments, _run)
 
-    def work() -> int:
-        options = _parser().parse_args(arguments)
-        path = options.output
-        if path.suffix != ".yaml" or path.parent.name != "vehicle" or not NAME_PATTERN.fullmatch(path.stem):
-            raise InputError("--output", "FOLDER/vehicle/NAME.yaml, as --config-dir FOLDER vehicle=NAME reads it", path)
-        if options.run is not None and options.words:
-            raise InputError("command line", "--run RUN or KEY=VALUE, not both", options.words[0])
-        told = str(options.run) if options.run is not None else " ".join(options.words)
-        given = flights(options.words, options.seed) if options.run is None else missions(options.run, options.trust)
-        found = identify(*given)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError("--output", "a folder that can be made", error) from None
-        write(path, lambda file: file.write(document(found, told or "plant=rotors").encode()))
-        say(f"{table(given[3], found)}\n{path}: torchgco --config-dir {path.parent.parent} vehicle={path.stem} ...")
-        return 0
 
-    return ended("torchgco-identify", work)
+def _run(options: argparse.Namespace) -> int:
+    path = options.output
+    if path.suffix != ".yaml" or path.parent.name != "vehicle" or not NAME_PATTERN.fullmatch(path.stem):
+        raise InputError("--output", "FOLDER/vehicle/NAME.yaml, as --config-dir FOLDER vehicle=NAME reads it", path)
+    if options.run is not None and options.words:
+        raise InputError("command line", "--run RUN or KEY=VALUE, not both", options.words[0])
+    told = str(options.run) if options.run is not None else " ".join(options.words)
+    given = flights(options.words, options.seed) if options.run is None else missions(options.run, options.trust)
+    found = identify(*given)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--output", "a folder that can be made", error) from None
+    write(path, lambda file: file.write(document(found, told or "plant=rotors").encode()))
+    say(f"{table(given[3], found)}\n{path}: torchgco --config-dir {path.parent.parent} vehicle={path.stem} ...")
+    return 0

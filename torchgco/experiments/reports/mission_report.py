@@ -16,7 +16,7 @@ from torchgco.experiments.flying.mission_flight import PLANS_KEPT
 from torchgco.experiments.flying.progress import draw as draw_all
 from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.folder import LAYOUTS, MISSION, TRIALS, read_trials
+from torchgco.experiments.results.folder import LAYOUTS, MISSION, PLANS_FILE, TIME_STEPS, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.missions.contact import Contact
@@ -32,8 +32,6 @@ from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts
 
 SNAPSHOTS = 4  # instants of a mission in one figure
-# Where few missions fly: planned positions (solver, L, K, N+1, 3), and a row per time step of the plant.
-PLANS_FILE, TIME_STEPS = "plans.npz", "time_steps.parquet"
 
 
 def mission_table(

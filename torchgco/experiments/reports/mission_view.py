@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.memory import limited
 from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.reports.finished import Study, document_of
-from torchgco.experiments.reports.mission_report import PLANS_FILE
+from torchgco.experiments.results.folder import PLANS_FILE
 from torchgco.experiments.results.limits import LARGEST_FILE
 from torchgco.exploration.replay import replayed
 from torchgco.judging.contact import contacts

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from torchgco.base.errors import InputError
+from torchgco.experiments.ending import ended
 
 TRUST = "admit any size in a run's files, and any class, such as a model of yours: its code runs"
 
@@ -20,3 +22,7 @@ class RunParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise InputError("command line", f"{self.takes} and the options of --help", message)
+
+    def run(self, arguments: Sequence[str] | None, work: Callable[[argparse.Namespace], int]) -> int:
+        """Do the work of the program with its options; returns the exit code, see `ended`."""
+        return ended(self.prog, lambda: work(self.parse_args(arguments)))

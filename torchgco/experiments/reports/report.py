@@ -17,7 +17,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.ending import ended, say
+from torchgco.experiments.ending import say
 from torchgco.experiments.flying.progress import draw
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
@@ -49,6 +49,8 @@ def write_report(
     figures: bool = True,
     printed: Columns | None = None,
     body: BoundBody | None = None,
+    trials: pd.DataFrame | None = None,
+    form: str = "table",
 ) -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
@@ -58,25 +60,16 @@ def write_report(
         figures: False: tables alone.
         printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
         body: of the vehicle, which these pictures draw; None: a ball.
+        trials: the table in that file, where it is known.
+        form: of the table that is returned, one of OUTPUTS.
 
     Raises:
         InputError: the table is missing, unreadable or empty, or the trajectories don't fit the layouts.
     """
-    return _written(folder, read_trials(folder / TRIALS), trajectories, figures=figures, printed=printed, body=body)
-
-
-def _written(
-    folder: Path,
-    trials: pd.DataFrame,
-    trajectories: Callable[[Arrays], Arrays] | None = None,
-    form: str = "table",
-    figures: bool = True,
-    printed: Columns | None = None,
-    body: BoundBody | None = None,
-) -> str:
+    trials = read_trials(folder / TRIALS) if trials is None else trials
     parts = parts_of(trials)
     write_tables(folder, parts)
-    held = _figures(parts) if figures else {}
+    held = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
         layouts = Layouts.load(folder / LAYOUTS).arrays()
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
@@ -84,17 +77,10 @@ def _written(
         if figures:
             held["layouts"] = lambda: layout_grid(layouts, states, trials, body=body)
         if printed:
-            for form in ("png", "pdf"):
-                held[f"study.{form}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed, body)
+            for ending in ("png", "pdf"):
+                held[f"study.{ending}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed, body)
     draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
     return format_report(parts, form)
-
-
-def _figures(parts: Sequence[Part]) -> Drawings:
-    held: Drawings = {}
-    for part in parts:
-        held |= drawings(part)
-    return held
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:
@@ -144,7 +130,7 @@ def _distributions(trials: pd.DataFrame, prefix: str) -> Drawings:
     return held
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> RunParser:
     parser = RunParser("torchgco-report", "One report on many studies.", "DIR")
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
@@ -155,14 +141,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-report`. Returns the exit code: 1 where rows can't be confirmed, and as `ended`."""
+    return _parser().run(arguments, _run)
 
-    def work() -> int:
-        options = _parser().parse_args(arguments)
-        if not options.folders:
-            raise InputError("DIR", "a study, or a folder of studies", "none")
-        return _verify(options) if options.verify else _report(options)
 
-    return ended("torchgco-report", work)
+def _run(options: argparse.Namespace) -> int:
+    if not options.folders:
+        raise InputError("DIR", "a study, or a folder of studies", "none")
+    return _verify(options) if options.verify else _report(options)
 
 
 def _report(options: argparse.Namespace) -> int:
@@ -178,7 +163,7 @@ def _report(options: argparse.Namespace) -> int:
     write(output / TRIALS, lambda file: plain(merged).to_parquet(file, index=False, use_dictionary=text))
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
-    say(_written(output, trials, form=options.format))
+    say(write_report(output, trials=trials, form=options.format))
     repeated = merged.attrs[REPEATED]
     notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
     for note in [*notes, f"written to {output}"]:

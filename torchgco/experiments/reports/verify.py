@@ -36,6 +36,7 @@ from torchgco.experiments.results.folder import (
 from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
 from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
+from torchgco.experiments.results.runs import below
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.judging.judge import frame_columns, gates_passed, judge
@@ -108,14 +109,11 @@ def verify(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> tu
             have one row per solver and layout, a study of an older version, a class that `trust` alone admits.
     """
     given = [Path(folder) for folder in folders]
-    for folder in given:
-        if not folder.is_dir():
-            raise InputError("folders", "an existing folder", folder)
-    studies = {path.parent.resolve(): path.parent for folder in given for path in sorted(folder.rglob(MANIFEST))}
-    done = [folder for folder in studies.values() if (folder / DONE).is_file()]
+    studies = below(given, MANIFEST).values()
+    done = [folder for folder in studies if (folder / DONE).is_file()]
     if not done:
         raise InputError("folders", "a finished study in or below them", ", ".join(map(str, given)))
-    unfinished = [str(folder) for folder in studies.values() if folder not in done]
+    unfinished = [str(folder) for folder in studies if folder not in done]
     return [verify_study(folder, trust) for folder in done], unfinished
 
 
@@ -123,8 +121,8 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
     manifest = read_manifest(folder / MANIFEST, whole=True)
     missions = manifest.configuration.get("mission") is not None
-    layouts = readable(folder / LAYOUTS, partial(read_layouts, trust=trust))
-    held = readable(folder / TRIALS, partial(read_table, trust=trust))
+    layouts = readable(folder / LAYOUTS, read_layouts, trust=trust)
+    held = readable(folder / TRIALS, read_table, trust=trust)
     rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=TRIAL)
     if not set(TRIAL) <= set(held.columns) or not held.set_index(TRIAL).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
@@ -183,7 +181,7 @@ def _trajectories(
     trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
 ) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
-    arrays = readable(folder / SOLUTIONS, partial(read_npz, trust=trust))
+    arrays = readable(folder / SOLUTIONS, read_npz, trust=trust)
     names, place = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
     parts = []
     for name in manifest.solvers:
@@ -210,7 +208,7 @@ def _missions(
     The log has the plant's state at the start of every control step, and a flight is judged at all time steps: the
     outcome itself, and what belongs to the end of a flight, can't be confirmed.
     """
-    log = readable(folder / MISSION, partial(read_log, trust=trust))
+    log = readable(folder / MISSION, read_log, trust=trust)
     log["shifted"] = log["source"] == "shifted"
     problem = vehicle.task(layouts).problem
     contact, period = Contact.among(problem), float(problem.dynamics.dt)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.ending import ended, say
+from torchgco.experiments.ending import say
 from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_view import missions
@@ -95,7 +95,7 @@ def told(row: Mapping[str, Any]) -> Rows:
     return [*held, ("iterations", f"{row['iterations']:g}"), ("time", time)]
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> RunParser:
     parser = RunParser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
     parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {PAGE_NAME} in RUN")
@@ -116,11 +116,10 @@ def write_view(folder: Path, output: Path | None = None, searched: Sequence[int]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-view`. Returns the exit code, see `ended`."""
+    return _parser().run(arguments, _run)
 
-    def work() -> int:
-        options = _parser().parse_args(arguments)
-        path = write_view(options.run, options.output, list(dict.fromkeys(options.search)), options.trust)
-        say(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
-        return 0
 
-    return ended("torchgco-view", work)
+def _run(options: argparse.Namespace) -> int:
+    path = write_view(options.run, options.output, list(dict.fromkeys(options.search)), options.trust)
+    say(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+    return 0

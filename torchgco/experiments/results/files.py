@@ -77,8 +77,8 @@ def checksum(path: Path) -> str:
     return total.hexdigest()
 
 
-def readable(path: Path, reader: Callable[[Path], Read], sized: bool = True) -> Read:
-    """What `reader` makes of a file of a study, whose bytes anything may have happened to.
+def readable(path: Path, reader: Callable[..., Read], sized: bool = True, **options: Any) -> Read:
+    """What `reader` makes of a file of a study, whose bytes anything may have happened to; `options` are its own.
 
     Args:
         sized: whether to pass on that the file takes more memory than it may, which a command can admit.
@@ -89,7 +89,7 @@ def readable(path: Path, reader: Callable[[Path], Read], sized: bool = True) -> 
     if not path.exists():
         raise damaged(path, "is missing")
     try:
-        found = reader(path)  # first, as it refuses sizes
+        found = reader(path, **options)  # first, as it refuses sizes
         if path.suffix == ".npz":
             with zipfile.ZipFile(path) as members:
                 if members.testzip() is not None:  # np.load alone doesn't check every member's checksum

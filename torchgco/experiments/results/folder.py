@@ -39,6 +39,8 @@ COLUMNS = (
 JUDGED = ("success", "best_cost", "best_from")  # columns that compare rows: not in shards
 MANIFEST, TRIALS, SOLUTIONS, LAYOUTS, DONE = "study.json", "trials.parquet", "solutions.npz", "layouts.npz", "done"
 MISSION = "mission.parquet"  # in place of solutions, where missions are flown
+# Where few missions fly: planned positions (solver, L, K, N+1, 3), and a row per time step of the plant.
+PLANS_FILE, TIME_STEPS = "plans.npz", "time_steps.parquet"
 Flown = tuple[pd.DataFrame, np.ndarray]  # rows without the judged columns, controls (rows, N, m)
 Save = Callable[[IO[bytes]], Any]
 

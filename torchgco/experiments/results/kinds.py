@@ -93,7 +93,7 @@ def _stacked(tables: Sequence[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
 
 
 def format_report(parts: Sequence[Part], form: str) -> str:
-    """The statistics of all kinds of trials, in one of `tables.FORMATS`.
+    """The statistics of all kinds of trials, in one of `tables.OUTPUTS`.
 
     Formats:
         csv: the summary with all its columns.

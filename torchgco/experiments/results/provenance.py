@@ -1,4 +1,4 @@
-"""StudyFolder of how a study was run: run.json in its folder, and run-JOB-of-JOBS.json of every job that flew a share.
+"""How a study was run: run.json in its folder, and run-JOB-of-JOBS.json of every job that flew a share.
 
 Each is written by who holds the study, or that very share (`lock.held`): nobody else reads and changes it meanwhile.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,8 +61,8 @@ def find_runs(folders: Iterable[str | os.PathLike[str]], trust: bool = False) ->
             `trust` one that takes more memory than a run's file may.
     """
     given = [Path(folder) for folder in folders]
-    found = {folder.resolve(): (folder, folder in given) for folder in _below(given)}
-    runs = [run for folder, is_given in found.values() if (run := _run(folder, is_given, trust)) is not None]
+    found = below(given, TRIALS, MANIFEST).values()
+    runs = [run for folder in found if (run := _run(folder, folder in given, trust)) is not None]
     if not runs:
         raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
     return runs
@@ -73,11 +73,17 @@ def is_merged(path: Path) -> bool:
     return MERGED in table_of(path, trust=True, columns=[]).attrs
 
 
-def _below(folders: list[Path]) -> Iterator[Path]:
+def below(folders: Sequence[Path], *names: str) -> dict[Path, Path]:
+    """The folders in and below some, with one of these files: as they were found, by their resolved paths.
+
+    Raises:
+        InputError: one of the folders is missing.
+    """
     for folder in folders:
         if not folder.is_dir():
             raise InputError("folders", "an existing folder", folder)
-        yield from sorted({path.parent for name in (TRIALS, MANIFEST) for path in folder.rglob(name)})
+    found = (sorted({path.parent for name in names for path in folder.rglob(name)}) for folder in folders)
+    return {folder.resolve(): folder for some in found for folder in some}
 
 
 def _run(folder: Path, given: bool, trust: bool) -> Run | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from torchgco.experiments.statistics.statistics import grouped, numbers_of, summarise, task_columns, wilson
+from torchgco.experiments.statistics.statistics import grouped, numbers_of, rate_columns, summarise, task_columns
 from torchgco.missions.outcome import Outcome
 
 # Medians over the missions that reached the goal, and means over all.
@@ -37,11 +37,8 @@ def summarise_missions(trials: pd.DataFrame) -> pd.DataFrame:
 def _of_missions(group: pd.DataFrame) -> dict[str, object]:
     row: dict[str, object] = {}
     for outcome in Outcome:
-        name, n, count = outcome.name.lower(), len(group), int((group["outcome"] == outcome.name).sum())
-        low, high = wilson(count, n)
-        parts = {"count": count, "n": n, "rate": count / n, "low": low, "high": high}
         if outcome is not Outcome.REACHED:
-            row |= {f"{name}_{part}": value for part, value in parts.items()}
+            row |= rate_columns(outcome.name.lower(), (group["outcome"] == outcome.name).to_numpy(dtype=float))
     reached = group[group["outcome"] == Outcome.REACHED.name]
     row |= {name: pd.Series(numbers_of(reached[name])).median() for name in MEDIANS}
     row |= {name: float(numbers_of(group[name]).mean()) for name in MEANS}

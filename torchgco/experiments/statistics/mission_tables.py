@@ -9,17 +9,7 @@ import numpy as np
 import pandas as pd
 
 from torchgco.experiments.statistics.mission_statistics import MISSIONS_AT_ONCE
-from torchgco.experiments.statistics.statistics import TASK
-from torchgco.experiments.statistics.tables import (
-    RATES_TEXT,
-    aligned,
-    cells,
-    headers,
-    paired_lines,
-    printed_pairs,
-    rate,
-    swept_of,
-)
+from torchgco.experiments.statistics.tables import RATES_TEXT, per_solver, per_task, printed_pairs, printed_rows, rate
 from torchgco.missions.outcome import Outcome
 
 # Header, column of the summary, and how the numbers are written.
@@ -72,45 +62,30 @@ def format_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
     Outcomes are counts with the share of all missions and its 95 % Wilson interval; they are disjoint. Effort is the
     median over the missions that reached the goal; missed deadlines and kept plans are means over all missions.
     """
-    blocks = []
-    for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
-        seeds = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split()))
-        swept = swept_of(task)
-        blocks += [f"missions in {scenario} ({model}), seed {seeds}", _outcomes(task, swept), _effort(task, swept)]
-        if (task[MISSIONS_AT_ONCE] > 1).any():
-            blocks[-1] += f"\n{DIVIDED}"
-        rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
-        if (rows["n"] > 0).any():
-            blocks.append(paired_lines(rows, swept, costs=False))
+    blocks = per_task(summary, paired, "missions in ", (_outcomes, _effort), costs=False)
     return "\n\n".join([*blocks, RATES_TEXT])
 
 
 def printed_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
     """The tables that a paper prints: outcomes and effort, and comparisons where there are any."""
-    swept, rows = swept_of(summary), []
-    for _, row in summary.iterrows():
-        rows.append([row["scenario"], row["model"], *cells(row, swept), row["solver"], row["n"]])
-        rows[-1] += [*(rate(row, name.lower()) for name in Outcome.__members__), *_measured(row)]
-    heads = [*TASK, *headers(swept), "solver", "n", *Outcome.__members__, *(head for head, *_ in MISSION_EFFORT)]
-    return [pd.DataFrame(rows, columns=heads), *_printed_pairs(paired)]
-
-
-def _printed_pairs(paired: pd.DataFrame) -> list[pd.DataFrame]:
-    return [printed_pairs(paired).iloc[:, :-1]] if (paired["n"] > 0).any() else []  # without the ratio of costs
+    heads = ["n", *Outcome.__members__, *(head for head, *_ in MISSION_EFFORT)]
+    rows = printed_rows(summary, heads, lambda row: [row["n"], *_shares(row), *_measured(row)])
+    pairs = [printed_pairs(paired).iloc[:, :-1]] if (paired["n"] > 0).any() else []  # without the ratio of costs
+    return [rows, *pairs]
 
 
 def _outcomes(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [[*headers(swept), "solver", "n", *Outcome.__members__]]
-    for _, row in task.iterrows():
-        shares = [rate(row, name.lower()) for name in Outcome.__members__]
-        rows.append([*cells(row, swept), row["solver"], str(row["n"]), *shares])
-    return aligned(rows, len(swept) + 1)
+    heads = ("n", *Outcome.__members__)
+    return per_solver(task, swept, heads, lambda row: [str(row["n"]), *_shares(row)])
+
+
+def _shares(row: pd.Series) -> list[str]:
+    return [rate(row, name.lower()) for name in Outcome.__members__]
 
 
 def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [[*headers(swept), "solver", *(head for head, *_ in MISSION_EFFORT)]]
-    rows += [[*cells(row, swept), row["solver"], *_measured(row)] for _, row in task.iterrows()]
-    return aligned(rows, len(swept) + 1)
+    lines = per_solver(task, swept, [head for head, *_ in MISSION_EFFORT], _measured)
+    return f"{lines}\n{DIVIDED}" if (task[MISSIONS_AT_ONCE] > 1).any() else lines
 
 
 def _measured(row: pd.Series) -> list[str]:

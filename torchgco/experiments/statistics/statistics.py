@@ -127,7 +127,7 @@ class _Values:
             "invalid": len(rows) - int(valid.sum()),
         }
         for name in OUTCOMES:
-            row |= _rate(name, self.hits[name][rows])
+            row |= rate_columns(name, self.hits[name][rows])
         row |= {
             "violation_ok": float(np.mean(held["violation"] <= SUCCESS_VIOLATION)),
             "violation_median": float(np.median(held["violation"])),
@@ -199,7 +199,8 @@ def numbers_of(column: pd.Series) -> np.ndarray:
     return column.to_numpy(dtype=float, na_value=nan)
 
 
-def _rate(name: str, hits: np.ndarray) -> dict[str, object]:
+def rate_columns(name: str, hits: np.ndarray) -> dict[str, object]:
+    """The columns of an outcome from its hits (rows,): 1 attained, 0 not, NaN where undefined."""
     n, count = int((~np.isnan(hits)).sum()), int(np.nansum(hits))
     low, high = wilson(count, n)
     parts = {"count": count, "n": n, "rate": count / n if n else nan, "low": low, "high": high}

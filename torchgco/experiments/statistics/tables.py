@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import pandas as pd
@@ -26,16 +26,27 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
 
     A rate reads "30/32 94 % [80, 98]". Two lines at the end tell what the numbers in brackets and parentheses are.
     """
+    blocks = per_task(summary, paired, "", (_rates, _effort, _statuses))
+    return "\n\n".join([*blocks, f"{RATES_TEXT}\n{EFFORTS}"])
+
+
+def per_task(
+    summary: pd.DataFrame, paired: pd.DataFrame, what: str, tables: Sequence[Callable[..., str]], costs: bool = True
+) -> list[str]:
+    """The blocks of text of all tasks: `what` and the task, its tables, and comparisons where there are any.
+
+    Args:
+        tables: functions of the task's summary and its swept variables.
+        costs: as of `paired_lines`.
+    """
     blocks = []
     for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
-        seeds = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split()))
-        blocks.append(f"{scenario} ({model}), seed {seeds}")
-        swept = swept_of(task)
-        blocks += [_rates(task, swept), _effort(task, swept), _statuses(task, swept)]
+        seeds, swept = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split())), swept_of(task)
+        blocks += [f"{what}{scenario} ({model}), seed {seeds}", *(table(task, swept) for table in tables)]
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if (rows["n"] > 0).any():
-            blocks.append(paired_lines(rows, swept))
-    return "\n\n".join([*blocks, f"{RATES_TEXT}\n{EFFORTS}"])
+            blocks.append(paired_lines(rows, swept, costs))
+    return blocks
 
 
 def format_frame(table: pd.DataFrame, form: str) -> str:
@@ -107,9 +118,16 @@ def cells(row: pd.Series, swept: Sequence[str]) -> list[str]:
     return ["-" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value) for value in values]
 
 
+def per_solver(
+    task: pd.DataFrame, swept: Sequence[str], heads: Iterable[str], values: Callable[[pd.Series], Sequence[str]]
+) -> str:
+    """A line for each row of a task's summary: swept variables, solver, and its values under their heads."""
+    rows = [[*cells(row, swept), row["solver"], *values(row)] for _, row in task.iterrows()]
+    return aligned([[*headers(swept), "solver", *heads], *rows], len(swept) + 1)
+
+
 def _rates(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [[*cells(row, swept), row["solver"], *(rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()]
-    return aligned([[*headers(swept), "solver", *OUTCOMES], *rows], len(swept) + 1)
+    return per_solver(task, swept, OUTCOMES, lambda row: [rate(row, name) for name in OUTCOMES])
 
 
 def rate(row: pd.Series, name: str) -> str:
@@ -137,26 +155,22 @@ EFFORT_COLUMNS = (
 PAPER_COLUMNS = ("n", "cost ratio", "iter.", "seconds")  # of them, in a paper's table
 
 
-def _measured(row: pd.Series, median: str, p90: str | None, form: str) -> str:
+def _measured(row: pd.Series, _: str, median: str, p90: str | None, form: str) -> str:
+    """A cell of one of EFFORT_COLUMNS."""
     cells = ["-" if pd.isna(row[name]) else f"{row[name]:{form}}" for name in (median, p90) if name is not None]
     return cells[0] if len(cells) == 1 or cells[0] == "-" else f"{cells[0]} ({cells[1]})"
 
 
 def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [[*headers(swept), "solver", *(header for header, *_ in EFFORT_COLUMNS)]]
-    columns_of = [(median, p90, form) for _, median, p90, form in EFFORT_COLUMNS]
-    for _, row in task.iterrows():
-        rows.append([*cells(row, swept), row["solver"], *(_measured(row, *columns) for columns in columns_of)])
-    return aligned(rows, len(swept) + 1)
+    heads = [header for header, *_ in EFFORT_COLUMNS]
+    return per_solver(task, swept, heads, lambda row: [_measured(row, *how) for how in EFFORT_COLUMNS])
 
 
 def _statuses(task: pd.DataFrame, swept: Sequence[str]) -> str:
     """How many trials ended with each status that occurs."""
     names = [name for name in task.columns if str(name).startswith(STATUS) and task[name].sum() > 0]
-    rows = [[*headers(swept), "solver", *(name.removeprefix(STATUS) for name in names)]]
-    for _, row in task.iterrows():
-        rows.append([*cells(row, swept), row["solver"], *(str(row[name]) for name in names)])
-    return aligned(rows, len(swept) + 1)
+    heads = [name.removeprefix(STATUS) for name in names]
+    return per_solver(task, swept, heads, lambda row: [str(row[name]) for name in names])
 
 
 COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neither": "neither"}
@@ -190,19 +204,23 @@ def _pair(row: pd.Series) -> list[str]:
 
 def printed(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
     """The tables that a paper prints: rates and effort, and comparisons where there are any."""
-    return [_printed_summary(summary), *([printed_pairs(paired)] if (paired["n"] > 0).any() else [])]
+    columns = [how for how in EFFORT_COLUMNS if how[0] in PAPER_COLUMNS]
+    heads = [*OUTCOMES, *(header for header, *_ in columns)]
+    rates = printed_rows(
+        summary, heads,
+        lambda row: [*(rate(row, name) for name in OUTCOMES), *(_measured(row, *how) for how in columns)],
+    )  # fmt: skip
+    return [rates, *([printed_pairs(paired)] if (paired["n"] > 0).any() else [])]
 
 
-def _printed_summary(summary: pd.DataFrame) -> pd.DataFrame:
+def printed_rows(summary: pd.DataFrame, heads: Sequence[str], values: Callable[[pd.Series], list[Any]]) -> pd.DataFrame:
+    """A row for each row of a summary: its task, swept variables and solver, and values under their heads."""
     swept = swept_of(summary)
-    columns = [(header, (median, p90, form)) for header, median, p90, form in EFFORT_COLUMNS if header in PAPER_COLUMNS]
-    rows = []
-    for _, row in summary.iterrows():
-        rates = [rate(row, name) for name in OUTCOMES]
-        measured = [_measured(row, *parts) for _, parts in columns]
-        rows.append([row["scenario"], row["model"], *cells(row, swept), row["solver"], *rates, *measured])
-    heads = [*TASK, *headers(swept), "solver", *OUTCOMES, *(header for header, _ in columns)]
-    return pd.DataFrame(rows, columns=heads)
+    rows = [
+        [row["scenario"], row["model"], *cells(row, swept), row["solver"], *values(row)]
+        for _, row in summary.iterrows()
+    ]
+    return pd.DataFrame(rows, columns=[*TASK, *headers(swept), "solver", *heads])
 
 
 def printed_pairs(paired: pd.DataFrame) -> pd.DataFrame:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -66,8 +66,7 @@ def read_world(source: Source, resolution: float | None) -> OccupancyGrid:
         InputError: another file, no shape, geometry of other kinds, models that are included from elsewhere, drawn,
             inserted or scaled afterwards, poses that are relative to named frames.
     """
-    source.needs("resolution", resolution, "the side of a cell, m")
-    assert resolution is not None
+    resolution = source.needs("resolution", resolution, "the side of a cell, m")
     shapes = list(_shapes(source, _root(source)))
     if not shapes:
         source.refuse(f"{WORLD_FILE} with a box, cylinder or sphere in a static model", "none")
@@ -134,7 +133,8 @@ def _of_models(
         kept = _kept(state, model)
         if model.get("placement_frame"):
             source.refuse("models placed by their own frame", f"placement_frame {shown(model.get('placement_frame'))}")
-        if kept is not None and any(float(scale) != 1.0 for scale in _numbers(source, kept, "scale", 3, (1.0,) * 3)):
+        scaled = kept is not None and kept.find("scale") is not None
+        if kept is not None and scaled and any(scale != 1.0 for scale in _numbers(source, kept, "scale", 3)):
             source.refuse("models of the size in which they were saved", f"<scale> {shown(kept.findtext('scale'))}")
         at = _placed(source, model, frame, kept)
         fixed = static or (model.findtext("static") or "").strip().lower() in ("1", "true")
@@ -166,21 +166,17 @@ def _shape(source: Source, geometry: Element | None, frame: Frame) -> Shape | No
     if shape is None or shape.tag in ("plane", "empty"):
         return None
     if shape.tag == "box":
-        half = 0.5 * np.array(_numbers(source, shape, "size", 3))
-        return Shape(frame, _lengths(source, half), 0)
-    if shape.tag in ("sphere", "cylinder"):
-        (radius,) = _numbers(source, shape, "radius", 1)
-        if shape.tag == "sphere":
-            return Shape(frame, _lengths(source, np.full(3, radius)), 3)
-        (length,) = _numbers(source, shape, "length", 1)
-        return Shape(frame, _lengths(source, np.array([radius, radius, 0.5 * length])), 2)
-    return source.refuse("static models of boxes, cylinders or spheres", f"<{shape.tag[:40]}>")
-
-
-def _lengths(source: Source, half: np.ndarray) -> np.ndarray:
+        half, round = 0.5 * np.array(_numbers(source, shape, "size", 3)), 0
+    elif shape.tag == "sphere":
+        half, round = np.full(3, _numbers(source, shape, "radius", 1)), 3
+    elif shape.tag == "cylinder":
+        (radius,), (length,) = (_numbers(source, shape, name, 1) for name in ("radius", "length"))
+        half, round = np.array([radius, radius, 0.5 * length]), 2
+    else:
+        source.refuse("static models of boxes, cylinders or spheres", f"<{shape.tag[:40]}>")
     if not (half > 0).all():
         source.refuse("shapes of sizes above 0 m", f"half sides {half.tolist()}")
-    return half
+    return Shape(frame, half, round)
 
 
 def _pose(source: Source, element: Element) -> Frame:
@@ -202,11 +198,7 @@ def _pose(source: Source, element: Element) -> Frame:
     return Frame(R, np.array([x, y, z]))
 
 
-def _numbers(
-    source: Source, element: Element, name: str, count: int, default: Sequence[float] | None = None
-) -> Sequence[float]:
-    if default is not None and element.find(name) is None:
-        return default
+def _numbers(source: Source, element: Element, name: str, count: int) -> list[float]:
     text = (element.findtext(name) or "").strip()
     try:
         found = [float(word) for word in text.split()]

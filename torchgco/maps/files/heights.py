@@ -23,8 +23,7 @@ def above_ground(
         resolution: side of a cell along all axes, m.
         origin: lowest corner (2,) or (3,) of the first cell, m; by default 0 in x and y.
     """
-    source.needs("resolution", resolution, "the side of a cell, m")
-    assert resolution is not None
+    resolution = source.needs("resolution", resolution, "the side of a cell, m")
     known = np.isfinite(heights)
     if not known.any():
         source.refuse("at least one finite height", f"{heights.size:,}, none of them finite")

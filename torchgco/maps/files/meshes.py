@@ -29,8 +29,7 @@ def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> O
         InputError: no such mesh, too fine a grid, faces with inner corners, a surface that isn't closed where `solid`
             is asked for.
     """
-    source.needs("resolution", resolution, "the side of a cell, m, for a mesh")
-    assert resolution is not None
+    resolution = source.needs("resolution", resolution, "the side of a cell, m, for a mesh")
     vertices, faces, closed = _loaded(source)
     if solid and not closed:
         source.refuse("a closed surface, or solid=False", "one with holes or edges of its own")

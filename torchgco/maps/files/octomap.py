@@ -6,14 +6,14 @@ so this reader is written here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 
 from torchgco.base.errors import shown
 from torchgco.maps.files.part import Box
-from torchgco.maps.files.source import MOST_CELLS, Cursor, Source, made
+from torchgco.maps.files.source import MOST_CELLS, Cursor, Source, made, whole
 from torchgco.maps.grid import OccupancyGrid
 
 DEPTH = 16  # of OctoMap's trees: the root has a side of 2**16 cells, with the frame's origin in its middle
@@ -96,49 +96,23 @@ def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float,
         source.refuse(f"{expected}, then id, size, res and data", f"only {', '.join(found) or 'none of them'}")
     if found["id"] not in NODE_BYTES:
         source.refuse(f"a tree of {', '.join(NODE_BYTES)}", shown(found["id"]))
-    if not found["size"].isascii() or not found["size"].isdigit() or len(found["size"]) > 12:
-        source.refuse("a whole number of nodes", shown(found["size"]))
+    size = whole(source, found["size"], "size")
     try:
         resolution = float(found["res"])
     except ValueError:
         resolution = np.nan
     if not 0.0 < resolution < np.inf:
         source.refuse("res, a length > 0 m", shown(found["res"]))
-    return found["id"], int(found["size"]), resolution, at
+    return found["id"], size, resolution, at
 
 
 def _binary_tree(cursor: Cursor, size: int) -> tuple[Leaves, int]:
     """Leaves and number of nodes of a bt file: two bytes per inner node, its eight children two bits each."""
-    count = min(cursor.left // 2, size)
-    words = np.frombuffer(cursor.data[cursor.at : cursor.at + 2 * count], "<u2").tolist()
-    inner: list[tuple[int, int, int, int, int]] = []
-    open_: list[tuple[int, int, int, int]] = [(0, 0, 0, DEPTH)] if words else []
-    while open_:
-        x, y, z, level = open_.pop()
-        if len(inner) >= count:
-            break
-        word = words[len(inner)]
-        if level == 0:
-            cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {cursor.at + 2 * len(inner):,}")
-        inner.append((x, y, z, level, word))
-        half = 1 << (level - 1)
-        for child in (7, 6, 5, 4, 3, 2, 1, 0):  # the first is read first, from the end of the list
-            if (word >> 2 * child) & 3 == INNER:
-                open_.append((x + half * (child & 1), y + half * (child >> 1 & 1), z + half * (child >> 2), level - 1))
-    if open_ or 2 * len(inner) < cursor.left:
-        _refuse_end(cursor, bool(open_), cursor.at + 2 * len(inner))
-    return _children(np.array(inner, np.int64).reshape(-1, 5))
-
-
-def _refuse_end(cursor: Cursor, cut: bool, at: int) -> NoReturn:
-    expected = f"{cursor.expected}, and ends with its tree's last node"
-    cursor.source.refuse(expected, f"a tree that is cut at byte {at:,}" if cut else f"a tree that ends at byte {at:,}")
-
-
-def _children(inner: np.ndarray) -> tuple[Leaves, int]:
-    """The leaves among the children of inner nodes (I, 5): lowest cell, level, word."""
-    child = np.arange(8)
-    kinds = inner[:, 4:] >> 2 * child & 3
+    count, child = min(cursor.left // 2, size), np.arange(8)
+    words = np.frombuffer(cursor.data[cursor.at : cursor.at + 2 * count], "<u2")
+    numbers = words.tolist()
+    inner = _walked(cursor, count, 2, lambda i: [c for c in range(8) if numbers[i] >> 2 * c & 3 == INNER])
+    kinds = words[: len(inner), None].astype(np.int64) >> 2 * child & 3
     node, which = np.nonzero((kinds == FREE_CHILD) | (kinds == OCCUPIED_CHILD))
     side = 1 << (inner[node, 3] - 1)
     corner = np.stack([which & 1, which >> 1 & 1, which >> 2], 1) * side[:, None]
@@ -148,40 +122,41 @@ def _children(inner: np.ndarray) -> tuple[Leaves, int]:
 
 def _tree(cursor: Cursor, more: int) -> tuple[Leaves, int]:
     """Leaves and number of nodes of an ot file: log-odds, a colour or time, and a bit for each child that there is."""
-    row = np.dtype([("log_odds", "<f4"), ("more", f"V{more}"), ("children", "u1")])
-    if not more:
-        row = np.dtype([("log_odds", "<f4"), ("children", "u1")])
-    count, rest = divmod(cursor.left, row.itemsize)
+    row = np.dtype([("log_odds", "<f4"), *([("more", f"V{more}")] if more else []), ("children", "u1")])
+    count = cursor.left // row.itemsize
     cursor.source.limit(count, MOST_NODES, "nodes of a tree")
     rows = np.frombuffer(cursor.data[cursor.at : cursor.at + count * row.itemsize], row)
+    bits = rows["children"].tolist()
+    nodes = _walked(cursor, count, row.itemsize, lambda i: [c for c in range(8) if bits[i] >> c & 1] or None)
+    leaves = rows["children"] == 0
+    found = nodes[leaves]
     with np.errstate(invalid="ignore"):  # some kinds of NaN, refused below
-        children, odds = rows["children"].tolist(), rows["log_odds"].astype(np.float64)
-    leaves: list[tuple[int, int, int, int, int]] = []
-    open_: list[tuple[int, int, int, int]] = [(0, 0, 0, DEPTH)] if count else []
-    node = 0
-    while open_ and node < count:
+        odds = rows["log_odds"][leaves].astype(np.float64)
+    if not np.isfinite(odds).all():
+        cursor.source.refuse("finite log-odds of leaves", f"{odds[~np.isfinite(odds)][0]}")
+    probabilities = (1.0 / (1.0 + np.exp(-np.clip(odds, -50.0, 50.0)))).astype(np.float32)
+    return Leaves(found[:, :3], 1 << found[:, 3], probabilities), count
+
+
+def _walked(cursor: Cursor, most: int, size: int, children: Callable[[int], list[int] | None]) -> np.ndarray:
+    """Lowest cell and level (nodes, 4) of the nodes of a tree in the order of the file, at most so many.
+
+    Args:
+        size: bytes of a node.
+        children: which children of a node are nodes of their own; None of a leaf.
+    """
+    nodes: list[tuple[int, int, int, int]] = []
+    open_ = [(0, 0, 0, DEPTH)] if most else []
+    while open_ and len(nodes) < most:
         x, y, z, level = open_.pop()
-        bits = children[node]
-        if not bits:
-            leaves.append((x, y, z, level, node))
-        elif level == 0:
-            at = cursor.at + node * row.itemsize
+        own, half = children(len(nodes)), 1 << level >> 1
+        if own is not None and level == 0:
+            at = cursor.at + size * len(nodes)
             cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {at:,}")
-        else:
-            half = 1 << (level - 1)
-            for child in (7, 6, 5, 4, 3, 2, 1, 0):
-                if bits >> child & 1:
-                    corner = (x + half * (child & 1), y + half * (child >> 1 & 1), z + half * (child >> 2))
-                    open_.append((*corner, level - 1))
-        node += 1
-    if open_ or node < count or rest:
-        _refuse_end(cursor, bool(open_), cursor.at + node * row.itemsize)
-    found = np.array(leaves, np.int64).reshape(-1, 5)
-    chosen = odds[found[:, 4]]
-    if not np.isfinite(chosen).all():
-        cursor.source.refuse("finite log-odds of leaves", f"{chosen[~np.isfinite(chosen)][0]}")
-    return Leaves(found[:, :3], 1 << found[:, 3], _probability(chosen)), count
-
-
-def _probability(log_odds: np.ndarray) -> np.ndarray:
-    return (1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0)))).astype(np.float32)
+        nodes.append((x, y, z, level))
+        for child in reversed(own or []):  # the first is read first, from the end of the list
+            open_.append((x + half * (child & 1), y + half * (child >> 1 & 1), z + half * (child >> 2), level - 1))
+    if open_ or size * len(nodes) < cursor.left:
+        expected, how = f"{cursor.expected}, and ends with its tree's last node", "is cut" if open_ else "ends"
+        cursor.source.refuse(expected, f"a tree that {how} at byte {cursor.at + size * len(nodes):,}")
+    return np.array(nodes, np.int64).reshape(-1, 4)

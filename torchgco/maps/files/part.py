@@ -21,11 +21,6 @@ class Box:
     low: np.ndarray
     high: np.ndarray
 
-    @classmethod
-    def everything(cls, d: int) -> Box:
-        """All of space."""
-        return cls(np.full(d, -np.inf), np.full(d, np.inf))
-
     def of(self, source: Source, d: int) -> Box:
         """Itself, for a map of d dimensions; InputError where it has others."""
         if len(self.low) != d:

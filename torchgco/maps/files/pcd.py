@@ -26,20 +26,15 @@ PCD_TYPES = {
 
 @dataclass(frozen=True)
 class Header:
-    """Names, types and numbers of each field of a point, how many points follow, and how."""
+    """Names and numbers of each field of a point, how many points follow, and how."""
 
     names: list[str]
-    types: list[np.dtype]
     counts: list[int]
+    point: np.dtype  # of all fields, in their order
     points: int
     data: str
     at: int  # byte after the header
     lines: int
-
-    @property
-    def point(self) -> int:
-        """Bytes of a point."""
-        return sum(type.itemsize * count for type, count in zip(self.types, self.counts, strict=True))
 
 
 def read_pcd(source: Source) -> np.ndarray:
@@ -62,9 +57,8 @@ def read_pcd(source: Source) -> np.ndarray:
         if len(points) != header.points:
             source.refuse(f"{header.points:,} points", f"{len(points):,}")
         return finite_points(source, points)
-    if header.data == "binary":
-        return finite_points(source, _binary(cursor, header, wanted))
-    return finite_points(source, _compressed(cursor, header, wanted))
+    read = _binary if header.data == "binary" else _compressed
+    return finite_points(source, read(cursor, header, wanted))
 
 
 def _header(source: Source, raw: bytes) -> Header:
@@ -90,11 +84,11 @@ def _header(source: Source, raw: bytes) -> Header:
     counts = [whole(source, count, "COUNT", 0) for count in lists[3]]
     if sum(counts) > FIELDS:
         source.refuse(f"at most {FIELDS} numbers per point", sum(counts))
-    types = []
-    for pair in zip(found["TYPE"], sizes, strict=True):
+    fields = []
+    for pair, count in zip(zip(found["TYPE"], sizes, strict=True), counts, strict=True):
         if pair not in PCD_TYPES:
             source.refuse("TYPE F, U or I of 1, 2, 4 or 8 bytes", f"{shown(pair[0])} of {pair[1]}")
-        types.append(np.dtype(PCD_TYPES[pair]))
+        fields.append((f"{len(fields)}", PCD_TYPES[pair], (count,)))
     sides = [whole(source, " ".join(found[key]), key) for key in ("WIDTH", "HEIGHT")]
     points = sides[0] * sides[1]
     if "POINTS" in found and whole(source, " ".join(found["POINTS"]), "POINTS") != points:
@@ -103,36 +97,25 @@ def _header(source: Source, raw: bytes) -> Header:
     data = " ".join(found["DATA"])
     if data not in ("ascii", "binary", "binary_compressed"):
         source.refuse("DATA ascii, binary or binary_compressed", shown(data))
-    return Header(names, types, counts, points, data, at, lines)
+    return Header(names, counts, np.dtype(fields), points, data, at, lines)
 
 
 def _binary(cursor: Cursor, header: Header, wanted: list[int]) -> list[np.ndarray]:
     """One point after the other."""
-    offsets = np.cumsum([0, *(t.itemsize * c for t, c in zip(header.types, header.counts, strict=True))]).tolist()
-    data = cursor.take(header.points * header.point, f"{header.points:,} points")
-    layout = np.dtype(
-        {
-            "names": [f"{i}" for i in wanted],
-            "formats": [header.types[i] for i in wanted],
-            "offsets": [offsets[i] for i in wanted],
-            "itemsize": header.point,
-        }
-    )
-    rows = np.frombuffer(data, layout)
-    return [rows[f"{i}"] for i in wanted]
+    rows = np.frombuffer(cursor.take(header.points * header.point.itemsize, f"{header.points:,} points"), header.point)
+    return [rows[f"{i}"][:, 0] for i in wanted]
 
 
 def _compressed(cursor: Cursor, header: Header, wanted: list[int]) -> list[np.ndarray]:
     """LZF of all values of the first field, then all of the second, ..."""
     packed, size = cursor.number("I", "compressed size"), cursor.number("I", "size")
-    if size != header.points * header.point:
-        cursor.source.refuse(f"{header.points * header.point:,} bytes of {header.points:,} points", f"{size:,}")
+    if size != (due := header.points * header.point.itemsize):
+        cursor.source.refuse(f"{due:,} bytes of {header.points:,} points", f"{size:,}")
     cursor.source.limit(size, MOST_BYTES, "bytes of points")
     at = cursor.at
     data = unpack(cursor.source, cursor.take(packed, "compressed points"), size, at)
-    lengths = [t.itemsize * c * header.points for t, c in zip(header.types, header.counts, strict=True)]
-    starts = np.cumsum([0, *lengths]).tolist()
-    return [np.frombuffer(data, header.types[i], header.points, starts[i]) for i in wanted]
+    starts = np.cumsum([0, *(header.points * header.point[i].itemsize for i in range(len(header.names)))]).tolist()
+    return [np.frombuffer(data, header.point[i].base, header.points, starts[i]) for i in wanted]
 
 
 def unpack(source: Source, data: memoryview, size: int, at: int = 0) -> bytearray:

@@ -61,45 +61,27 @@ def _read_image(
 
 def _read_octomap(source: Source, layer: tuple[float, float] | None, box: Box | None) -> OccupancyGrid:
     """What `layer` and `box` leave of a tree, which may be larger than a grid can be."""
-    box = Box.everything(3) if box is None else box.of(source, 3)
+    box = Box(np.full(3, -np.inf), np.full(3, np.inf)) if box is None else box.of(source, 3)
     return read_octomap(source, box if layer is None else box.between(*layer))
 
 
 METADATA = "metadata.yaml"  # is in the folder of each bag of ROS 2
-IMAGE = Format(_read_image, ("resolution", "origin", "height"))
 BAG = Format(_read_bag, ("topic",))
-WORLD = Format(read_world, ("resolution",))
-MESH = Format(read_mesh, ("resolution", "solid"))
-OCTOMAP = Format(_read_octomap, ("layer", "box"))
-LAS = Format(read_las)
+IMAGES = ".png", ".pgm", ".ppm", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff"
 FORMATS = {
     ".npz": Format(read_npz),
     ".npy": Format(read_npy, ("resolution", "origin", "height")),
-    ".yaml": Format(read_map_server),
-    ".yml": Format(read_map_server),
-    ".png": IMAGE,
-    ".pgm": IMAGE,
-    ".ppm": IMAGE,
-    ".bmp": IMAGE,
-    ".jpg": IMAGE,
-    ".jpeg": IMAGE,
-    ".tif": IMAGE,
-    ".tiff": IMAGE,
+    **dict.fromkeys((".yaml", ".yml"), Format(read_map_server)),
+    **dict.fromkeys(IMAGES, Format(_read_image, ("resolution", "origin", "height"))),
     ".map": Format(read_movingai, ("resolution", "origin")),
-    ".world": WORLD,
-    ".sdf": WORLD,
-    ".stl": MESH,
-    ".obj": MESH,
+    **dict.fromkeys((".world", ".sdf"), Format(read_world, ("resolution",))),
+    **dict.fromkeys((".stl", ".obj"), Format(read_mesh, ("resolution", "solid"))),
     ".xyz": Format(read_xyz),
     ".pcd": Format(read_pcd),
     ".ply": Format(read_ply, ("resolution", "solid")),
-    ".las": LAS,
-    ".laz": LAS,
-    ".bt": OCTOMAP,
-    ".ot": OCTOMAP,
-    ".bag": BAG,
-    ".mcap": BAG,
-    ".db3": BAG,
+    **dict.fromkeys((".las", ".laz"), Format(read_las)),
+    **dict.fromkeys((".bt", ".ot"), Format(_read_octomap, ("layer", "box"))),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), BAG),
 }
 # What other formats become ones that are read by: a tool of theirs, and its line.
 _BY_TRIMESH = "an stl: `python -c \"import trimesh; trimesh.load('IN', force='mesh').export('OUT.stl')\"` writes one"
@@ -158,8 +140,10 @@ def read(
     for name, value in given.items():
         if value is not None and name not in format.options:
             raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
-    for name, value in (("resolution", resolution), ("radius", radius), ("height", height)):
-        _check_length(value, f"{field}.{name}", least=0.0 if name == "radius" else LEAST_CELL)
+    lengths = (("resolution", resolution, LEAST_CELL), ("radius", radius, 0.0), ("height", height, LEAST_CELL))
+    for name, value, least in lengths:
+        if value is not None and not least <= number(value, f"{field}.{name}") <= FARTHEST_AT:
+            raise InputError(f"{field}.{name}", f"a length from {least:g} to {FARTHEST_AT:g} m", shown(value))
     if origin is not None:
         given["origin"] = origin = coordinates(origin, f"{field}.origin")
         if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST_AT).all():
@@ -186,14 +170,8 @@ def _find(path: Any, field: str) -> tuple[Source, Format]:
         raise InputError(f"{field}.path", "the path of a map", shown(path))
     source = Source(Path(os.path.expanduser(path)), field)
     ending = source.path.suffix.lower()
-    if ending not in FORMATS and (source.path / METADATA).is_file():
-        return source, BAG
-    if ending not in FORMATS:
+    format = FORMATS.get(ending) or (BAG if (source.path / METADATA).is_file() else None)
+    if format is None:
         expected = CONVERTED.get(ending, f"a file that ends with {', '.join(FORMATS)}")
         raise InputError(f"{field}.path", expected, path)
-    return source, FORMATS[ending]
-
-
-def _check_length(value: Any, field: str, least: float) -> None:
-    if value is not None and not least <= number(value, field) <= FARTHEST_AT:
-        raise InputError(field, f"a length from {least:g} to {FARTHEST_AT:g} m", shown(value))
+    return source, format

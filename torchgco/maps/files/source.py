@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import IO, Any, NoReturn, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,8 @@ FARTHEST_AT = 1e7  # m, of any coordinate: what lies farther has another unit
 PATH_ROOM = 150  # of a path in an error
 LEAST_CELL = 1e-6  # m, of a cell
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
 class Source:
@@ -38,10 +40,11 @@ class Source:
         """What errors call the path."""
         return f"{self.name}.path"
 
-    def needs(self, option: str, value: Any, expected: str) -> None:
-        """InputError where an option of `read` that this file needs isn't given."""
+    def needs(self, option: str, value: T | None, expected: str) -> T:
+        """The value of an option of `read` that this file needs; InputError where it isn't given."""
         if value is None:
             raise InputError(f"{self.name}.{option}", f"{expected}, for {self.path}", value)
+        return value
 
     def refuse(self, expected: str, got: object) -> NoReturn:
         """Raise InputError, which names the file before what came."""

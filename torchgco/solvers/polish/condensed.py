@@ -10,11 +10,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchgco.base.autodiff import gradients
 from torchgco.constraints.base import Constraint
 from torchgco.lagrangian.expansion import linearise, quadratise
 from torchgco.problem.problem import Problem
+
+LAST = 0, 0, 0, 1  # one more stage of zeros: the last knot has no controls
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,7 @@ class Condensed:
             G[k + 1, :, here] = F[k, :, n:]
         column = quadratise(problem, X, U)[0, :, :, n]
         local = torch.cat((column[:, :n], column[:, n + 1 :]), dim=-1)
-        gradient = (G * local[:, :n, None]).flatten(0, 1).sum(0) + local[:-1, n:].flatten()
-        return cls(problem, X, U, F, G, local, gradient, *_rows(problem, X, U))
+        return cls(problem, X, U, F, G, local, _reduced(G, local), *_rows(problem, X, U))
 
     def dense(self, rows: Tensor) -> Tensor:
         """A (q, v): derivatives of the rows (q,) w.r.t. U."""
@@ -60,14 +62,12 @@ class Condensed:
 
     def change(self, step: Tensor) -> Tensor:
         """A dU (r,) of all rows for a step dU (v,)."""
-        z = torch.cat((self.G @ step, _padded(step.view(self.problem.N, -1))), dim=-1)
+        z = torch.cat((self.G @ step, pad(step.view(self.problem.N, -1), LAST)), dim=-1)
         return (self.slopes * z[self.knots]).sum(-1)
 
     def lagrangian_gradient(self, lam: Tensor) -> Tensor:
         """Gradient (v,) of J_var + lam'c w.r.t. U, for multipliers lam (r,)."""
-        n = self.problem.n
-        local = self.local.index_add(0, self.knots, lam.unsqueeze(-1) * self.slopes)
-        return (self.G * local[:, :n, None]).flatten(0, 1).sum(0) + local[:-1, n:].flatten()
+        return _reduced(self.G, self.local.index_add(0, self.knots, lam.unsqueeze(-1) * self.slopes))
 
     def hessian(self, lam: Tensor | None) -> Tensor:
         """Hessian (v, v) of J_var + lam'c w.r.t. U: exact for multipliers lam (r,), that of the cost alone for None.
@@ -115,7 +115,7 @@ class Condensed:
                 total = total + (weight * constraint.value(X, U)).sum()
             return total
 
-        z = torch.cat((self.X, _padded(self.U, 1)), dim=-1).repeat(s, 1, 1)
+        z = torch.cat((self.X, pad(self.U, LAST)), dim=-1).repeat(s, 1, 1)
         (blocks,) = gradients(lambda z: gradients(value, z)[0] * directions, z)
         return blocks.movedim(0, 1)
 
@@ -126,10 +126,16 @@ class Condensed:
         return tuple(part.view(shape) for part, shape in zip(parts, shapes, strict=True))
 
 
+def _reduced(G: Tensor, local: Tensor) -> Tensor:
+    """The gradient (v,) w.r.t. U of what has gradients `local` (N+1, n + m) w.r.t. the x and u of each knot."""
+    n = G.shape[1]
+    return (G * local[:, :n, None]).flatten(0, 1).sum(0) + local[:-1, n:].flatten()
+
+
 def _rows(problem: Problem, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Values, slopes, knots and senses of all rows."""
     every = torch.arange(problem.N + 1, device=X.device)
-    z = torch.cat((X, _padded(U, 1)), dim=-1)
+    z = torch.cat((X, pad(U, LAST)), dim=-1)
     values, slopes, knots, senses = [X.new_zeros(0)], [z.new_zeros(0, z.shape[-1])], [every[:0]], [every[:0].bool()]
     for constraint in problem.constraints:
         c, slope = _slopes(constraint, z, problem.n)
@@ -152,8 +158,3 @@ def _slopes(constraint: Constraint, z: Tensor, n: int) -> tuple[Tensor, Tensor]:
     twins = constraint.take(torch.zeros(p, dtype=torch.int64, device=z.device))
     (slopes,) = gradients(lambda z: twins.value(z[..., :n], z[:, :-1, n:]).diagonal(dim1=0, dim2=2), z.repeat(p, 1, 1))
     return c, slopes[:, constraint.knots].transpose(0, 1)
-
-
-def _padded(U: Tensor, dim: int = 0) -> Tensor:
-    """U with one more stage of zeros: the last knot has no controls."""
-    return torch.cat((U, torch.zeros_like(U.narrow(dim, 0, 1))), dim=dim)

@@ -9,7 +9,7 @@ from torchgco.maps.files.source import Cursor, Source
 
 MCAP = "an mcap file"
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, MCAP_INDEX, END = 3, 4, 5, 6, 7, 15  # kinds of records
+SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, MCAP_INDEX = 3, 4, 5, 6, 7  # kinds of records
 MOST_SCHEMA = 2**24  # bytes
 MOST_UNPACKED = 2**32  # bytes of all chunks of a file without an index
 
@@ -31,9 +31,8 @@ class Contents:
     schemas: dict[int, str] = field(default_factory=dict)
     channels: dict[int, tuple[str, int, str]] = field(default_factory=dict)
     last: dict[int, Place] = field(default_factory=dict)
-    chunks: dict[int, dict[int, int]] = field(
-        default_factory=dict
-    )  # latest times by channel, by the chunk's first byte
+    # Latest times by channel, by the chunk's first byte.
+    chunks: dict[int, dict[int, int]] = field(default_factory=dict)
     records: int = 0
     unpacked: int = 0  # records in chunks
 

@@ -111,29 +111,23 @@ def _cloud(source: Source, fields: Fields, ros1: bool) -> np.ndarray:
     fields.header(ros1)
     height, width, count = fields.numbers("III")
     source.limit(count, MOST_FIELDS, "fields of a point")
+    kinds = [(fields.text(), *fields.numbers("IBI")) for _ in range(count)]
     offsets: dict[str, tuple[int, np.dtype]] = {}
-    kinds = []
-    for _ in range(count):
-        name = fields.text()
-        offset, kind, _ = fields.numbers("IBI")
-        kinds.append((name, offset, kind))
     big, step, row = fields.numbers("BII")
     data = fields.bytes("points")
     source.limit(height * width, MOST_POINTS, f"points ({height:,} x {width:,})")
-    for name, offset, kind in kinds:
+    for name, offset, kind, _ in kinds:
         if name in ("x", "y", "z"):
             type = np.dtype((">" if big else "<") + TYPES[kind]) if kind in TYPES else None
             if type is None or offset + type.itemsize > step:
                 source.refuse(f"{name} as a number within a point's {step:,} bytes", f"type {kind} at byte {offset:,}")
             offsets[name] = (offset, type)
     if set(offsets) != {"x", "y", "z"}:
-        source.refuse("points with x, y and z", ", ".join(name[:20] for name, _, _ in kinds[:8]) or "no fields")
+        source.refuse("points with x, y and z", ", ".join(name[:20] for name, *_ in kinds[:8]) or "no fields")
     row = step * width if height == 1 else row  # some drivers leave it out
     needed = (height - 1) * row + step * width
     if not height * width or row < step * width or len(data) < needed:
         source.refuse(f"{height:,} rows of {width:,} points of {step:,} bytes", f"{len(data):,} bytes")
-    columns = []
-    for axis in ("x", "y", "z"):
-        offset, type = offsets[axis]
-        columns.append(np.ndarray((height, width), type, data, offset, (row, step)).reshape(-1))
+    places = (offsets[axis] for axis in ("x", "y", "z"))
+    columns = [np.ndarray((height, width), type, data, offset, (row, step)).reshape(-1) for offset, type in places]
     return finite_points(source, columns)

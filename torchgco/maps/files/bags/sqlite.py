@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
+from itertools import count
 from urllib.request import pathname2url
 
 from torchgco.maps.files.bags.container import MOST_MESSAGE, Message, choose
@@ -47,13 +48,8 @@ def last_message(source: Source, topic: str | None) -> Message:
 
 def _restrict(database: sqlite3.Connection) -> None:
     """A file of others may hold tables whose columns are computed: nothing large, long or with effects is."""
-    calls = [0]
-
-    def count() -> bool:
-        calls[0] += 1
-        return calls[0] > MOST_CALLS
-
-    database.set_progress_handler(count, STEPS)
+    looks = count(1)
+    database.set_progress_handler(lambda: next(looks) > MOST_CALLS, STEPS)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_MESSAGE)
     database.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
     for pragma in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "query_only = ON"):

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.causes.seen import seen_figure
 from torchgco.base.errors import InputError
 from torchgco.missions.log import MissionLog, SeenLog
 from torchgco.plotting.bodies import Ball
 from torchgco.plotting.course import Course
-from torchgco.plotting.seen import seen_figure
 
 COURSE = Course((Ball(np.array([2.0, 0.0, 0.0]), 0.5, np.zeros(3)),), np.array([4.0, 0.0, 0.0]), 0.5, 0.2)
 
