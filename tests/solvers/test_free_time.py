@@ -222,7 +222,7 @@ def test_solvers_that_hold_the_time_are_refused() -> None:
         with pytest.raises(InputError, match="solver: expected interior_point, gco, gco_exact, ipopt or fatrop"):
             torchgco.solve(carts(B=1), solver=solver)
     with pytest.raises(InputError, match="problem: expected one of fixed times"):
-        torchgco.compile(carts(B=1))
+        torchgco.MPPIController(carts(B=1))
     with pytest.raises(InputError, match="solution: expected one of fixed times"):
         torchgco.solve(carts(B=1, N=20)).shifted()
 

@@ -20,6 +20,7 @@ from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import CPU, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
+from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.explaining.account import Account
 from torchgco.kernels import cost_unit, current, interior_of
@@ -30,6 +31,7 @@ from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.ending import constant_cost, least_cost
@@ -61,11 +63,17 @@ class Answer:
     violation: Tensor  # (B,): largest violation, metres for lengths
     warm: Tensor  # (B,) bool: whether the solve from the last answer was enough
     seconds: float  # that the call took
+    t: Tensor | None = None  # (B, N+1): times of the knots where the time is free, s; else None
 
     @property
     def u(self) -> Tensor:
         """The first controls, (B, m)."""
         return self.U[:, 0]
+
+    @property
+    def duration(self) -> Tensor | None:
+        """How long each trajectory lasts where the time is free, (B,), s; else None."""
+        return None if self.t is None else self.t[:, -1]
 
     @property
     def statuses(self) -> list[Status]:
@@ -95,10 +103,11 @@ def compile(
         changes: names of the numbers that calls may change; others keep what the problem has. None: all that
             `Compiled.numbers` lists.
         receding: each call's horizon begins a stage after that of the call before; its warm start is shifted as far.
+            Where the time is free, calls say what has `elapsed`.
         tolerance: of the optimality conditions; None: that of `InteriorPoint`.
 
     Raises:
-        InputError: another solver, a name that isn't there, a problem on another device, or a free time.
+        InputError: another solver, a name that isn't there, a problem on another device, `receding` in free time.
     """
     check_untransformed("compile")
     problem = current_problem(problem)
@@ -128,8 +137,8 @@ class Compiled:
         receding: bool,
         interior: InteriorPoint,
     ) -> None:
-        if problem.time is not None:
-            raise InputError("problem", "one of fixed times: torchgco.solve chooses times", "a free time")
+        if problem.time is not None and receding:
+            raise InputError("receding", "False where the time is free: calls say what has `elapsed`, s", True)
         if problem.x0.device.type != "cpu":
             raise InputError("problem", "one on the CPU", str(problem.x0.device))
         self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
@@ -139,6 +148,7 @@ class Compiled:
 
     def _begin(self, problem: Problem) -> None:
         found = numbers_of(problem)
+        found = found if problem.time is None else numbers_in_time(found, problem)
         every = Numbers(found, self._note)
         chosen = None if self.changes is None else {every.find(name).name for name in self.changes}
         self.numbers = Numbers([n for n in found if chosen is None or n.name in chosen], self._note)
@@ -152,15 +162,25 @@ class Compiled:
     def _pack(self, problem: Problem) -> None:
         """Compile and pack a problem as it is now; what was packed before hands its iterates on."""
         self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
-        form, before, self._kept = current(for_solvers(problem)), self._kept, None
-        if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
+        before, self._kept = self._kept, None
+        self._packed(problem)
+        if self._kept is not None and before is not None:
+            self._kept.begin_with(before)
+
+    def _packed(self, problem: Problem) -> None:
+        if problem.free_start is not None or problem.B == 0:
+            return
+        if problem.time is not None:
+            self._kept = kept_in_time(problem, self._options)
+            self._unit = self._unit if self._kept is None else cost_unit(self._kept.whole)
+            return
+        form = current(for_solvers(problem))
+        if for_solvers(problem) is problem:
             kernels = interior_of(form)
             # What Python has read of a problem's own numbers stays in the code.
             if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
                 self._problem, self._unit = form, cost_unit(form)
                 self._kept = Kept(kernels, form, **self._options(form))
-                if before is not None:
-                    self._kept.begin_with(before)
 
     def _options(self, problem: Problem) -> dict[str, Any]:
         interior = self.interior
@@ -175,6 +195,7 @@ class Compiled:
         *,
         warm: bool = True,
         shift: float | None = None,
+        elapsed: float | None = None,
         max_seconds: float | None = None,
         numbers: Mapping[str, Any] | None = None,
         **named: Any,
@@ -184,7 +205,9 @@ class Compiled:
         Args:
             warm: begin with the last answer, where that was a solution.
             shift: by how many stages, also parts of one, the horizon has moved since the last call; None: 1 if
-                receding, else 0.
+                receding, else 0. Where the time is free, `elapsed` serves.
+            elapsed: where the time is free, the time since the last call, s, by which the horizon has moved: the guess
+                is what is then left of the last trajectories, and of their time. None: 0.
             max_seconds: after which the iterate so far is returned; looked at in every iteration.
             numbers: new numbers by name, for names that are no words, such as "constraints[1].centers".
             named: the same.
@@ -197,19 +220,31 @@ class Compiled:
         if not self._lock.acquire(blocking=False):
             raise InputError("mpc", "one call at a time: a compiled problem per thread", "a call during another one")
         try:
-            if shift is None:
-                shift = int(self.receding)
-            elif isinstance(shift, bool) or not isinstance(shift, int | float) or not 0 <= shift < math.inf:
-                raise InputError("shift", "a number of stages, at least 0", shown(shift))
+            moved = self._moved(shift, elapsed)
             until = math.inf
             if max_seconds is not None:
                 until = began + check_value(max_seconds, Positive, "max_seconds")
             self.numbers.write({**(numbers or {}), **named})
             able = self._warm if warm else np.zeros_like(self._warm)
             self._warm = np.zeros_like(self._warm)  # an error or an interrupt leaves nothing to begin with
-            return self._solved(able, shift, began, until)
+            return self._solved(able, moved, began, until)
         finally:
             self._lock.release()
+
+    def _moved(self, shift: Any, elapsed: Any) -> float:
+        """By how much the horizon has moved since the last call: stages, or seconds where the time is free."""
+        free = self._problem.time is not None
+        own, other = ("elapsed", "shift") if free else ("shift", "elapsed")
+        given, wrong = (elapsed, shift) if free else (shift, elapsed)
+        if wrong is not None:
+            raise InputError(
+                other, f"None where the time is {'free' if free else 'fixed'}: `{own}` serves", shown(wrong)
+            )
+        if given is None:
+            return int(self.receding)
+        if isinstance(given, bool) or not isinstance(given, int | float) or not 0 <= given < math.inf:
+            raise InputError(own, f"a number of {'seconds' if free else 'stages'}, at least 0", shown(given))
+        return given
 
     @property
     def problem(self) -> Problem:
@@ -229,7 +264,8 @@ class Compiled:
         if self._kept is None:
             return last
         now = self._now()
-        cost = torch.where(torch.isnan(last.cost), now.cost.total(last.X, last.U), last.cost)
+        form, X, U = at_times(now, last.X, last.U, last.times)
+        cost = torch.where(torch.isnan(last.cost), form.cost.total(X, U), last.cost)
         return replace(last, cost=cost, account=Account(now, self.interior))
 
     @property
@@ -250,7 +286,7 @@ class Compiled:
             return "numbers of the problem were changed in place since it was compiled: pass them to the call by name"
         if self._kept is None:
             return None  # PyTorch's kernels call the functions themselves
-        problem, then = self._now().renewed(), self._kept.engine
+        problem, then = for_solvers(self._now().renewed()), self._kept.engine
         read, now = then.captured.read(), Engine(problem, compiles=False)
         if read is None or then.with_shared(read).computes_as(now, problem):  # None: a call compiles again by itself
             return None
@@ -270,16 +306,21 @@ class Compiled:
             self._begin(with_own_numbers(problem))
 
     def _note(self, number: Number) -> None:
-        if number.derived:
+        if number.derived or self._problem.time is not None:  # where it is, C has traced what it would read itself
             self._changed.add(number.part)
 
     def _refresh(self, shift: float = 0) -> None:
         """Have C begin `shift` stages later, and read what it doesn't share with the problem's tensors."""
         kept = self._kept
         assert kept is not None
-        if shift:
+        parts = self._changed
+        if isinstance(kept, KeptInTime):
+            with _plainly():
+                kept.shift(shift)
+                parts = kept.read(parts, self._now())
+        elif shift:
             kept.shift(shift)
-        for part in self._changed:
+        for part in parts:
             if part == "dynamics":
                 kept.refresh_model()
             elif part == "cost" and kept.engine.cost is not None:
@@ -342,7 +383,7 @@ class Compiled:
         assert kept is not None
         if kept.engine.measures:
             return kept.worst
-        return violation(self._now().constraints, *kept.rolled)
+        return violation(for_solvers(self._now()).constraints, *kept.rolled)
 
     def _packed_solution(self, good: np.ndarray) -> Solution:
         """What C has found; CONVERGED where it is `good` (B,)."""
@@ -350,12 +391,13 @@ class Compiled:
         assert kept is not None
         ended = kept.statuses
         status = np.where(good | (ended == TIME_LIMIT), ended, Status.MAX_ITERATIONS)
-        multipliers = Multipliers(tuple(lam.clone() for lam in kept.lam), PENALTY * self._unit)
+        multipliers = Multipliers(kept.multipliers, PENALTY * self._unit)
         X, U, K, _, iterations = kept.copies()
         none, cost = torch.zeros_like(iterations), X.new_full((X.shape[0],), torch.nan)
         return Solution(
             X, U, K, torch.zeros_like(U), multipliers, cost, self._violation().clone(),
             torch.from_numpy(status.astype(np.int64)), iterations, none, none.clone(),
+            times=kept.times,
         )  # fmt: skip
 
     def _again(self, found: Solution, rows: Tensor, until: float) -> None:
@@ -364,18 +406,16 @@ class Compiled:
         assert kept is not None
         now = self._now().take(rows)
         solution = self._by_solver(None, until, now)
-        bare = replace(solution, trace=None, search=None, account=None)
+        bare = replace(solution, trace=None, search=None, account=None, needed=None)
         put(found, rows, replace(bare, iterations=solution.iterations + tried))
-        kept.X[rows], kept.U[rows] = solution.X, solution.U
-        for lam, own in zip(kept.lam, solution.multipliers.lam, strict=True):
-            lam[rows] = own
+        kept.take_over(rows, solution)
 
     def _by_solver(self, shift: float | None, until: float, problem: Problem | None = None) -> Solution:
         """A solve by the solver that `compile` was given, from the last answer where a shift is given."""
         now = self._now() if problem is None else problem
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
         seconds = None if until == math.inf else max(1e-3, until - time.perf_counter())
-        warm = None if shift is None or self._last is None else _later(self._last, shift)
+        warm = None if shift is None or self._last is None else later(now, self._last, shift)
         return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:
@@ -391,16 +431,8 @@ class Compiled:
         # The next call may begin with solutions, and with what only the time was over for.
         ended = status.numpy()
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
-        return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began)
-
-
-def _later(last: Solution, shift: float) -> Solution:
-    """A guess for a horizon that begins so many stages later; parts of one as `Kept.shift` takes them."""
-    whole = int(shift)
-    guess, part = last.shifted(whole) if whole else last, shift - whole
-    if part == 0:
-        return guess
-    one = guess.shifted()
-    X, U, K, d = (torch.lerp(getattr(guess, name), getattr(one, name), part) for name in ("X", "U", "K", "d"))
-    lam = tuple(torch.lerp(*pair, part) for pair in zip(guess.multipliers.lam, one.multipliers.lam, strict=True))
-    return replace(one, X=X, U=U, K=K, d=d, multipliers=Multipliers(lam, guess.multipliers.mu))
+        t = found.times if found is not None else None
+        if found is None and isinstance(kept, KeptInTime):
+            with _plainly():
+                t = kept.times
+        return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began, t)

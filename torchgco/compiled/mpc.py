@@ -17,7 +17,7 @@ from torchgco.base.status import Status
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Answer, Compiled, compile
 from torchgco.compiled.numbers import Numbers, as_floats
 from torchgco.compiled.plan import Plan
-from torchgco.compiled.stages import stage_of, stages_between
+from torchgco.compiled.stages import check_loop_in_free_time, stage_of, stages_between
 from torchgco.constraints.bounds import RateBounds
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
@@ -34,12 +34,15 @@ class MPC:
     before is held: its control of that time with feedback on the measured state, within the bounds. `RateBounds` with a
     `previous` count from the controls that were returned last.
 
+    Where the time is free, a plan lasts as long as is left of the one before, or as is best. Controls are the plan's
+    means over the next period, and of stages that are longer those of the first.
+
     Args:
-        problem: B vehicles with stages of one length; its start isn't used.
+        problem: B vehicles with stages of one length, or a free time; its start isn't used.
         solver: "gco" or "interior_point": of the first period, and of those that no plan before leads to, where an
             obstacle has come into the way, say. None: "gco" among obstacles, as only it searches for other ways, else
             "interior_point".
-        period: s, from one step to the next; None: a stage.
+        period: s, from one step to the next; None: a stage of dt.
         max_seconds: of a step; a solve that isn't ready by then is late. None: none is.
         changes: names of the numbers that steps may change, beside the starts and `previous`, which each step writes.
             None: all.
@@ -51,7 +54,8 @@ class MPC:
         answer: the last solve's `Answer`, whether it is flown or not; None before the first step.
 
     Raises:
-        InputError: as `torchgco.compile`; stages that differ in length, horizons of each problem, free starts or times.
+        InputError: as `torchgco.compile`; stages that differ in length, horizons of each problem, or free starts. Where
+            the time is free: a shortest duration below a period, `RateBounds` with a `previous`.
     """
 
     def __init__(
@@ -68,8 +72,11 @@ class MPC:
         for name, given in (("horizon", problem.horizon), ("free_start", problem.free_start)):
             if given is not None:
                 raise InputError(f"problem.{name}", "None in a loop, which starts from measured states", "one")
-        self.dt = stage_of(problem)
+        self._free = problem.time is not None
+        self.dt = float(problem.dynamics.dt) if self._free else stage_of(problem)
         self.period = self.dt if period is None else check_value(period, Seconds, "period")
+        if self._free:
+            check_loop_in_free_time(problem, self.period)
         self.max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
@@ -148,28 +155,31 @@ class MPC:
         state, now = self._measured(x), self._time(t)
         if self._previous and self._u is not None and "previous" not in named:
             numbers = dict.fromkeys(self._previous, self._u) | dict(numbers or {})
-        later = 0 if self.answer is None else stages_between((self.period if t is None else now - self.t) / self.dt)
+        later = 0.0 if self.answer is None else self.period if t is None else now - self.t
+        moved = {"elapsed": later} if self._free else {"shift": stages_between(later / self.dt)}
         answer = self.compiled(
-            x0=state, warm=self.answer is not None, shift=later, numbers=numbers,
+            x0=state, warm=self.answer is not None, numbers=numbers, **moved,
             max_seconds=self.max_seconds if max_seconds is None else max_seconds, **named,
         )  # fmt: skip
         ended = answer.status.numpy()
         solved = (ended == CONVERGED) | (ended == FEASIBLE)
         if self.answer is None or solved.all():
             self._held = np.zeros_like(solved)
-            self._begun, self._plan, u = np.full(len(solved), now), None, answer.u
+            self._begun, self._plan = np.full(len(solved), now), None
+            u = self._made(answer).mean(now, self.period) if self._free else answer.u
         else:
             before = self.plan
             assert before is not None
             self._held, self._begun = ~solved, np.where(solved, now, self._begun)
             self._plan = _mixed(solved, self._made(answer), before)
-            u = self._plan.at(now, state).u
+            u = self._plan.mean(now, self.period, state) if self._free else self._plan.at(now, state).u
         self.t, self.answer, self._u = now, answer, u
         return u[0].clone() if state.ndim == 1 and len(u) == 1 else u.clone()
 
     def _made(self, answer: Answer) -> Plan:
         problem = self.compiled.problem
-        return Plan(answer.X, answer.U, answer.K, self._begun, self.dt, problem.dynamics, problem.control_bounds)
+        parts = answer.X, answer.U, answer.K, self._begun, self.dt, problem.dynamics, problem.control_bounds
+        return Plan(*parts, answer.t)
 
     def _measured(self, x: Any) -> np.ndarray:
         state, (B, n) = as_floats(x, "x"), self._problem.x0.shape
@@ -195,7 +205,8 @@ def _mixed(new: np.ndarray, plan: Plan, before: Plan) -> Plan:
         torch.where(rows.view(-1, *[1] * (a.dim() - 1)), a, b)
         for a, b in ((plan.X, before.X), (plan.U, before.U), (plan.K, before.K))
     )
-    return replace(plan, X=X, U=U, K=K, start=np.where(new, plan.start, before.start))
+    knots = None if plan.knots is None else torch.where(rows.unsqueeze(-1), plan.knots, before.knots)  # type: ignore[arg-type]
+    return replace(plan, X=X, U=U, K=K, start=np.where(new, plan.start, before.start), knots=knots)
 
 
 def _follows(part: Any) -> bool:

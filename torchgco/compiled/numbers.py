@@ -24,6 +24,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.norms import Cone, NormBounds
+from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
@@ -179,6 +180,7 @@ def with_own_numbers(problem: Problem) -> Problem:
             object.__setattr__(cost, name, part.expand(B, length, part.shape[-1]).clone())
     rows = tuple(_own(part, B) for part in problem.constraints)
     parts = {"x0": problem.x0.clone(), "dynamics": _own(problem.dynamics, B), "cost": cost, "constraints": rows}
+    parts["time"] = _own(problem.time, B)
     if problem.goal is not None and problem.goal.required:
         parts["goal"] = _goal_of(rows[-1], problem)
     return problem._with(parts)
@@ -226,7 +228,7 @@ def numbers_of(problem: Problem) -> list[Number]:
 def with_numbers_as_they_are(problem: Problem) -> Problem:
     """The same problems after numbers were written, with nothing that was computed from the previous ones."""
     constraints = tuple(_renewed(part) for part in problem.constraints)
-    known = replace(problem.known, row_shapes=None, interior=None, packed={}, cost=(None, 0, None))
+    known = replace(problem.known, row_shapes=None, interior=None, packed={}, cost=(None, 0, None), lifted={})
     now = problem._with({"constraints": constraints}, known)
     if now.goal is None or now.goal.assumed:
         dims = now._dimensions(now.x0)
@@ -260,10 +262,12 @@ def _own(part: Any, B: int) -> Any:
 
 
 def _of_cost(problem: Problem) -> list[Number]:
-    cost = problem.cost
+    cost, after = problem.cost, None
+    if isinstance(cost, QuadraticInFreeTime):
+        cost, after = cost.cost, cost.write
     if type(cost) is not BoundQuadratic:
         return _of_part(cost, "cost", "cost")
-    found = [Number("cost.x_ref", (_view(cost.x_ref), _view(cost.xf_ref)), "cost", False, _finite)]
+    found = [Number("cost.x_ref", (_view(cost.x_ref), _view(cost.xf_ref)), "cost", False, _finite, after)]
     for name in ("u_ref", *WEIGHTS, "q", "r", "qf", "H"):
         tensor = getattr(cost, name)
         if tensor is not None:

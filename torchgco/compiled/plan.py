@@ -36,6 +36,7 @@ class Plan:
         dt: of a stage, s.
         dynamics: lead from knot to knot.
         bounds: that controls with feedback keep; None: none.
+        knots: times of the knots from `start` on, (B, N+1), s, where the time is free; None: dt apart.
     """
 
     X: Tensor
@@ -45,11 +46,13 @@ class Plan:
     dt: float
     dynamics: Dynamics
     bounds: ControlBounds | None
+    knots: Tensor | None = None
 
     @property
     def t(self) -> Tensor:
         """Times of the knots, (B, N+1), s."""
-        return torch.from_numpy(self.start[:, None] + self.dt * np.arange(self.X.shape[1]))
+        from_start = self.dt * np.arange(self.X.shape[1]) if self.knots is None else self.knots.numpy()
+        return torch.from_numpy(self.start[:, None] + from_start)
 
     @property
     def end(self) -> Tensor:
@@ -74,20 +77,46 @@ class Plan:
         with computing_on(CPU):
             return self._at(t, None if x is None else self._states(x))
 
-    def _at(self, t: float, given: Tensor | None) -> Instant:
+    def mean(self, t: float, seconds: float, x: Any = None) -> Tensor:
+        """The mean controls (B, m) from a time on, s, for so many seconds; x as in `at`.
+
+        Where the time is free, stages may be shorter than the period for which a vehicle holds its controls.
+        """
+        with computing_on(CPU):
+            knots = self.t.numpy()
+            last = np.maximum(knots[:, -1:], t + seconds)  # after the end the last control holds
+            knots = np.concatenate((np.minimum(knots[:, :1], t), knots[:, 1:-1], last), axis=1)
+            within = np.clip(knots, t, t + seconds)
+            shares = torch.from_numpy(np.diff(within, axis=1) / seconds)
+            return self._at(t, None if x is None else self._states(x), (shares.unsqueeze(1) @ self.U).squeeze(1)).u
+
+    def _at(self, t: float, given: Tensor | None, u: Tensor | None = None) -> Instant:
+        """`at`; with other controls u (B, m) than those of the stage, where they are given."""
         B, N, m = self.U.shape
-        stages = np.clip((t - self.start) / self.dt, 0.0, N)
+        stages = self._stages(t)
         k = np.minimum(np.floor(stages + KNOT_ROUNDING), N - 1).astype(int)
         share = np.clip(stages - k, 0.0, 1.0)
         share[share < KNOT_ROUNDING] = 0.0
-        states, rows = self._states_at(k, share), torch.arange(B)
-        u = self.U[rows, k].clone()
+        rows = torch.arange(B)
+        states = self._states_at(k, share)
+        u = self.U[rows, k].clone() if u is None else u
         if given is not None:
             u += (self.K[rows, k] @ (given - states).unsqueeze(-1)).squeeze(-1)
             if self.bounds is not None:
                 lower, upper = (bound.expand(B, N, m)[rows, k] for bound in self.bounds.over(N))
                 u = torch.minimum(torch.maximum(u, lower), upper)
         return Instant(states, u)
+
+    def _stages(self, t: float) -> np.ndarray:
+        """How many stages are over at a time, s, (B,) from 0 to N."""
+        N = self.U.shape[1]
+        if self.knots is None:
+            return np.asarray(np.clip((t - self.start) / self.dt, 0.0, N))
+        over = []
+        for since, knots in zip(t - self.start, self.knots.numpy(), strict=True):
+            k = int(np.clip(np.searchsorted(knots, since, side="right") - 1, 0, N - 1))
+            over.append(k + np.clip((since - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0))
+        return np.array(over)
 
     def _states(self, x: Any) -> Tensor:
         B, _, n = self.X.shape
@@ -98,10 +127,12 @@ class Plan:
 
     def _states_at(self, k: np.ndarray, share: np.ndarray) -> Tensor:
         """The states (B, n) after shares (B,) of the stages k (B,)."""
-        states = self.X[torch.arange(len(k)), k].clone()
-        for stage, part in sorted(set(zip(k.tolist(), share.tolist(), strict=True))):
+        rows = torch.arange(len(k))
+        states = self.X[rows, k].clone()
+        lengths = np.full(len(k), self.dt) if self.knots is None else self.knots.diff(dim=1)[rows, k].numpy()
+        for stage, part, length in sorted(set(zip(k.tolist(), share.tolist(), lengths.tolist(), strict=True))):
             if part > 0:
-                at = torch.tensor([stage]), self.X.new_tensor([part * self.dt]), self.X.new_tensor([self.dt])
-                rows = torch.from_numpy((k == stage) & (share == part))
-                states[rows] = between(self.dynamics, self.X, self.U, *at)[rows, 0]
-        return states
+                at = torch.tensor([stage]), self.X.new_tensor([part * length]), self.X.new_tensor([length])
+                some = torch.from_numpy((k == stage) & (share == part) & (lengths == length))
+                states[some] = between(self.dynamics, self.X, self.U, *at)[some, 0]
+        return states if self.knots is None else self.dynamics.settled(states)

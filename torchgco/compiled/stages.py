@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.constraints.bounds import RateBounds
 from torchgco.constraints.gates import has_gates
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.problem import Problem
@@ -20,14 +21,35 @@ def stage_of(problem: Problem) -> float:
     Raises:
         InputError: dynamics without a time step, or with several, a free time, or gates.
     """
-    if has_gates(problem):
-        raise InputError("problem", "one without Gates in a loop, whose plans begin again at their knot 0", "Gates")
+    _check_no_gates(problem)
     if problem.time is not None:
         raise InputError("problem", "one of fixed times in a loop", "a free time")
     lengths = times(problem).diff()
     if not torch.allclose(lengths, lengths.flatten()[0], rtol=1e-9):
         raise InputError("dynamics.dt", "stages of one length in a loop", "several")
     return float(lengths.flatten()[0])
+
+
+def check_loop_in_free_time(problem: Problem, period: float) -> None:
+    """Refuse, in one line each, what a loop in free time doesn't serve.
+
+    Raises:
+        InputError: gates; a shortest duration below the period; bounds on rates from the controls before.
+    """
+    time, dt = problem.time, problem.dynamics.dt
+    assert time is not None
+    _check_no_gates(problem)
+    shortest = dt * time.least[:, time.of_stages(problem.N)].sum(-1)
+    if bool((shortest < period * (1.0 - STAGE_ROUNDING)).any()):
+        raise InputError("time.least", f"a shortest duration of at least a period, {period:g} s", float(shortest.min()))
+    if any(isinstance(part, RateBounds) and part.previous is not None for part in problem.constraints):
+        expected = "None in a loop in free time, whose stages aren't its periods"
+        raise InputError("rate_bounds.previous", expected, "controls")
+
+
+def _check_no_gates(problem: Problem) -> None:
+    if has_gates(problem):
+        raise InputError("problem", "one without Gates in a loop, whose plans begin again at their knot 0", "Gates")
 
 
 def stages_between(count: float) -> float:

@@ -105,6 +105,8 @@ class WrappedConstraint(Constraint):
 
     constraint: Constraint
 
+    keeps_rows: ClassVar[bool] = False  # whether rows, and by how much they are violated, are those of the other one
+
     sense, geometric, knots = passed_on("constraint", "sense", "geometric", "knots")
     bare, row_radii = passed_on("constraint", "bare", "row_radii")
     calls_function = property(lambda self: is_users(self.constraint))

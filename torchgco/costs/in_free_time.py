@@ -34,12 +34,13 @@ class QuadraticInFreeTime(WrappedCost):
     @classmethod
     def of(cls, cost: Any) -> QuadraticInFreeTime | None:
         """That of a BoundQuadratic; None where no reference of states differs from stage to stage."""
-        rests = (cost.x_ref == cost.x_ref[:, :1]).flatten(1).all(-1)
-        if bool(rests.all()):
-            return None
-        rows = torch.cat((cost.x_ref, cost.xf_ref.unsqueeze(1)), dim=1)
-        still = cost.x_ref[:, :1].expand_as(rows)
-        return cls(cost, torch.where(rests.view(-1, 1, 1), still, coefficients(rows)), rests)
+        along, rests = _read(cost)
+        return None if bool(rests.all()) else cls(cost, along, rests)
+
+    def write(self) -> None:
+        """Read the references of `cost` as they are, in this memory."""
+        for own, new in zip((self.along, self.rests), _read(self.cost), strict=True):
+            own.copy_(new)
 
     @property
     def of_errors(self) -> Cost:
@@ -73,6 +74,14 @@ class QuadraticInFreeTime(WrappedCost):
         places = torch.arange(-1, last + 2, dtype=s.dtype, device=s.device)
         weights = bump(within.unsqueeze(-1) - places).unsqueeze(-1)
         return (weights * _spread(c, s, 2)).sum(-2) + (s - within).unsqueeze(-1) * ahead
+
+
+def _read(cost: Any) -> tuple[Tensor, Tensor]:
+    """The fields `along` and `rests` of a BoundQuadratic."""
+    rests = (cost.x_ref == cost.x_ref[:, :1]).flatten(1).all(-1)
+    rows = torch.cat((cost.x_ref, cost.xf_ref.unsqueeze(1)), dim=1)
+    still = cost.x_ref[:, :1].expand_as(rows)
+    return torch.where(rests.view(-1, 1, 1), still, coefficients(rows)), rests
 
 
 def bump(t: Tensor) -> Tensor:

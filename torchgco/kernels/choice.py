@@ -106,7 +106,7 @@ def _engine(problem: Problem) -> Engine:
         return Engine(problem, ahead)
     key = before.key, find_compiler()
     known = _engines.pop(key, None)
-    if known is not None and (shared := known[0].captured.read()) is not None:
+    if known is not None and known[1].hold and (shared := known[0].captured.read()) is not None:
         _engines[key] = known  # the most recent one is the last
         return known[0].with_shared(shared.copy())
     engine, after = Engine(problem, ahead), signature(problem)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
-from torchgco.constraints.base import Constraint, innermost
+from torchgco.constraints.base import Constraint, WrappedConstraint, innermost
 from torchgco.constraints.norms import NormBounds
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
@@ -387,6 +387,8 @@ def _measured(part: Constraint) -> bool:
     """Whether violations are what the base class says of rows, or C finds them from these."""
     if part.row_radii is not None:
         return type(innermost(part)).violation in (NormBounds.violation, SpheresInFreeTime.violation)
+    while isinstance(part, WrappedConstraint) and part.keeps_rows:
+        part = part.constraint
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
 
 

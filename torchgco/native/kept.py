@@ -53,7 +53,8 @@ class Kept(KeptProblem):
         self._follow = self.packed.copy()
         self._follow.fill({"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst})
         ends = {name: like.new_zeros(B) for name in ("error", "theta", "falls")}
-        self.how = c.Interior.complete(of=self.packed, barrier=self.barrier, free_start=None, **ends, **options)
+        free = None if problem.free_start is None else problem.free_start.double().contiguous()
+        self.how = c.Interior.complete(of=self.packed, barrier=self.barrier, free_start=free, **ends, **options)
 
     def solve(self, rows: np.ndarray, mu: float, **options: float) -> None:
         """Solve the problems that `rows` (B,) marks, from X, U and `lam`, in place, with `mu` as the first barrier.
@@ -84,6 +85,22 @@ class Kept(KeptProblem):
         """Take over the iterates of another one of the same shapes."""
         for own, its in zip(self._moving, other._moving, strict=True):
             own[:] = its
+
+    def take_over(self, rows: Tensor, found: Any) -> None:
+        """Put the states, controls and multipliers of solutions in the places `rows` (b,)."""
+        self.X[rows], self.U[rows] = found.X, found.U
+        for lam, own in zip(self.lam, found.multipliers.lam, strict=True):
+            lam[rows] = own
+
+    @property
+    def times(self) -> Tensor | None:
+        """Of the knots, (B, N+1), s, where they are free; else None."""
+        return None
+
+    @property
+    def multipliers(self) -> tuple[Tensor, ...]:
+        """Copies of `lam`."""
+        return tuple(lam.clone() for lam in self.lam)
 
     @property
     def finite(self) -> np.ndarray:

@@ -347,6 +347,7 @@ class _Rows(WrappedConstraint):
     m: int
 
     batched: ClassVar[tuple[str, ...]] = ("constraint",)
+    keeps_rows: ClassVar[bool] = True
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self.constraint.value(X[..., : self.n], U[..., : self.m])

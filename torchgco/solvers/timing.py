@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import torch
@@ -20,6 +21,7 @@ from torch import Tensor
 from torchgco.base.errors import NAMED, HorizonWarning
 from torchgco.base.status import Status
 from torchgco.base.tree import put, spread, take
+from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import WrappedCost
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
@@ -76,20 +78,47 @@ class Timed:
     def __init__(self, chooser: Chooser, problem: Problem, call: Any) -> None:
         self.chooser, self.problem, self.call = chooser, problem, call
         assert problem.time is not None
-        self.time, line = problem.time, straight_line(problem)
-        legs, U, N = Legs.of(problem, line[:, -1]), call.U0[..., : problem.m], problem.N
-        steering = LinearTime(problem, line if legs is None else _to_the_farthest(problem, line, legs))
-        estimate = steering.factors().unsqueeze(-1)
-        if legs is not None:
-            each = legs.stage_factors(torch.where(estimate.isnan(), 1.0, estimate), N)
-            of_stages = torch.nn.functional.one_hot(self.time.of_stages(N), self.time.count).to(each)
-            estimate = each @ of_stages / of_stages.sum(0)
-        own = HELD_FIRST * torch.where(estimate.isnan(), 1.0, estimate)
-        self.own = own.clamp(self.time.least, self.time.most)
-        self.first = self._first(estimate)
-        X, U = (line, U) if call.X0 is not None or legs is not None else steering.guess(self.first.amax(-1), U)
-        self.X, self.U, self.through_gates = X, U, legs is not None  # of the user's problem
+        self.time = problem.time
+        self.through_gates = gates_of(problem) is not None and problem.dynamics.position is not None
+        self.first = self._first()
         self.best: Solution | None = None
+
+    @cached_property
+    def _line(self) -> Tensor:
+        return straight_line(self.problem)
+
+    @cached_property
+    def _legs(self) -> Legs | None:
+        return Legs.of(self.problem, self._line[:, -1])
+
+    @cached_property
+    def _steering(self) -> LinearTime:
+        line, legs = self._line, self._legs
+        return LinearTime(self.problem, line if legs is None else _to_the_farthest(self.problem, line, legs))
+
+    @cached_property
+    def _estimate(self) -> Tensor:
+        """The factors (B, 1 or S) of the linear model, perhaps NaN: calls with states and times need none at first."""
+        estimate, legs, time, N = self._steering.factors().unsqueeze(-1), self._legs, self.time, self.problem.N
+        if legs is None:
+            return estimate
+        each = legs.stage_factors(torch.where(estimate.isnan(), 1.0, estimate), N)
+        of_stages = torch.nn.functional.one_hot(time.of_stages(N), time.count).to(each)
+        return each @ of_stages / of_stages.sum(0)
+
+    @cached_property
+    def own(self) -> Tensor:
+        """`HELD_FIRST` times the estimate, within the bounds, (B, S)."""
+        own = HELD_FIRST * torch.where(self._estimate.isnan(), 1.0, self._estimate)
+        return own.clamp(self.time.least, self.time.most)
+
+    @cached_property
+    def _guess(self) -> tuple[Tensor, Tensor]:
+        """States and controls of the user's problem to begin with."""
+        U = self.call.U0[..., : self.problem.m]
+        if self.call.X0 is not None or self.through_gates:
+            return self._line, U
+        return self._steering.guess(self.first.amax(-1), U)
 
     def run(self) -> Solution:
         """Solve at longer and longer times; see the module."""
@@ -113,8 +142,8 @@ class Timed:
         self._again()
         return self._found
 
-    def _first(self, estimate: Tensor) -> Tensor:
-        """The factors (B, S) to begin with: the guess, or `HELD_FIRST` times the estimate (B, 1 or S), perhaps NaN.
+    def _first(self) -> Tensor:
+        """The factors (B, S) to begin with: the guess, or `own`.
 
         A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end; beside
         states to begin with it counts all the same.
@@ -122,7 +151,7 @@ class Timed:
         guess = self.time.guess
         if guess is None:
             return self.own
-        return guess if self.call.X0 is not None else torch.where(guess < estimate, self.own, guess)
+        return guess if self.call.X0 is not None else torch.where(guess < self._estimate, self.own, guess)
 
     @property
     def _found(self) -> Solution:
@@ -211,7 +240,7 @@ class Timed:
     def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Any:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
         call, user, n = self.call.take(rows), self.problem.take(rows), self.problem.n
-        X, U = (call.X0, call.U0) if given and call.X0 is not None else (self.X[rows], self.U[rows])
+        X, U = (call.X0, call.U0) if given and call.X0 is not None else (part[rows] for part in self._guess)
         X, U = states_in_time(user, X[..., :n], U[..., : user.m], guess)
         x0 = call.problem.x0.clone()
         x0[:, n] = guess[:, 0]

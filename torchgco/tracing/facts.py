@@ -81,6 +81,7 @@ class Facts:
         self._modules: list[types.ModuleType] = []
         self._libraries: list[Any] = [Tensor]
         self._tensors: dict[int, Tensor] = {}
+        self._contents: dict[int, tuple[Tensor, bytes]] = {}
         self._memory: list[tuple[int, int]] = []
         try:
             for root in roots:
@@ -96,9 +97,14 @@ class Facts:
 
     def know(self, tensor: Tensor) -> bool:
         """Whether the facts would differ if another tensor stood in this one's place."""
-        if id(tensor) in self._tensors:
+        if id(tensor) in self._tensors or id(tensor) in self._contents:
             return True
         return tensor.device.type == "cpu" and any(a <= tensor.data_ptr() < b for a, b in self._memory)
+
+    @property
+    def hold(self) -> bool:
+        """Whether the tensors that the key has by content have it still: a trace reads those that it has met."""
+        return all(_bytes(tensor) == content for tensor, content in self._contents.values())
 
     def walk(self, thing: Any) -> None:
         kind = type(thing)
@@ -337,7 +343,9 @@ class Facts:
             if name in own:
                 self._form(value)
             elif of_torchgco and isinstance(value, Tensor) and value.numel() <= COMPARED_NUMBERS:
-                self.note(value.dtype, value.shape, value.detach().cpu().contiguous().numpy().tobytes())
+                content = _bytes(value)
+                self._contents[id(value)] = value, content
+                self.note(value.dtype, value.shape, content)
             else:
                 self.walk(value)
 
@@ -351,6 +359,10 @@ class Facts:
             self.note(value.dtype, value.dim(), value.shape[1:], value.shape[:1] == (1,))
         else:
             self.walk(value)
+
+
+def _bytes(tensor: Tensor) -> bytes:
+    return tensor.detach().cpu().contiguous().numpy().tobytes()
 
 
 def _surroundings() -> tuple[Hashable, ...]:

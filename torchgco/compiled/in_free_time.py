@@ -1,0 +1,211 @@
+"""Compiled problems with a free time: what stays packed, numbers that have another form there, and later guesses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.compiled.numbers import Floats, Number
+from torchgco.constraints.bounds import RateBounds
+from torchgco.costs.function import FunctionCost
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.kernels import cost_unit, current, interior_of
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.native.interior import InteriorEngine
+from torchgco.native.kept import Kept
+from torchgco.problem.elapsed import Elapsed
+from torchgco.problem.in_time import factors_in, factors_of, in_time, states_in_time, times_of
+from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.tracing import own_tensors
+
+
+class KeptInTime(Kept):
+    """Kept problems with a free time: in the form `in_time` and, as in solves with a choice of time, in units of cost.
+
+    Args:
+        kernels: of this form.
+        user: the problems, whose tensors are written to.
+        whole: the same `in_time`.
+        options: see `Kept`.
+    """
+
+    def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, **options: Any) -> None:
+        self.user, self.whole, self.unit = user, whole, cost_unit(whole)
+        super().__init__(kernels, whole.in_cost_units(), **options)
+        self._given = user.x0.numpy()
+        pairs = zip(user.constraints, whole.constraints, strict=False)
+        self._copied_parts = {i for i, (a, b) in enumerate(pairs) if isinstance(a, RateBounds) or _differ(a, b)}
+
+    @property
+    def times(self) -> Tensor:
+        """Of the knots of `rolled`, (B, N+1), s."""
+        return times_of(self.user, factors_in(self.user, self.rolled[0]))
+
+    @property
+    def multipliers(self) -> tuple[Tensor, ...]:
+        """Copies of those of the user's rows, (B, K, p)."""
+        return tuple(self.unit.view(-1, 1, 1) * lam for lam in self.lam[: len(self.user.constraints)])
+
+    def copies(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """See `Kept`: those of the user's states and controls."""
+        (X, U, K, status, iterations), n, m = super().copies(), self.user.n, self.user.m
+        return X[..., :n].contiguous(), U[..., :m].contiguous(), K[..., :m, :n].contiguous(), status, iterations
+
+    def start(self) -> None:
+        """See `Kept`; the factors of time stay as they are."""
+        n, first = self.user.n, self._moving[0][:, 0]
+        self._x0[:, :n] = first[:, :n] = self._given
+        first[:, n + 1 :] = self._x0[:, n + 1 :]
+
+    def shift(self, by: float) -> None:
+        """Let all trajectories and multipliers begin `by` seconds later; see `Elapsed`."""
+        if by == 0:
+            return
+        user, count = self.user, len(self.user.constraints)
+        factors = factors_in(user, self.X)
+        at = Elapsed.of(user, factors, by)
+        X = at.states(self.X[..., : user.n])
+        U = at.controls(self.U[..., : user.m], times_of(user, factors).diff(dim=1))
+        lam = at.multipliers(self.lam[:count], self._knots[2 : 2 + count])
+        for own, new in zip((self.X, self.U, *self.lam), (*states_in_time(user, X, U, at.factors), *lam), strict=False):
+            own.copy_(new)
+
+    def take_over(self, rows: Tensor, found: Solution) -> None:
+        """See `Kept`."""
+        user = self.user.take(rows)
+        assert found.times is not None
+        self.X[rows], self.U[rows] = states_in_time(user, found.X, found.U, factors_of(user, found.times))
+        for lam in self.lam:
+            lam[rows] = 0.0
+        for lam, own in zip(self.lam, found.multipliers.scaled(1.0 / self.unit[rows]).lam, strict=False):
+            lam[rows] = own
+
+    def read(self, changed: set[str | int], now: Problem) -> set[str | int]:
+        """Put numbers of the user's parts that have changed where the form `in_time` has copies of them.
+
+        Args:
+            now: the user's problems with their numbers as they are.
+
+        Returns:
+            the parts whose numbers C has to read again.
+        """
+        places = sorted(self._copied_parts.intersection(changed))
+        if not places and "time" not in changed:
+            return changed
+        new, n = in_time(now), self.user.n
+        self._x0[:, n + 1 :] = new.x0[:, n + 1 :].numpy()  # controls before
+        if "time" in changed:
+            _copy(self.whole.cost, new.cost)
+            places += range(len(self.user.constraints), len(new.constraints))
+            changed = changed.union({"cost"}, places)
+        for i in places:
+            _copy(self.whole.constraints[i], new.constraints[i])
+        return changed
+
+
+def kept_in_time(problem: Problem, options: Any) -> KeptInTime | None:
+    """Problems with a free time, packed; None where C can't serve them.
+
+    Args:
+        options: gives the options of `Kept` for a problem.
+    """
+    whole = current(in_time(problem))
+    kernels = interior_of(whole)
+    if not isinstance(kernels, InteriorEngine) or kernels.engine.captured.reads_own:
+        return None
+    return KeptInTime(kernels, problem, whole, **options(whole))
+
+
+def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:
+    """The numbers of a problem with a free time: those of the problem, of the time, and checks of what is by stage."""
+    time, cost = problem.time, problem.cost
+    assert time is not None
+    by_stage = set[str]()
+    if type(cost) is BoundQuadratic:
+        names = "x_ref", "u_ref", "Q", "R", "q", "r", "H"
+        by_stage = {name for name in names if (part := getattr(cost, name)) is not None and part.shape[1] > 1}
+    elif isinstance(cost, FunctionCost):
+        by_stage = set(cost.values.knot_names)
+    for number in found:
+        if number.part == "cost" and number.name.rpartition(".")[2] in by_stage:
+            number.check = partial(_steady, number, problem.N, number.check)
+    names = [name for name in ("least", "most", "weight", "guess") if getattr(time, name) is not None]
+    views = {name: getattr(time, name).numpy() for name in names}
+    joint = partial(_crossed, views)
+    checks = {"weight": _at_least_0}
+    return found + [
+        Number(f"time.{name}", (view,), "time", True, checks.get(name, _above_0), None, joint)
+        for name, view in views.items()
+    ]
+
+
+def later(problem: Problem, last: Solution, shift: float) -> Solution:
+    """A guess for a horizon that begins so many stages, or seconds, later; parts of one as `Kept.shift` takes them."""
+    if problem.time is not None:
+        return _later_in_time(problem, last, shift)
+    whole = int(shift)
+    guess, part = last.shifted(whole) if whole else last, shift - whole
+    if part == 0:
+        return guess
+    one = guess.shifted()
+    X, U, K, d = (torch.lerp(getattr(guess, name), getattr(one, name), part) for name in ("X", "U", "K", "d"))
+    lam = tuple(torch.lerp(*pair, part) for pair in zip(guess.multipliers.lam, one.multipliers.lam, strict=True))
+    return replace(one, X=X, U=U, K=K, d=d, multipliers=Multipliers(lam, guess.multipliers.mu))
+
+
+def _later_in_time(problem: Problem, last: Solution, seconds: float) -> Solution:
+    """A guess for problems with a free time, so many seconds after the solution `last` began."""
+    assert last.times is not None
+    factors, knots = factors_of(problem, last.times), torch.arange(problem.N + 1)
+    at = Elapsed.of(problem, factors, seconds)
+    rows = [knots[part.knots].tolist() for part in problem.constraints]
+    lam = at.multipliers(last.multipliers.lam, rows)
+    X, U = at.states(last.X), at.controls(last.U, last.times.diff(dim=1))
+    multipliers = Multipliers(lam, last.multipliers.mu)
+    return replace(last, X=X, U=U, multipliers=multipliers, times=times_of(problem, at.factors), needed=None)
+
+
+def _differ(own: Any, lifted: Any) -> bool:
+    """Whether a part has numbers that its form in free time has copies of."""
+    there = {part.data_ptr() for part in own_tensors(lifted)}
+    return any(part.data_ptr() not in there for part in own_tensors(own))
+
+
+def _copy(old: Any, new: Any) -> None:
+    for there, here in zip(own_tensors(old), own_tensors(new), strict=True):
+        if there.data_ptr() != here.data_ptr():
+            there.copy_(here)
+
+
+def _steady(number: Number, N: int, check: Any, new: Floats) -> tuple[str, Any] | None:
+    """What is wrong with numbers by stage, which are the same at all stages where the time is free."""
+    rows = np.moveaxis(new, new.ndim - len(number.shape) + 1, 0)[:N]
+    if len(rows) > 1 and not (rows == rows[0]).all():
+        return "the same at all stages, as when it was compiled, where the time is free", "others"
+    return check(new)  # type: ignore[no-any-return]
+
+
+def _above_0(new: Floats) -> tuple[str, Any] | None:
+    good = np.isfinite(new).all() and (new > 0).all()
+    return None if good else ("factors of N dt above 0", new.tolist())
+
+
+def _at_least_0(new: Floats) -> tuple[str, Any] | None:
+    good = np.isfinite(new).all() and (new >= 0).all()
+    return None if good else ("a cost per second of at least 0", new.tolist())
+
+
+def _crossed(views: dict[str, Floats], new: Any) -> tuple[str, Any] | None:
+    own = {name: new.get(f"time.{name}", view) for name, view in views.items()}
+    inner: Sequence[Floats] = [own["guess"]] if "guess" in own else []
+    for low, high in zip([own["least"], *inner], [*inner, own["most"]], strict=True):
+        if (low > high).any():
+            return "time.least at most time.guess and time.most", f"{low[low > high][0]:g} and {high[low > high][0]:g}"
+    return None
