@@ -80,7 +80,7 @@ def saturation(ours: Ours) -> list[float]:
 def reference(part: str) -> str:
     """What the tracker follows at the knots of a plan with different values everywhere."""
     X = torch.arange(42, dtype=torch.float64).view(1, 3, 14)
-    rates, acceleration = Reference(X, 0.05, Airframe()).at(0.05 * torch.arange(3, dtype=torch.float64))
+    rates, acceleration = Reference(X, 0.05, Airframe()).at(0.0, 0.05, 3)
     followed, planned = (rates, X[..., RATES]) if part == "w" else (acceleration, X[..., THRUST])
     return "optimal states in path planning" if torch.allclose(followed, planned) else "others"
 
