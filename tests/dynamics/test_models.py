@@ -220,6 +220,8 @@ def test_parameters_per_problem() -> None:
         (lambda: Unicycle(integrator="heun"), "unicycle.integrator"),
         (lambda: Airframe(mass=-1.0), "airframe.mass"),
         (lambda: Airframe(thrust_min=7.0), "airframe.thrust_min"),
+        (lambda: Airframe(thrust_min=4.0), "airframe.thrust_min"),
+        (lambda: Airframe(thrust_max=3.9), "airframe.thrust_max"),
     ],
 )
 def test_bad_parameters_are_named(make, field) -> None:

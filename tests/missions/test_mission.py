@@ -1,6 +1,6 @@
 """Missions: how they end, the batch contract in closed loop, latency, moving spheres, and bad input."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -298,6 +298,19 @@ def test_a_plant_of_another_airframe_than_the_planned_one_is_refused() -> None:
         mission(plant=RotorPlant(Airframe(mass=1.2, arm=0.2))).fly(far())
     errors = RotorPlant(mass_error=0.1, thrust_error=-0.1, drag=0.1)  # deviations, not another vehicle
     assert mission(plant=errors, duration=0.05).fly(far()).x.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("answer", "got"), [(lambda x: x.numpy(), "ndarray"), (lambda x: x[:, :13], r"\(1, 13\)")], ids=["numpy", "short"]
+)
+def test_what_a_plant_of_ones_own_returns_is_checked(answer: Callable[[Tensor], Any], got: str) -> None:
+    @dataclass(frozen=True)
+    class Own(RotorPlant):
+        def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Any:
+            return answer(x)
+
+    with pytest.raises(InputError, match=rf"plant.advance: expected .*1, 17.*, got {got}"):
+        mission(plant=Own(), duration=0.05).fly(far())
 
 
 @pytest.mark.slow

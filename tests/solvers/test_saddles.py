@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import chain, repeat
+
 import pytest
 import torch
 from torch import Tensor
 
 import torchgco
 from tests.engines import compiled
-from torchgco import ControlBounds, FunctionCost, FunctionDynamics, Problem, Status
+from torchgco import ControlBounds, FunctionCost, FunctionDynamics, InteriorPoint, Problem, Status
 from torchgco.kernels import use_native
+from torchgco.solvers.contracts import Call
 
 D = torch.float64
 CART = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1)
@@ -52,3 +55,14 @@ def test_a_solve_leaves_points_from_which_the_cost_falls(name: str, native: bool
         use_native(True)
     assert found.statuses == [Status.CONVERGED] * 2 and bool((found.cost < known).all())
     assert torch.equal(found.U[1], alone.U[0]), "the same bits alone and in a batch"
+
+
+def test_where_no_time_is_left_to_leave_one_the_solve_is_late(monkeypatch) -> None:
+    """A first solve in time, and none from beside it."""
+    late = chain([False], repeat(True))
+    monkeypatch.setattr(Call, "late", property(lambda _: next(late)))
+    model, most, N, *_, cost = PROBLEMS["hanging pendulum"]
+    problem = Problem(model, cost, [ControlBounds(-most, most)], torch.zeros(1, 2, dtype=D), N)
+    call = Call.checked(problem, torch.zeros(1, N, problem.m, dtype=D))
+    end = InteriorPoint().solved(call, escapes=True)
+    assert Status(int(end.status)) is Status.TIME_LIMIT and not bool(end.best.U.any())

@@ -37,7 +37,8 @@ class Airframe:
     Command lines and configurations call it `vehicle`: `vehicle.mass=1.2`, `vehicle=crazyflie`.
 
     Raises:
-        InputError: a field out of its range or of another kind, thrust limits crossed, an inertia that can't be.
+        InputError: a field out of its range or of another kind, thrust limits crossed or between which no rotor hovers,
+            an inertia that can't be.
     """
 
     mass: Annotated[float, Above(0, "kg")] = 1.608
@@ -65,6 +66,11 @@ class Airframe:
             raise InputError("airframe.inertia", "a symmetric, positive definite matrix in kg m^2", self.inertia)
         if not self.thrust_min < self.thrust_max:
             raise InputError("airframe.thrust_min", f"less than thrust_max {self.thrust_max}", self.thrust_min)
+        weight = f"than a quarter of the weight, {self.hover_thrust:.4g} N"
+        if self.thrust_min >= self.hover_thrust:
+            raise InputError("airframe.thrust_min", f"less {weight}", self.thrust_min)
+        if self.thrust_max <= self.hover_thrust:
+            raise InputError("airframe.thrust_max", f"more {weight}", self.thrust_max)
 
     def slowed(self, pose: Components, v: Components) -> Components:
         """The rates of `pose_rates` with the drag on the velocity v."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
-from torchgco.base.shapes import CPU, check_tensor, computing_on
+from torchgco.base.shapes import CPU, check_shape, check_tensor, computing_on
 from torchgco.base.tree import take
 from torchgco.constraints.gates import has_gates
 from torchgco.dynamics.base import Dynamics
@@ -327,6 +327,7 @@ class Flight:
             tracking = self.mission.tracker.track(seen, reference, j * self.plant.dt, tracking)
             seconds = (time.perf_counter() - began) / self.rows.numel()
             flew, x = ~ended, self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
+            check_shape(x, tuple(self.x.shape), "plant.advance")
             before, self.x = self.x, torch.where(ended.unsqueeze(-1), self.x, x)
             if self.passing is not None:
                 passed = self.passing.after(before[:, :3], self.x[:, :3])

@@ -194,7 +194,10 @@ class InteriorPoint(Solver):
         """Solve again beside the results that `falls` (B,) marks; what costs less takes their place in `end`."""
         for share in SADDLE_STEPS:
             rows = falls.nonzero().flatten()
-            if rows.numel() == 0 or call.late:
+            if rows.numel() == 0:
+                return
+            if call.late:
+                end.status[rows] = Status.TIME_LIMIT
                 return
             old, part = take(end.best, rows), call.take(rows)
             part = replace(part, U0=_beside(part.problem, old.U, share), warm=None, X0=None, callback=None)

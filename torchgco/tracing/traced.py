@@ -50,11 +50,10 @@ class Traced:
         own: tensors, objects that nothing else holds (`base.tree.apart`), that are treated as one problem's own even
             where all problems of the batch share them: the expressions, and with them the last bits, then don't depend
             on the other problems of the batch.
-        stages: whole numbers that the form of a problem has, and that the function may read: not `outside`.
 
     Attributes:
         looked: whether Python code of the function has read values of tensors, which it may branch on.
-        outside: the tensors that it has read, other than its arguments, `own` and `stages`.
+        outside: the tensors that it has read, other than its arguments and `own`.
         shared: the `shared_numbers` when it was traced.
         pattern: see `shared_numbers`.
         is_mixed: whether numbers that differ between problems depend on `outside` tensors, too.
@@ -66,12 +65,7 @@ class Traced:
     """
 
     def __init__(
-        self,
-        field: str,
-        function: Callable[..., Tensor],
-        *examples: Tensor,
-        own: Sequence[Tensor] = (),
-        stages: Tensor | None = None,
+        self, field: str, function: Callable[..., Tensor], *examples: Tensor, own: Sequence[Tensor] = ()
     ) -> None:
         self.field = field
         self._precision = max((example.dtype for example in examples), key=lambda dtype: torch.finfo(dtype).bits)
@@ -99,8 +93,7 @@ class Traced:
         varying = _followers(self._plain, [self._index, *named])
         self._own = [slot for slot in border if slot in varying]
         outer = [slot for slot in recording.outside if slot not in named]
-        captured = (self._captured[slot] for slot in outer)
-        self.looked, self.outside = recording.looked, [tensor for tensor in captured if tensor is not stages]
+        self.looked, self.outside = recording.looked, [self._captured[slot] for slot in outer]
         read = [slot for slot in outer if slot.dtype.is_floating_point]
         reached = _followers(self._plain, read) - varying
         shared = [slot for slot in border if slot in reached and slot.dtype.is_floating_point]
