@@ -8,16 +8,12 @@ import pytest
 
 from tests.search.gates import CLOSED, PASSES, SHORT, SOLVER, Solve, gates
 from torchgco import AugmentedLagrangian, Solution
-from torchgco.search import passes
 from torchgco.search.candidates import LINE_SEARCH
 
 
 @pytest.fixture
 def solves(monkeypatch) -> Iterator[list[Solve]]:
-    """All local solves made after this fixture, in order; those that refine candidates are left out.
-
-    Samples are never used up: their limit is tested in test_passes.
-    """
+    """All local solves made after this fixture, in order; those that refine candidates are left out."""
     made, iterate = [], AugmentedLagrangian.outer_loop
 
     def noted(self, call, guidance=None, penalty=None, *rest, **options):
@@ -27,7 +23,6 @@ def solves(monkeypatch) -> Iterator[list[Solve]]:
         return end
 
     monkeypatch.setattr(AugmentedLagrangian, "outer_loop", noted)
-    monkeypatch.setattr(passes, "MOST_DRAWS", 100)
     yield made
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from tests.problems import planar_batch
 from tests.search.gates import LOCAL, PASSES, PATHS, SAMPLING, SHORT, gates
@@ -26,8 +25,6 @@ from torchgco import (
     Spheres,
     presets,
 )
-from torchgco.base.draws import DrawKey
-from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.maps import OccupancyGrid
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search import (
@@ -49,9 +46,7 @@ from torchgco.search import (
     Tighten,
     Tube,
 )
-from torchgco.search.passes import MOST_DRAWS
 from torchgco.search.table import TABLE_COLUMNS
-from torchgco.solvers.contracts import Advice
 from torchgco.solvers.interior import InteriorPoint
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
@@ -180,33 +175,6 @@ def test_rows_solve_by_the_interior_point_of_their_table() -> None:
     U0 = problem.x0.new_zeros(1, problem.N, problem.m)
     other = replace(solver, interior=InteriorPoint(tolerance=1e-2))
     assert differ(solver.solve(problem, U0), other.solve(problem, U0))
-
-
-@dataclass
-class Fruitless:
-    """A guidance that attracts every knot to the start, and never replaces an iterate."""
-
-    asked: int = 0
-
-    def suited(self, problem: Problem) -> Fruitless:
-        return self
-
-    def start(self, problem: Problem, X: Tensor) -> GuideRegion:
-        return GuideRegion.inactive(X, X.new_ones(problem.B), problem.position)
-
-    def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
-        self.asked += problem.B
-        region = self.start(problem, X)
-        region.center[:], region.radius[:] = problem.x0[:, None, problem.position], 0.1
-        return Advice(region, U, torch.zeros(problem.B, dtype=torch.bool))
-
-
-def test_samples_without_a_clear_trajectory_are_drawn_no_further() -> None:
-    guidance = Fruitless()
-    local = replace(LOCAL, guidance=guidance, max_outer_iterations=20)
-    solution = Restarts(local, (Solve(), FromSamples("caught", redraws=3))).recording().solve(*gates(6.0))
-    assert solution.search is not None and solution.search.caught is not None
-    assert guidance.asked == MOST_DRAWS * len(solution.search.caught[0]) > 0
 
 
 LONGEST = ((ClearChords, "rounds"),)

@@ -76,10 +76,11 @@ class Best:
         call: Call,
         guidance: Guidance | None = None,
         penalty: Penalty | None = None,
+        guide_first: bool = False,
     ) -> None:
         """One more attempt at the problems in `rows`, by a call for them; the better trajectory is kept."""
         if rows.numel() > 0:
-            self.keep(rows, self.attempt(call, guidance, penalty))
+            self.keep(rows, self.attempt(call, guidance, penalty, guide_first))
 
     def attempt(
         self,
@@ -88,11 +89,10 @@ class Best:
         penalty: Penalty | None = None,
         guide_first: bool = False,
         solver: AugmentedLagrangian | None = None,
-        draws: int | None = None,
     ) -> SolveEnd:
         """A solve with progress and trace of the whole; see `AugmentedLagrangian.outer_loop`. None: by its own."""
         call = replace(call, callback=self._callback(call))
-        return (solver or self.solver).outer_loop(call, guidance, penalty, self.recorder, guide_first, True, draws)
+        return (solver or self.solver).outer_loop(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
         """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""
@@ -192,7 +192,6 @@ class Search:
         self.proposed = torch.zeros_like(call.ids, dtype=torch.bool)  # (B,): whether there was ever a proposal
         # (B,): whether the vehicle has been steered along all paths, so that there is no use in tracking these.
         self.steered = torch.zeros_like(call.ids, dtype=torch.bool)
-        self.drawn = torch.zeros_like(call.ids, dtype=torch.bool)  # (B,): whether the samples of an attempt are used up
         self.rejected = torch.full_like(call.U0[:, 0, 0], torch.nan)  # (B,): mu of the proposals rejected so far
 
     @property

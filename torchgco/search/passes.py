@@ -26,9 +26,6 @@ from torchgco.solvers.caught import StopWhenCaught
 
 ATTRACTED_TO = 0.95  # share of the goal tolerance to which trajectories are attracted
 ATTRACTION = 1e3  # weight of that attraction, in units of cost per radius^4
-# An attempt's draws, at most, without a clear trajectory. Of 97 attempts from samples that arrived, in eleven families,
-# 96 had made at most three draws, and one six.
-MOST_DRAWS = 6
 ATTEMPT_SEED_STEP = 1_000_003  # between the seeds of two attempts
 
 
@@ -158,8 +155,6 @@ class IntoGoal(Row):
 class FromSamples(Row):
     """Attempts from the caught trajectory, guided by samples from the start: the guidance of the local solver.
 
-    An attempt whose draws lead to no clear trajectory ends, and no other is made: these would draw the same again.
-
     Args:
         when: as of `PathProposals`; "unproposed": there was never a proposal.
         redraws: how many attempts start again, each with other random draws; 0: the solve that was stopped goes on,
@@ -188,7 +183,6 @@ class FromSamples(Row):
         """Solve; see the class."""
         for draw in range(1, self.redraws + 1) if self.redraws > 0 else (0,):
             rows = search.rows(self.when)
-            rows = rows[~search.drawn[rows]]
             if draw > 1:
                 search.best.next_attempt()
             if not search.call.late and rows.numel() > 0 and (search.guidance is not None or draw == 0):
@@ -202,9 +196,7 @@ class FromSamples(Row):
             call = replace(call, warm=warm, outer=search.caught.outer[rows])
         else:
             call = replace(call, seed=call.seed + ATTEMPT_SEED_STEP * draw)
-        end = search.best.attempt(call, search.guidance, guide_first=True, draws=MOST_DRAWS)
-        search.drawn[rows] = end.guided >= MOST_DRAWS
-        search.best.keep(rows, end)
+        search.best.improve(rows, call, guidance=search.guidance, guide_first=True)
 
 
 def _goal_region(problem: Problem) -> GuideRegion:

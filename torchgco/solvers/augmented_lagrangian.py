@@ -113,17 +113,14 @@ class AugmentedLagrangian(Solver):
         recorder: Recorder | None = None,
         guide_first: bool = False,
         by_arrival: bool = False,
-        draws: int | None = None,
     ) -> SolveEnd:
         """The solve without its verdict, in the units of the call: with guidance, or with a fixed penalty.
 
         Args:
             guide_first: also call guidance before the first inner solve.
             by_arrival: an iterate that has arrived at a stated goal is preferred to any that hasn't.
-            draws: how often guidance attracts an iterate without replacing it, at most, before the solve ends; None:
-                any number of times.
         """
-        loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival, draws)
+        loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
         run_all(loop, max(1, self.slots or call.problem.B))
         return loop.result
 
@@ -139,7 +136,6 @@ class OuterLoop:
     recorder: Recorder | None
     guide_first: bool
     by_arrival: bool
-    draws: int | None
     stopped: int = 0  # problems that guidance has stopped
     _result: SolveEnd | None = None
     _passes: OuterPasses | None = None  # of the running problems
@@ -322,8 +318,6 @@ class OuterLoop:
             status[rows[advice.stop]] = STOPPED
         if advice.U is not None and advice.taken is not None:
             self._replace_iterate(s, rows, problem, advice)
-        if self.draws is not None:
-            status[rows[(s.guided[rows] >= self.draws) & ~s.replaced[rows]]] = Status.MAX_ITERATIONS
 
     def _replace_iterate(self, s: State, rows: Tensor, problem: Problem, advice: Advice) -> None:
         """Continue from the advised controls where they are taken.
