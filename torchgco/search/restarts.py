@@ -18,6 +18,7 @@ from torchgco.roadmap.scene import has_paths
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
 from torchgco.search.converge import Converge, mapped
+from torchgco.search.freed import Freed
 from torchgco.search.nearby import among_nearby
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.proposals import PathProposals
@@ -110,7 +111,8 @@ class Restarts(Solver):
         limit = self.local.violation_tolerance
         paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
         through = partial(solved_through_gates, self.interior, limit)
-        return Chooser(self, self.interior, limit, paces=paces, through=through)
+        rounds = max((one.rounds for one in self.passes.steps if isinstance(one, ClearChords)), default=0)
+        return Chooser(self, Freed(self.interior, limit, rounds), limit, paces=paces, through=through)
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""

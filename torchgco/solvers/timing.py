@@ -23,6 +23,7 @@ from torchgco.base.status import Status
 from torchgco.base.tree import put, spread, take
 from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import WrappedCost
+from torchgco.kernels import chord_clearance
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.problem.in_time import at_held_times, factors_in, in_time, states_in_time, times_of
@@ -252,9 +253,14 @@ class Timed:
             self.best = found
             return
         best, old = self.best, self.best.take(rows)
-        better = is_better(found.cost, found.violation, old.cost, old.violation, self.chooser.limit)
-        same = (found.cost <= old.cost) & (found.violation <= self.chooser.limit)
+        limit, problem = self.chooser.limit, self.call.problem.take(rows)
+        better = is_better(found.cost, found.violation, old.cost, old.violation, limit)
+        same = (found.cost <= old.cost) & (found.violation <= limit)
         better |= same & (found.status == Status.CONVERGED)
+        # Of feasible trajectories those that touch no obstacle between two knots come first.
+        clear, was = (chord_clearance(problem, one.X) >= 0.0 for one in (found, old))
+        both = (found.violation <= limit) & (old.violation <= limit)
+        better = torch.where(both & (clear != was), clear, better)
         where = better.nonzero().flatten()
         for name in ("X", "U", "K", "d", "multipliers", "cost", "violation", "status"):
             put(getattr(best, name), rows[where], take(getattr(found, name), where))
