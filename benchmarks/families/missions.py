@@ -33,7 +33,7 @@ CASES = {
     ],
     "woods, 0.4 trunks per m^2": ["scenario=woods"],
     "mazes, 3 walls": ["scenario=mazes"],
-    "forest, a quadrotor of one's own": ["vehicle.mass=1.2", "vehicle.arm=0.15", "vehicle.thrust_max=4.5"],
+    "forest, a quadrotor of 1.2 kg": ["vehicle.mass=1.2", "vehicle.arm=0.15", "vehicle.thrust_max=4.5"],
     "forest, mass +10 %, wind 0.5 N": ["plant.mass_error=0.1", "mission.disturbance.wind=0.5"],
     "the same with drag 0.1 N s/m": [
         "plant.drag=0.1", "plant.mass_error=0.1", "mission.disturbance.wind=0.5",
