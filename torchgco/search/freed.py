@@ -5,18 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
-from torchgco.kernels import chord_clearance, measured
+from torchgco.lagrangian.state import Iterate
 from torchgco.problem.problem import Problem
-from torchgco.search.chords import EXTRA, GROWN_BARRIER, MIN_GROWTH
+from torchgco.search.chords import GROWN_BARRIER, cleared, serving
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
+from torchgco.solvers.ending import DOUBTED
 from torchgco.solvers.interior import InteriorPoint
-
-DEARER = 1e-3  # share of the cost up to which a trajectory that was cleared counts as converged
-PARTS = "X", "U", "K", "d", "multipliers", "cost", "violation", "status"
 
 
 @dataclass(frozen=True)
@@ -39,25 +38,22 @@ class Freed:
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call, as `Solver.run` does."""
-        found = self.interior.run(call)
-        solver, clearance = replace(self.interior, warm_barrier=GROWN_BARRIER), chord_clearance(call.problem, found.X)
-        rows = ((found.violation <= self.limit) & (clearance < 0.0)).nonzero().flatten()
-        dear, by, now = found.cost + DEARER * found.cost.abs(), torch.zeros_like(clearance), clearance.clone()
-        for _ in range(self.rounds):
-            if rows.numel() == 0 or call.late:
-                break
-            by[rows] += (-EXTRA * now[rows]).clamp(min=MIN_GROWTH * self.limit)
-            old, part = found.take(rows), call.take(rows)
-            larger = replace(part, problem=part.problem.grown(by[rows]), X0=old.X, U0=old.U, warm=old.multipliers)
-            new = solver.run(larger)
-            now[rows] = chord_clearance(part.problem, new.X)
-            serves = (measured(part.problem, new.X, new.U) <= self.limit) & (now[rows] > clearance[rows])
-            converged = torch.where(new.cost <= dear[rows], int(Status.CONVERGED), int(Status.FEASIBLE))
-            new = replace(new, status=torch.where(new.status == Status.CONVERGED, converged, new.status))
-            places = serves.nonzero().flatten()
-            for name in PARTS:
-                put(getattr(found, name), rows[places], take(getattr(new, name), places))
+        found, solver = self.interior.run(call), replace(self.interior, warm_barrier=GROWN_BARRIER)
+        best = Iterate(found.X, found.U, found.multipliers, found.cost, found.violation)
+        dear = found.cost + DOUBTED * found.cost.abs()
+
+        def once(rows: Tensor, larger: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
+            new = solver.run(replace(larger, X0=old.X))
+            one = Iterate(new.X, new.U, new.multipliers, new.cost, new.violation)
+            serves, one, clearance = serving(call.problem.take(rows), one, old, least, self.limit)
             found.iterations[rows] += new.iterations
-            clearance[rows] = torch.where(serves, now[rows], clearance[rows])
-            rows = rows[clearance[rows] < 0.0]
+            chosen = serves.nonzero().flatten()
+            put(best, rows[chosen], take(one, chosen))
+            near = (new.status != Status.CONVERGED) | (new.cost <= dear[rows])
+            status = torch.where(near, new.status, int(Status.FEASIBLE))
+            for own, other in ((found.K, new.K), (found.d, new.d), (found.status, status)):
+                own[rows[chosen]] = other[chosen]
+            return serves, clearance
+
+        cleared(call, best, self.rounds, self.limit, once)
         return found
