@@ -19,7 +19,7 @@ ROOMY = 4.0  # units from an obstacle within which a way costs up to double: the
 AVERAGED = 0.8  # units: the standard deviation over which the corners of a path with few of them are averaged
 
 
-def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
+def clear_ways(scene: Scene, b: int, count: int) -> list[Array]:
     """Ways (P, d), m, of the problem at place b, from block to block; in the plane one of each homotopy class.
 
     Of up to `count` classes, the cheapest first, and of as many more that are the cheapest where only the last of the
@@ -36,7 +36,7 @@ def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
         kinds = dict.fromkeys([*list(wide)[:count], *list(near)[:count]])
         return [ways.path(wide[kind]) for kind in kinds if kind in wide]
 
-    return in_one(scene, b, overlap, search)
+    return in_one(scene, b, 0.0, search)
 
 
 def clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:

@@ -18,11 +18,9 @@ from torch import Tensor
 from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.tree import take
 from torchgco.roadmap import native as roadmap
-from torchgco.roadmap.clear import clear_path, clear_ways
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
-from torchgco.roadmap.lattice import Array
-from torchgco.roadmap.mapped import in_each, paths_in_maps
+from torchgco.roadmap.mapped import paths_in_maps
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import DIVERSITY, HOPS, TorchSearch
 
@@ -94,20 +92,6 @@ class Roadmap:
             if lost.numel() > 0:
                 corners[lost], found[lost] = paths_in_maps(scene.take(rows[lost]), count, self.max_overlap)
         return corners, found
-
-    def clear_path(self, scene: Scene) -> tuple[Tensor, Tensor]:
-        """One more path of each problem, weighted by clearance, where there are maps: as `paths` with one.
-
-        Elsewhere none: edges of the graph keep to the middle between neighbours.
-        """
-        if scene.obstacles.maps:
-            return in_each(scene, 1, self.max_overlap, clear_path)
-        straight = torch.stack((scene.start, scene.goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1)
-        return straight, torch.zeros_like(scene.start[:, 0], dtype=torch.bool)
-
-    def clear_ways(self, scene: Scene, b: int, count: int) -> list[Array]:
-        """The same of the problem at place b, with all their points (P, d), m: one of each homotopy class."""
-        return clear_ways(scene, b, self.max_overlap, count) if scene.obstacles.maps else []
 
     def repeats(self, other: Roadmap, scene: Scene) -> bool:
         """Whether another search finds the same paths: those among maps need no points all over the scene."""

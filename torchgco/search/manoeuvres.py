@@ -18,10 +18,10 @@ from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.scene import scales, scene_of
-from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
 from torchgco.search.chords import EXTRA
 from torchgco.search.poses import ARC_LENGTH, Poses, clear_at
+from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solved
 from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
 

@@ -12,10 +12,10 @@ from torchgco.search.candidates import Refine
 from torchgco.search.converge import Converge
 from torchgco.search.direct import Direct, Join
 from torchgco.search.following import Follow
-from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.proposals import PathProposals
-from torchgco.search.row import Row
 from torchgco.search.starts import Starts
+from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
+from torchgco.search.table import Row
 
 REPAIRED = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)  # of candidates that lie deep in an obstacle
 INSIDE_DEPTH = 0.5  # how deep these may lie, in R
@@ -37,6 +37,8 @@ class FirstSolve(Row):
 
     single_contact_after: Count | None = 3
 
+    problems: ClassVar[str] = "all"
+
     def __post_init__(self) -> None:
         check_options(self, "guess")
 
@@ -44,10 +46,6 @@ class FirstSolve(Row):
     def steps(self) -> tuple[Row, ...]:
         solve = Solve(single_contact_after=self.single_contact_after)
         return Converge(among="free"), Solve("end", "pathless"), solve, Direct()
-
-    @property
-    def problems(self) -> str:
-        return "all"
 
     @property
     def does(self) -> str:
@@ -87,6 +85,7 @@ class Paths(Row):
 
     seeks_paths: ClassVar[bool] = True
     kinds: ClassVar[tuple[str, ...]] = ("maps", "bodies")
+    problems: ClassVar[str] = "caught, not arrived"
 
     def __post_init__(self) -> None:
         check_options(self, "paths")
@@ -130,10 +129,6 @@ class Paths(Row):
         )  # fmt: skip
 
     @property
-    def problems(self) -> str:
-        return "caught, not arrived"
-
-    @property
     def does(self) -> str:
         more = "" if self.max_gap is None else f"; over {self.max_gap:.0%} above free: twice as many paths"
         near, far = "; without any: followed closer", "; still far: twice as many, all refined"
@@ -163,6 +158,7 @@ class Samples(Row):
     redraws: Natural = 2
 
     kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
+    problems: ClassVar[str] = "caught, not arrived"
 
     def __post_init__(self) -> None:
         check_options(self, "samples")
@@ -172,10 +168,6 @@ class Samples(Row):
         return (
             IntoGoal("pathless"), FromSamples("unproposed"), FromSamples(redraws=self.redraws), IntoGoal(), Join(),
         )  # fmt: skip
-
-    @property
-    def problems(self) -> str:
-        return "caught, not arrived"
 
     @property
     def does(self) -> str:
@@ -198,6 +190,7 @@ class Tighten(Row):
     starts: Natural = 8
 
     last: ClassVar[bool] = True
+    problems: ClassVar[str] = "not solved as tightly yet"
 
     def __post_init__(self) -> None:
         check_options(self, "tighten")
@@ -205,10 +198,6 @@ class Tighten(Row):
     @cached_property
     def steps(self) -> tuple[Row, ...]:
         return Converge(), *((Starts(self.starts),) if self.starts > 0 else ())
-
-    @property
-    def problems(self) -> str:
-        return "not solved as tightly yet"
 
     @property
     def does(self) -> str:
