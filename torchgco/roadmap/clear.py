@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from torchgco.maps.ways import length
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.mapped import CLOSE_UNITS, Price, even, in_one, one_of_each_class, ways_of
+from torchgco.roadmap.mapped import CLOSE_UNITS, Price, Ways, even, in_one, one_of_each_class, ways_of
 from torchgco.roadmap.search import HOPS
 
 ROOMY = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide
@@ -32,7 +32,8 @@ def clear_ways(scene: Scene, b: int, count: int) -> list[Array]:
             return []
         if lattice.d == 3:
             return [ways.path(int(ways.total.argmin()))]
-        wide, near = one_of_each_class(ways), one_of_each_class(ways.nearer(CLOSE_UNITS * unit))
+        closer = Ways(ways.blocks, ends, price, CLOSE_UNITS * unit, ways.free_above)
+        wide, near = one_of_each_class(ways), one_of_each_class(closer)
         kinds = dict.fromkeys([*list(wide)[:count], *list(near)[:count]])
         return [ways.path(wide[kind]) for kind in kinds if kind in wide]
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.tree import take
-from torchgco.roadmap import native as roadmap
+from torchgco.roadmap import native
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
 from torchgco.roadmap.mapped import paths_in_maps
@@ -72,8 +72,8 @@ class Roadmap:
         """
         if scene.obstacles.maps:
             return paths_in_maps(scene if rows is None else scene.take(rows), count, self.max_overlap)
-        library = roadmap.library_for(scene.start, scene.obstacles.boxes is not None)
-        most = PROBLEMS_AT_ONCE if library is None else roadmap.SEARCHES_AT_ONCE
+        library = native.library_for(scene.start, scene.obstacles.boxes is not None)
+        most = PROBLEMS_AT_ONCE if library is None else native.SEARCHES_AT_ONCE
         B, d = scene.start.shape
         rows = torch.arange(B, device=scene.start.device) if rows is None else rows
         place, found = torch.full((B,), -1, device=rows.device), torch.zeros_like(rows, dtype=torch.bool)
@@ -103,13 +103,11 @@ class Roadmap:
         """Courses with `count` paths, or more, of the problems in `rows`, which are of one group."""
         if rows.numel() == 0:
             return []
-        courses = known.courses((self, group), rows)
-        fresh = courses is None
-        if courses is None:
-            courses = self._begun(scene, rows, group, library, known)
+        before = known.courses((self, group), rows)
+        courses = before or self._begun(scene, rows, group, library, known)
         for course in courses:
             course.go_on(count)
-        if fresh:
+        if before is None:
             known.keep((self, group), courses)
         return courses
 

@@ -13,7 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, check_options
+from torchgco.base.options import Count
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.kernels import chord_clearance, measured
@@ -52,11 +52,9 @@ class ClearChords(Row):
 
     rounds: Count = 4
 
+    label: ClassVar[str] = "chords"
     kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
     problems: ClassVar[str] = "touching an obstacle between two knots"
-
-    def __post_init__(self) -> None:
-        check_options(self, "chords")
 
     @property
     def does(self) -> str:

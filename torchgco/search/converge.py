@@ -8,7 +8,6 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status, is_over
 from torchgco.base.tree import put
 from torchgco.kernels import chord_clearance, is_convex
@@ -40,15 +39,13 @@ class Converge(Row):
 
     among: Literal["free", "all"] = "all"
 
+    label: ClassVar[str] = "converge"
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "converge")
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem = search.call.problem
-        if problem.B == 0 or not self.worth(problem):
+        if not self.worth(problem):
             return
         if self.among == "all":
             self._tighten(search)
@@ -157,7 +154,7 @@ def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor) -> SolveEnd:
     if near is None:
         return solver.solved(call, X)
     found = solver.solved(near.call, X)
-    wrong, end = near.wrong(found.best), near.end(found)
+    wrong, end = near.wrong(found.best), replace(found, best=near.whole(found.best), last=near.whole(found.last))
     if wrong.numel() > 0:
         put(end, wrong, solver.solved(call.take(wrong), X[wrong]))
     return end

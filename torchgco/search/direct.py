@@ -16,7 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Natural, NonNegative, check_options
+from torchgco.base.options import Natural, NonNegative
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.lagrangian.state import SolveEnd
@@ -51,11 +51,9 @@ class Direct(Row):
     gap: NonNegative = 0.02
     most: Natural = 5
 
+    label: ClassVar[str] = "direct"
     seeks_paths: ClassVar[bool] = True
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "direct")
 
     @property
     def problems(self) -> str:

@@ -6,13 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
-from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
-from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Count, check_options
-from torchgco.base.shapes import check_shape, tensor
-from torchgco.problem.problem import Problem
+from torchgco.guidance.mppi import diagonal
 from torchgco.search.best import Best
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -59,7 +56,7 @@ class MultiStart(Solver):
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call; guesses are keyed by (seed, id, start), and the warm start serves the first."""
-        solver, sigma = self.local, self._sigma(call.problem)
+        solver, sigma = self.local, diagonal(self.covariance, call.problem, "multistart.covariance")
         session = Session(call, solver.inner.as_printed)
         scaled = session.call
         guidance = None if solver.guidance is None else solver.guidance.suited(scaled.problem)
@@ -74,11 +71,3 @@ class MultiStart(Solver):
             noise = sigma.sqrt() * smooth_normal(key, self.noise_knots, part.U0)
             best.improve(rows, replace(part, U0=part.U0 + noise, warm=None), guidance=guidance)
         return session.finished(best.end, solver.violation_tolerance, solver.slots)
-
-    def _sigma(self, problem: Problem) -> Tensor:
-        sigma = tensor(self.covariance, "multistart.covariance", problem.x0)
-        sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
-        check_shape(sigma, (problem.m,), "multistart.covariance")
-        if not bool(((sigma > 0) & torch.isfinite(sigma)).all()):
-            raise InputError("multistart.covariance", "finite variances above 0", sigma.tolist())
-        return sigma

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Count, Natural, Positive, check_options
+from torchgco.base.options import Count, Natural, Positive
 from torchgco.base.tree import put, take
 from torchgco.kernels import cost_unit, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -99,10 +99,11 @@ class PathProposals(Row):
     max_penetration: Positive = 0.1
     max_gap: Positive | None = None
 
+    label: ClassVar[str] = "proposals"
     seeks_paths: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_options(self, "proposals")
+        super().__post_init__()
         for name in ("roadmaps", "follow"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if not self.follow:
@@ -323,16 +324,13 @@ class Round:
         return whole._replace(multipliers=whole.multipliers.scaled(self.unit), cost=whole.cost * self.unit)
 
 
-def propose(passes: Sequence[PathProposals], problem: Problem, watch: Watch = unwatched) -> Proposal:
+def propose(passes: Sequence[PathProposals], problem: Problem) -> Proposal:
     """Proposals for every problem, from the vehicle at rest, by some passes.
-
-    `watch` is called with how many candidates of the current step are solved, and of how many; an exception that it
-    raises ends the search.
 
     Raises:
         InputError: initial offsets that don't fit the controls.
     """
-    found = Round(problem, passes[0].at_once, watch)
+    found = Round(problem, passes[0].at_once)
     for proposals in passes:
         found.improve(proposals)
     return found.result()

@@ -41,7 +41,7 @@ SOLVED_WAYS = 4  # candidates that are solved, the cheapest as driven
 FINE = 0.25  # R between the points of a way
 ROUNDED = 2.0  # R: the standard deviation over which its corners are averaged
 LOOK_AHEAD = 2.4  # R that the vehicle looks ahead
-DOES = (
+PURSUIT_TEXT = (
     f"what drives along its heading is steered along ways that keep clear, of {WAYS} to {2 * WAYS} classes, "
     f"{WAY_PACES} paces, forwards and backwards; interior point from the {SOLVED_WAYS} cheapest"
 )

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
-from torchgco.base.options import Count, Natural, Positive, check_options
+from torchgco.base.options import Count, Natural, Positive
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import Refine
 from torchgco.search.converge import Converge
@@ -37,10 +37,8 @@ class FirstSolve(Row):
 
     single_contact_after: Count | None = 3
 
+    label: ClassVar[str] = "guess"
     problems: ClassVar[str] = "all"
-
-    def __post_init__(self) -> None:
-        check_options(self, "guess")
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
@@ -83,12 +81,10 @@ class Paths(Row):
     max_penetration: Positive = 0.1
     max_gap: Positive | None = None
 
+    label: ClassVar[str] = "paths"
     seeks_paths: ClassVar[bool] = True
     kinds: ClassVar[tuple[str, ...]] = ("maps", "bodies")
     problems: ClassVar[str] = "caught, not arrived"
-
-    def __post_init__(self) -> None:
-        check_options(self, "paths")
 
     @property
     def proposals(self) -> PathProposals:
@@ -157,11 +153,9 @@ class Samples(Row):
 
     redraws: Natural = 2
 
+    label: ClassVar[str] = "samples"
     kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
     problems: ClassVar[str] = "caught, not arrived"
-
-    def __post_init__(self) -> None:
-        check_options(self, "samples")
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
@@ -189,11 +183,9 @@ class Tighten(Row):
 
     starts: Natural = 8
 
+    label: ClassVar[str] = "tighten"
     last: ClassVar[bool] = True
     problems: ClassVar[str] = "not solved as tightly yet"
-
-    def __post_init__(self) -> None:
-        check_options(self, "tighten")
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:

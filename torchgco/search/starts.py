@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
-from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.options import Count, Positive
 from torchgco.base.status import UNMOVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.state import Iterate
@@ -47,10 +47,8 @@ class Starts(Row):
     bend: Positive = 0.2
     change: Positive = 0.1
 
+    label: ClassVar[str] = "starts"
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "starts")
 
     @property
     def problems(self) -> str:
@@ -62,11 +60,8 @@ class Starts(Row):
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
-        problem = search.call.problem
-        if problem.B == 0 or not Converge.begins(problem):
-            return
-        left = self._rows(search)
-        if left.numel() == 0:  # which `split` would make one empty batch of
+        problem, left = search.call.problem, self._rows(search)
+        if not Converge.begins(problem) or left.numel() == 0:  # which `split` would make one empty batch of
             return
         slots = search.solver.slots or problem.B * self.count
         for rows in left.split(max(1, slots // self.count)):

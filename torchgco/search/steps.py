@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 
 import torch
 
-from torchgco.base.options import Count, Natural, check_options
+from torchgco.base.options import Count, Natural
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
 from torchgco.kernels import cost_unit
@@ -48,8 +48,7 @@ class Solve(Row):
     among: Literal["pathless", "all"] = "all"
     single_contact_after: Count | None = None
 
-    def __post_init__(self) -> None:
-        check_options(self, "solve")
+    label: ClassVar[str] = "solve"
 
     @property
     def problems(self) -> str:
@@ -129,10 +128,8 @@ class IntoGoal(Row):
         where = ", where no path can be sought" if self.among == "pathless" else ""
         return f"caught, close to the goal, not arrived{where}"
 
+    label: ClassVar[str] = "into_goal"
     does: ClassVar[str] = "AL-iLQR with the end attracted to the goal"
-
-    def __post_init__(self) -> None:
-        check_options(self, "into_goal")
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -164,8 +161,7 @@ class FromSamples(Row):
     when: Literal["caught", "unarrived", "unproposed"] = "unarrived"
     redraws: Natural = 0
 
-    def __post_init__(self) -> None:
-        check_options(self, "samples")
+    label: ClassVar[str] = "samples"
 
     @property
     def problems(self) -> str:

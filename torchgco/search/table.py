@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Self, overload
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_options
 
 KINDS = ("free", "moving", "maps", "bodies")  # of problems: without obstacles, where no path can be sought, and others
 
@@ -18,6 +19,7 @@ class Row:
     before have brought.
 
     Attributes:
+        label: how errors name its options.
         seeks_paths: whether it needs obstacles among which the roadmap can seek a path.
         kinds: of problems that it may work on.
         last: whether only a last answer is worth it; a planner that solves again soon leaves it out.
@@ -25,11 +27,15 @@ class Row:
         does: what it does with them, in words.
     """
 
+    label: ClassVar[str] = "pass"
     seeks_paths: ClassVar[bool] = False
     last: ClassVar[bool] = False
     kinds: Any = KINDS
     problems: Any
     does: Any
+
+    def __post_init__(self) -> None:
+        check_options(self, self.label)
 
     @property
     def steps(self) -> tuple[Row, ...]:

@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, check_options
+from torchgco.base.options import Count
 from torchgco.kernels import open_loop
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import clear_path
@@ -24,9 +24,8 @@ from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import around_body, has_maps
 from torchgco.search.candidates import Candidates
 from torchgco.search.following import Follow, Free, Paths
-from torchgco.search.manoeuvres import MANOEUVRES_TEXT as MANOEUVRES
-from torchgco.search.manoeuvres import manoeuvre
-from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
+from torchgco.search.manoeuvres import MANOEUVRES_TEXT, manoeuvre
+from torchgco.search.pursue import PURSUED_AT_ONCE, PURSUIT_TEXT, pursue
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solve_cheapest
 from torchgco.search.table import Row
@@ -67,11 +66,9 @@ class Tube(Row):
     among: Literal["maps", "bodies"] = "bodies"
     num_paths: Count = 6
 
+    label: ClassVar[str] = "tube"
     seeks_paths: ClassVar[bool] = True
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "tube")
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -85,9 +82,9 @@ class Tube(Row):
     def does(self) -> str:
         more, first = "", ""
         if self.among == "maps":
-            more, first = " and one that keeps clear", f"{DOES}; others, or without success: "
+            more, first = " and one that keeps clear", f"{PURSUIT_TEXT}; others, or without success: "
         tracked = f"{self.num_paths} paths{more}: {FOLLOW}, {PACES} paces"
-        cars = f"cars with a body: {MANOEUVRES}; without success, and others: "
+        cars = f"cars with a body: {MANOEUVRES_TEXT}; without success, and others: "
         return f"{cars}{first}{tracked}; not relaxed; interior point from the {TOP} cheapest"
 
     def run(self, search: Search) -> None:

@@ -14,14 +14,7 @@ from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.fixed import GOLDEN, ROUNDINGS
 from torchgco.eager.kernels import least_violation
-from torchgco.kernels import (
-    cost_unit,
-    expect_interior,
-    followed,
-    interior_of,
-    measured,
-    open_loop,
-)
+from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
 from torchgco.kernels.base import InteriorKernels
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
@@ -30,7 +23,7 @@ from torchgco.lagrangian.unmoved import unmoved
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
-from torchgco.solvers.ending import STATIONARY, constant_cost, least_cost, start_status
+from torchgco.solvers.ending import STATIONARY, start_status
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
@@ -228,10 +221,11 @@ class InteriorPoint(Solver):
         how = how | {"smoothing": smoothing, "minimum": int(escapes)}
         X, U = inside(problem, X, call.U0, how["push"])
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
-        fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
+        scale = cost_scale(problem)
+        fitted = Multipliers(multipliers, PENALTY * scale.unit)
         out = kernels.solve(
             problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
-            constant=constant_cost(problem), least_cost=least_cost(problem), seconds=call.seconds_left,
+            constant=scale.constant, least_cost=scale.size, seconds=call.seconds_left,
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
         X, U = rolled_out(problem, X, U, out["gains"][..., :-1])
