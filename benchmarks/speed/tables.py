@@ -136,7 +136,7 @@ def targets_text(rows: list[Row]) -> str:
     own = [row for row in rows if row["section"] == "targets" and row["device"] == "cpu"]
     cases = {row["case"] for row in own if row["quantity"] in PEERS}
     own = [row for row in own if row["case"] in cases]
-    return f"{_source(own[0])}\n{WORDS['targets']}\n\n{section_text(own)}" if own else NOT_MEASURED
+    return f"{_when(own[0])}{_how(own[0])}.\n{WORDS['targets']}\n\n{section_text(own)}" if own else NOT_MEASURED
 
 
 def speed_text(rows: list[Row]) -> str:
@@ -149,23 +149,27 @@ def speed_text(rows: list[Row]) -> str:
 
 def _device_text(rows: list[Row]) -> str:
     """Tables of one device; a line on the source precedes a section where it differs from the section before."""
-    blocks, before = [], ""
+    blocks, before = [], ("", "")
     present = {row["section"] for row in rows}
     for section in [name for name in WORDS if name in present and name not in LEFT_OUT]:
         own = [row for row in rows if row["section"] == section]
-        source = _source(own[0])
-        blocks += [source] if source != before else []
+        source = when, how = _when(own[0]), _how(own[0])
+        blocks += [f"{when}{how if how != before[1] else ', all else as above'}."] if source != before else []
         blocks.append(f"### `{section}`\n\n{WORDS[section]}\n\n{section_text(own)}")
         before = source
     return "\n\n".join(blocks)
 
 
-def _source(row: Row) -> str:
+def _when(row: Row) -> str:
+    return f"Measured on {row['date']} at commit {row['commit']}"
+
+
+def _how(row: Row) -> str:
     where = "one core, one thread" if row["device"] == "cpu" else "one GPU"
     return (
-        f"Measured on {row['date']} at commit {row['commit']}, {row['processor']}, {where}; torch {row['torch']}, "
+        f", {row['processor']}, {where}; torch {row['torch']}, "
         f"CasADi {row['casadi']}, pytorch-mppi {row['pytorch_mppi']}, acados (comma-deps-acados) "
-        f"{row['acados'] or 'not installed'}."
+        f"{row['acados'] or 'not installed'}"
     )
 
 
