@@ -23,6 +23,7 @@ from torchgco import kernels
 from torchgco.experiments.config import build, checks
 from torchgco.experiments.config.groups import config_dir
 from torchgco.native.compiler import find_compiler
+from torchgco.native.store import trim
 
 ROOT = Path(__file__).parents[1]
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
@@ -73,6 +74,7 @@ def _compose_once() -> None:
         key = (config_name, JobRuntime().get("name"), places, *overrides, *more, *named.items())
         if key not in loaded:
             loaded[key] = slow_load(self, config_name, overrides, *more, **named)
+            trim(loaded, 32)  # of some MB each; a test's commands are much alike
         config = deepcopy(loaded[key])  # with the interpolations, which are resolved later
         config.hydra.runtime.cwd = os.getcwd()
         return config
