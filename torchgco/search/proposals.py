@@ -144,7 +144,8 @@ class PathProposals(Row):
 
     def fitting(self, m: int) -> Self:
         """Without initial offsets that have another number of controls than m."""
-        return replace(self, follow=tuple(follow.fitting(m) for follow in self.follow))
+        ways = tuple(follow.fitting(m) for follow in self.follow)
+        return self if ways == self.follow else replace(self, follow=ways)
 
     @property
     def at_once(self) -> int:

@@ -136,6 +136,8 @@ class Restarts(Solver):
         if self._finishes:
             end = least_violated(session.call, end, solver.violation_tolerance)
         solution = session.finished(end, solver.violation_tolerance, solver.slots)
+        if search.record is None:
+            return solution
         return replace(solution, search=search.finish_record(*session.scales))
 
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
