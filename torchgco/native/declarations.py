@@ -54,11 +54,11 @@ class Structure(ctypes.Structure):
 
     def fill(self, values: Mapping[str, Any]) -> None:
         """Set fields by name."""
-        kinds, tensors, kept = self.kinds, self.tensors, self.kept
+        kinds, tensors = self.kinds, self.tensors
+        self.kept.extend(values.values())
         for name, value in values.items():
             # Most fields of a call are tensors or numbers, and each solve makes thousands of calls.
-            if type(value) is Tensor and name in tensors and value.dtype is tensors[name] and value.is_contiguous():
-                kept.append(value)
+            if type(value) is Tensor and value.dtype is tensors.get(name) and value.is_contiguous():
                 _set(self, name, value.data_ptr())
             elif type(value) in PLAIN_NUMBERS and name in kinds:
                 _set(self, name, value)

@@ -205,11 +205,13 @@ class Problem:
         shapes = self.known.row_shapes
         if shapes is None:
             stated = [None if is_users(part) else part.row_shape(self.N) for part in self.constraints]
-            # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
-            one = self.take(slice(0, 1)) if None in stated else self
-            X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-            parts = zip(stated, one.constraints, strict=True)
-            found = [shape or part.value(X, U).shape[1:] for shape, part in parts]
+            found: list[Any] = stated
+            if None in stated:
+                # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
+                one = self.take(slice(0, 1))
+                X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
+                parts = zip(stated, one.constraints, strict=True)
+                found = [shape or part.value(X, U).shape[1:] for shape, part in parts]
             shapes = self.known.row_shapes = tuple((knots, rows) for knots, rows in found)
         return shapes
 
