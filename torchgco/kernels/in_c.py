@@ -142,9 +142,9 @@ class NativeKernels:
 def native_options(how: Descent) -> Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
-    ladder = _numbers(*search.ladder(printed))
+    rungs = search.ladder(printed)
     return Options.complete(
-        ladder=ladder, rungs=len(ladder), back=-1 if search.back is None else search.back, accept_last=printed,
+        ladder=_numbers(*rungs), rungs=len(rungs), back=-1 if search.back is None else search.back, accept_last=printed,
         ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
         max_iterations=how.max_iterations, tolerance=0.0 if printed else how.tolerance,
         absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,

@@ -54,11 +54,11 @@ class Structure(ctypes.Structure):
 
     def fill(self, values: Mapping[str, Any]) -> None:
         """Set fields by name."""
-        kinds, tensors = self.kinds, self.tensors
-        self.kept.extend(values.values())
+        kinds, tensors, kept = self.kinds, self.tensors, self.kept
         for name, value in values.items():
             # Most fields of a call are tensors or numbers, and each solve makes thousands of calls.
             if type(value) is Tensor and value.dtype is tensors.get(name) and value.is_contiguous():
+                kept.append(value)
                 _set(self, name, value.data_ptr())
             elif type(value) in PLAIN_NUMBERS and name in kinds:
                 _set(self, name, value)

@@ -160,4 +160,4 @@ def _sum(numbers: Any) -> int | None:
             array = np.asarray(list(numbers) if isinstance(numbers, deque) else numbers)
     except (TypeError, ValueError, RuntimeError):
         return None
-    return zlib.crc32(np.ascontiguousarray(array)) if array.dtype.kind in "biuf" else None
+    return zlib.crc32(np.ascontiguousarray(array).data) if array.dtype.kind in "biuf" else None

@@ -130,7 +130,10 @@ class Candidates:
 
     def parts(self) -> Iterator[Tensor]:
         """Rows of the live candidates, `CANDIDATES_AT_ONCE` at a time."""
-        return (rows for rows in self.live.nonzero().flatten().split(CANDIDATES_AT_ONCE) if rows.numel() > 0)
+        rows = self.live.nonzero().flatten()
+        if rows.numel() <= CANDIDATES_AT_ONCE:
+            return iter((rows,) if rows.numel() > 0 else ())
+        return iter(rows.split(CANDIDATES_AT_ONCE))
 
     def arrive(self) -> Tensor:
         """Whether each candidate ends near the goal, (B * count,)."""

@@ -205,6 +205,8 @@ class Follow:
             places, stages = (part.repeat_interleave(each, dim=0) for part in (gates.places, problem.stages))
             last = places[:, -1]
             return timed(path, places, last + arrive.clamp(LEAST_SHARE, 1.0) * (stages - last), N)
+        if problem.horizon is None:
+            return followed(path, self.depart, arrive, self.smoothing, N, paths.obstacles, paths.R)
         center = repeated(path[:, -1], N + 1)
         for horizon in problem.stages.unique().tolist():
             rows = (problem.stages == horizon).nonzero().flatten()
