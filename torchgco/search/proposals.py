@@ -144,8 +144,7 @@ class PathProposals(Row):
 
     def fitting(self, m: int) -> Self:
         """Without initial offsets that have another number of controls than m."""
-        ways = tuple(follow.fitting(m) for follow in self.follow)
-        return self if ways == self.follow else replace(self, follow=ways)
+        return replace(self, follow=tuple(follow.fitting(m) for follow in self.follow))
 
     @property
     def at_once(self) -> int:
