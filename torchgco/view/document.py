@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.version import VERSION
+from torchgco.judging.worst import kind_of
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
-from torchgco.view.flights import Flight, constraint_name
+from torchgco.view.flights import Flight
 from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
 from torchgco.view.vehicles import Look, Shape, shape_of
@@ -61,7 +62,7 @@ class Document:
         """The page of a batch of problems, whose vehicle has a `radius`, m, where there are no obstacles."""
         shape, at = shape_of(problem), problem.position
         radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=radius)
-        names = [constraint_name(part) for part in problem.constraints]
+        names = [kind_of(part) for part in problem.constraints]
         size = {"radius": radius if shape is None else shape.reach, "shape": shape}
         return cls(dimension=at.stop - at.start, constraints=names, **size, **given)  # type: ignore[arg-type]
 
