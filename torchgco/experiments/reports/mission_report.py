@@ -18,7 +18,7 @@ from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import LAYOUTS, MISSION, PLANS_FILE, TIME_STEPS, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
-from torchgco.experiments.statistics.mission_tables import mission_lines
+from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.missions.contact import Contact
 from torchgco.missions.passing import Passing
 from torchgco.missions.planning_problem import airframe_of
