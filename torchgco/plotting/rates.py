@@ -132,11 +132,11 @@ def _words(variable: str) -> str:
     return WORDS.get(variable, variable.split(".")[-1].replace("_", " "))
 
 
-def _interval(held: Mapping[str, Any] | pd.DataFrame, name: str) -> list[np.ndarray]:
+def _interval(held: Mapping[str, Any] | pd.DataFrame, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The low end, the rate and the high end of an outcome, of a row or in the rows of a summary."""
     low, rate, high = (np.asarray(held[f"{name}_{part}"], dtype=float) for part in ("low", "rate", "high"))
     # Rounding can put an end of the interval slightly inside the rate at 0 and at 1.
-    return [np.minimum(low, rate), rate, np.maximum(high, rate)]
+    return np.minimum(low, rate), rate, np.maximum(high, rate)
 
 
 def _as_rate(ax: Axes, name: str, low: float = -0.02, high: float = 1.02) -> None:

@@ -199,9 +199,9 @@ class SearchPart:
             guidance on.
     """
 
-    passes: Sequence[str]
-    rounds: Sequence[tuple[str, Sequence[Line]]]
-    guides: Sequence[tuple[str, np.ndarray, np.ndarray]] = ()
+    passes: list[str] = field(default_factory=list)
+    rounds: list[tuple[str, Sequence[Line]]] = field(default_factory=list)
+    guides: list[tuple[str, np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def packed(self, packing: Packing) -> dict[str, Any]:
         rounds = [{"name": name, "lines": [_line(packing, line) for line in lines]} for name, lines in self.rounds]
@@ -209,7 +209,7 @@ class SearchPart:
             {"name": name, "balls": packing.put(balls), "sample": packing.put(sample, steps=True)}
             for name, balls, sample in self.guides
         ]
-        return {"passes": list(self.passes), "rounds": rounds, "guides": guides}
+        return {"passes": self.passes, "rounds": rounds, "guides": guides}
 
 
 def _line(packing: Packing, line: Line) -> dict[str, Any]:

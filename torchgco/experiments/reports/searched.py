@@ -71,7 +71,7 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
     Raises:
         InputError: missions with a sensor, whose search is that for a path on the map.
     """
-    found: dict[int, list[SearchPart]] = {number: [] for number in numbers}
+    found: dict[int, SearchPart] = {}
     for name in study.manifest.solvers:
         solver, seen = study.solver(name).recording(), []
         if isinstance(solver, AugmentedLagrangian):
@@ -82,12 +82,14 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
         for some in _alike(study, numbers):
             problem, solution = _solved(study, some, name, solver)
             for b, number in enumerate(some):
-                part = search_of(solution, problem, b) or SearchPart([], [])
+                part = search_of(solution, problem, b) or SearchPart()
                 own = [one for one in seen if one.number == number]
-                guides = [(f"outer iteration {one.outer}", one.balls, one.sample) for one in own]
-                if part.passes or part.rounds or guides:
-                    found[number].append(_named(replace(part, guides=guides), name))
-    return {number: _joined(parts) for number, parts in found.items() if parts}
+                if part.passes or part.rounds or own:
+                    whole = found.setdefault(number, SearchPart())
+                    whole.passes.extend(f"{name}: {text}" for text in part.passes)
+                    whole.rounds.extend((f"{name}: {text}", lines) for text, lines in part.rounds)
+                    whole.guides.extend((f"outer iteration {one.outer}, {name}", one.balls, one.sample) for one in own)
+    return found
 
 
 def _alike(study: Study, numbers: Sequence[int]) -> list[list[int]]:
@@ -109,19 +111,3 @@ def _solved(study: Study, numbers: Sequence[int], name: str, solver: Any) -> tup
         raise InputError("--search", expected, "missions with a sensor")
     planner = replace(mission.planner, solver=solver)
     return replace(mission, planner=planner).first_plans(task.problem, study.seed, ids)
-
-
-def _named(part: SearchPart, solver: str) -> SearchPart:
-    return SearchPart(
-        [f"{solver}: {text}" for text in part.passes],
-        [(f"{solver}: {text}", lines) for text, lines in part.rounds],
-        [(f"{text}, {solver}", balls, sample) for text, balls, sample in part.guides],
-    )
-
-
-def _joined(parts: Sequence[SearchPart]) -> SearchPart:
-    return SearchPart(
-        [text for part in parts for text in part.passes],
-        [one for part in parts for one in part.rounds],
-        [one for part in parts for one in part.guides],
-    )
