@@ -83,7 +83,9 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
     """
     rows = summary[summary[variable].notna()]
     tasks = list(tasks_of(rows.rename(columns={variable: "value"})))
-    shown, effort = _shown(rows), _effort(rows)
+    shown = _shown(rows)
+    known = (held for held in EFFORT_AXES if held[0] in rows.columns and rows[held[0]].notna().any())
+    effort = next(known, None)  # columns of the last panel, its middle and its upper end, and its label
     width = len(shown) + (effort is not None)
     figure, axes = panels(len(tasks) * width, width, SWEEP_PANEL)
     numeric = pd.api.types.is_numeric_dtype(rows[variable])
@@ -119,12 +121,6 @@ def _shown(rows: pd.DataFrame) -> list[str]:
     if f"{FAILED_OUTCOMES[0]}_n" not in rows.columns:
         return [name for name in OUTCOMES if rows[f"{name}_n"].sum() > 0]
     return ["reached", *(name for name in FAILED_OUTCOMES if rows[f"{name}_count"].sum() > 0)]
-
-
-def _effort(rows: pd.DataFrame) -> tuple[str, str, str] | None:
-    """Columns of the last panel, its middle and its upper end, and its label; None where no trial has a value."""
-    found = (held for held in EFFORT_AXES if held[0] in rows.columns and rows[held[0]].notna().any())
-    return next(found, None)
 
 
 def _words(variable: str) -> str:

@@ -157,12 +157,9 @@ def csv_text(table: pd.DataFrame) -> str:
     Names come from configurations and files of others: an apostrophe stands before what a spreadsheet would compute.
     Numbers, also those held as text, stay what they are.
     """
-    texts = {name: table[name].astype(object).map(_inert) for name in table.columns if _holds_text(table[name])}
+    holding = table.select_dtypes(exclude=["number", "bool", "boolean"])
+    texts = {name: holding[name].astype(object).map(_inert) for name in holding.columns}
     return table.assign(**texts).rename(columns=_inert).to_csv(index=False)
-
-
-def _holds_text(column: pd.Series) -> bool:
-    return not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column))
 
 
 def _inert(cell: Any) -> Any:
