@@ -172,10 +172,9 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             before = self.episodes.distance()
             outcome = self.episodes.fly(action, torch.from_numpy(waiting)).numpy()
             after = self.episodes.distance()
-            bonus = BONUS * (outcome == Outcome.REACHED) - BONUS * np.isin(
-                outcome, (Outcome.COLLISION, Outcome.DIVERGED)
-            )
-            reward = np.where(waiting, 0.0, (before - after).numpy() + bonus)
+            lost = np.isin(outcome, (Outcome.COLLISION, Outcome.DIVERGED))
+            ended = (outcome == Outcome.REACHED).astype(float) - lost  # 1 at the goal, -1 in contact or lost
+            reward = np.where(waiting, 0.0, (before - after).numpy() + BONUS * ended)
             over = (self.episodes.step >= self.episodes.steps).numpy() & (outcome == FLYING)
             outcome = np.where(over, int(Outcome.TIMEOUT), outcome)
             again, info = waiting, dict[str, Any]()
