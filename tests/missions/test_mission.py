@@ -115,6 +115,8 @@ def test_the_log_is_nan_after_the_end() -> None:
         flown_x = log.x[b, :K]
         assert torch.equal(flown_x[1:, 0].nan_to_num(), flown_x[: max(K - 1, 0), -1].nan_to_num())
         assert torch.equal(log.x[b, 0, 0], hovering(Airframe(), problem.x0[b : b + 1, :3])[0])
+    t, x = log.samples()
+    assert t.shape == (31,) and x.shape == (6, 31, 17) and float(t[-1]) == pytest.approx(0.3)
 
 
 def disturbed(B: int = 4) -> tuple[Problem, Mission]:

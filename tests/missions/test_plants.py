@@ -260,7 +260,7 @@ def test_the_plants_agree_on_a_short_mission() -> None:
     problem = mission_problem(free=True)
     planner = Planner(presets.al_ilqr(problem))
     plants = RotorPlant(), DroneModelsPlant(), DroneModelsPlant(drag=0.3)
-    a, b, dragged = (Mission(planner, plant=plant, duration=1.0).fly(problem).x[:, :, -1] for plant in plants)
+    a, b, dragged = (Mission(planner, plant=plant, duration=1.0).fly(problem).samples()[1] for plant in plants)
     assert ((a[:, -1, :3] - a[:, 0, :3]).norm(dim=-1) > 0.5).all()
     torch.testing.assert_close(a, b, rtol=0, atol=2e-5)
     assert (a - dragged).abs().max() > 0.05

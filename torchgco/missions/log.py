@@ -104,6 +104,13 @@ class MissionLog:
         worst = torch.maximum(self.tracking_violation[rows, step], tracking.violation)
         self.tracking_violation[rows, step] = worst
 
+    def samples(self) -> tuple[Tensor, Tensor]:
+        """Times (K J + 1,), s, and states (B, K J + 1, 17) of the plant at all time steps."""
+        B, K, J = self.commands.shape[:3]
+        x = torch.cat((self.x[:, :1, 0], self.x[:, :, 1:].reshape(B, K * J, 17)), dim=1)
+        t = torch.arange(K * J + 1, dtype=x.dtype) * (self.period / J)
+        return t, x
+
     def steps(self) -> np.ndarray:
         """Control steps that each mission made, (B,)."""
         return (~torch.isnan(self.planner_seconds)).sum(1).numpy()

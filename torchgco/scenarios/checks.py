@@ -313,7 +313,7 @@ def _of_each(value: Any, field: str, shape: tuple[int, ...], expected: str | Non
     return held
 
 
-def _present(values: np.ndarray, good: np.ndarray, centers: np.ndarray, field: str, expected: str) -> np.ndarray:
+def _present(values: np.ndarray, good: Any, centers: np.ndarray, field: str, expected: str) -> np.ndarray:
     """Values with rows that are `good` (L, M) where a centre (L, M, d) is there, and NaN elsewhere."""
     absent = np.isnan(centers).all(axis=2)
     _none_of(~absent & ~good, field, expected, values)
