@@ -13,7 +13,7 @@ from torchgco.base.status import STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import chord_clearance
 from torchgco.lagrangian.penalties import Penalty
-from torchgco.lagrangian.quality import has_arrived, is_preferred, leaves_goal
+from torchgco.lagrangian.quality import arrive_alike, has_arrived, is_preferred
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
@@ -108,7 +108,7 @@ class Best:
         fits = (old.best.violation <= limit) & (new.best.violation <= limit)
         if not bool(fits.any()):
             return
-        fits &= ~leaves_goal(problem, new.best.X, old.best.X) & ~leaves_goal(problem, old.best.X, new.best.X)
+        fits &= arrive_alike(problem, new.best.X, old.best.X)
         if not bool(fits.any()):
             return
         before, now = (chord_clearance(problem, end.best.X) >= 0 for end in (old, new))
@@ -243,10 +243,9 @@ class Search:
         held = best.cost.clone(), best.violation.clone()
         self.record.standings.append(Standing(self.call.rows, *held, away, self.best.arrived()))
 
-    def finish_record(self, unit: Tensor, constant: Tensor) -> SearchRecord | None:
+    def finish_record(self, unit: Tensor, constant: Tensor) -> SearchRecord:
         """The record, at the end of the search, with costs times a unit, plus a constant, both by place."""
-        if self.record is None:
-            return None
+        assert self.record is not None
         rows = (self.caught.status == STOPPED).nonzero().flatten()
         self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
         self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
@@ -264,16 +263,17 @@ class Search:
         "caught": all of them; "unarrived": no attempt has arrived yet; "far": none ends close to the goal either;
         "close": the best one does, but has not arrived; "unproposed": not arrived, and there was never a proposal.
         """
-        stopped = self.caught.status == STOPPED
-        if when != "caught":
-            stopped = stopped & ~self.best.arrived()
+        rows = (self.caught.status == STOPPED).nonzero().flatten()
+        if when == "caught" or rows.numel() == 0:
+            return rows
+        rows = rows[~self.best.arrived()[rows]]
         if when == "far":
-            stopped = stopped & ~self.best.arrived(ATTRACTED_WITHIN)
+            rows = rows[~self.best.arrived(ATTRACTED_WITHIN)[rows]]
         elif when == "close":
-            stopped = stopped & self.best.arrived(ATTRACTED_WITHIN)
+            rows = rows[self.best.arrived(ATTRACTED_WITHIN)[rows]]
         elif when == "unproposed":
-            stopped = stopped & ~self.proposed
-        return stopped.nonzero().flatten()
+            rows = rows[~self.proposed[rows]]
+        return rows
 
     def propose(self, proposals: PathProposals) -> None:
         """A pass of proposals: of a new round, or of the one that has begun."""
