@@ -20,7 +20,7 @@ from tests.trials import trials as hand_made
 from torchgco.experiments.flying import progress, study
 from torchgco.experiments.reports import mission_report, report
 from torchgco.experiments.reports.verify import verify
-from torchgco.experiments.statistics.mission_tables import mission_lines
+from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.missions import RotorPlant
 from torchgco.plotting import missions as draw
 
