@@ -15,6 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from benchmarks.lib.studies import torchgco
 from torchgco.experiments.reports.view import write_view
 
 PICTURE = Path(__file__).parent / "woods.jpg"
@@ -52,8 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         run = options.run or Path(folder)
         if options.run is None:
-            command = [sys.executable, "-m", "torchgco", *MISSION, f"hydra.run.dir={run}"]
-            subprocess.run(command, check=True)
+            torchgco(*MISSION, f"hydra.run.dir={run}")
         take(write_view(run, Path(folder) / "page.html"), ADDRESS, options.output)
     print(f"{options.output}: {options.output.stat().st_size / 1e3:.0f} kB")
     return 0

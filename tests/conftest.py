@@ -15,10 +15,15 @@ import omegaconf.base
 import pytest
 import torch
 import yaml
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.utils import JobRuntime
+from omegaconf import DictConfig
 
 from torchgco import kernels
-from torchgco.experiments.config import build
+from torchgco.experiments.config import build, checks
+from torchgco.experiments.config.groups import config_dir
 from torchgco.native.compiler import find_compiler
+from torchgco.native.store import trim
 
 ROOT = Path(__file__).parents[1]
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
@@ -49,7 +54,7 @@ _parse_once()
 
 def _compose_once() -> None:
     """The tests compose some configurations many times: what conf/ alone decides is composed once, and copied."""
-    slow = build.compose_config
+    slow, slow_load = build.compose_config, ConfigLoaderImpl.load_configuration
 
     @cache
     def known(words: tuple[str, ...], folder: str) -> dict[str, Any]:
@@ -58,7 +63,24 @@ def _compose_once() -> None:
     def quick(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> dict[str, Any]:
         return slow(overrides, searchpath) if searchpath else deepcopy(known(tuple(overrides), os.getcwd()))
 
-    build.compose_config = quick
+    loaded: dict[tuple[Any, ...], DictConfig] = {}
+
+    def load(self: ConfigLoaderImpl, config_name: str | None, overrides: list[str], *more: Any, **named: Any) -> Any:
+        """What commands compose; folders of a user's own may change from one to the next."""
+        places = tuple(str(entry.path).removeprefix("file://") for entry in self.config_search_path.get_path())
+        own = {place for place in places if "://" not in place} - {str(config_dir())}
+        if own or any("searchpath" in word for word in overrides):
+            return slow_load(self, config_name, overrides, *more, **named)
+        key = (config_name, JobRuntime().get("name"), places, *overrides, *more, *named.items())
+        if key not in loaded:
+            loaded[key] = slow_load(self, config_name, overrides, *more, **named)
+            trim(loaded, 32)  # of some MB each; a test's commands are much alike
+        config = deepcopy(loaded[key])  # with the interpolations, which are resolved later
+        config.hydra.runtime.cwd = os.getcwd()
+        return config
+
+    build.compose_config, ConfigLoaderImpl.load_configuration = quick, load
+    checks._read = cache(checks._read)
 
 
 _compose_once()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,10 @@ from benchmarks.lib import ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import FAMILIES, Family
 from benchmarks.lib.page import origin, put
+from benchmarks.lib.recorded import Told
 from torchgco import compose, judge
 from torchgco.base.draws import DrawKey
 from torchgco.guidance.gco import GCO
-from torchgco.guidance.mppi import MPPI
 from torchgco.lagrangian.quality import violation
 from torchgco.problem.problem import Problem
 from torchgco.solvers.caught import active_counts, caught_knots
@@ -62,9 +62,13 @@ class Witness:
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: Any, key: DrawKey) -> Any:
         self.plan = None
-        advice = replace(self.guidance, sampler=_noted(self.guidance.sampler, self)).update(problem, X, U, penalty, key)
+        sampler = Told.of(self.guidance.sampler, self._told)
+        advice = replace(self.guidance, sampler=sampler).update(problem, X, U, penalty, key)
         self._note(problem, X, U, key)
         return advice
+
+    def _told(self, problem: Problem, U: Tensor, key: DrawKey, X: Tensor) -> None:
+        self.plan = (key.ids, X)
 
     def _note(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> None:
         caught = caught_knots(problem, X, U)
@@ -90,22 +94,6 @@ class Witness:
                 frame["crosses"][row] = float(_crosses(part, path, plan[:, at]))
                 self.last[i] = plan[:, at].clone()
         self.rows.append(pd.DataFrame({name: value.numpy() for name, value in frame.items()}))
-
-
-@dataclass(frozen=True)
-class _Noted(MPPI):
-    """A sampler that passes its plans on to the witness."""
-
-    witness: Any = None
-
-    def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
-        X, plan = super().improve(problem, U, key)
-        self.witness.plan = (key.ids, X)
-        return X, plan
-
-
-def _noted(sampler: MPPI, witness: Witness) -> _Noted:
-    return _Noted(**{option.name: getattr(sampler, option.name) for option in fields(sampler)}, witness=witness)
 
 
 def _crosses(problem: Problem, path: Tensor, plan: Tensor) -> bool:

@@ -18,9 +18,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
+import pandas as pd
+import torch
+
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import filed, put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import filed, markdown, origin, put
 
 PAGE = RESULTS / "robustness.md"
 # Kinds of trials, and the tests that make them: files, folders, or parts of a test's name after "::".
@@ -64,9 +66,9 @@ def run_tests(folder: Path, arguments: Sequence[str]) -> tuple[Counter[tuple[str
     return cases, examples
 
 
-def case_table(cases: Mapping[tuple[str, str], int]) -> list[str]:
-    """A row per kind of trial."""
-    lines = ["| tried | cases | failed | skipped |", "| --- | --- | --- | --- |"]
+def case_table(cases: Mapping[tuple[str, str], int]) -> str:
+    """Markdown: a row per kind of trial."""
+    rows = []
     for kind, paths in KINDS.items():
         starts = tuple(path.removesuffix(".py") for path in paths)
         ends: Counter[str] = Counter()
@@ -74,46 +76,40 @@ def case_table(cases: Mapping[tuple[str, str], int]) -> list[str]:
             if name.startswith(starts):
                 ends[end] += count
         failed = ends["failure"] + ends["error"]
-        lines.append(f"| {kind} | {ends.total()} | {failed} | {ends['skipped']} |")
-    return lines
+        rows.append((kind, ends.total(), failed, ends["skipped"]))
+    return markdown(("tried", "cases", "failed", "skipped"), rows)
 
 
-def example_table(examples: Mapping[tuple[str, str], int]) -> list[str]:
-    """A row per kind of random example and outcome."""
-    rows = [f"| {kind} | {outcome} | {count:,} |" for (kind, outcome), count in sorted(examples.items())]
-    return ["| random examples | outcome | count |", "| --- | --- | --- |", *rows]
+def example_table(examples: Mapping[tuple[str, str], int]) -> str:
+    """Markdown: a row per kind of random example and outcome."""
+    rows = ((kind, outcome, f"{count:,}") for (kind, outcome), count in sorted(examples.items()))
+    return markdown(("random examples", "outcome", "count"), rows)
 
 
-def bomb_table() -> tuple[list[str], bool]:
-    """A row per small file that promises much, and whether each was refused within the limits."""
+def put_bombs(write: bool) -> bool:
+    """Try the small files that promise much, print their table, and with `write` put it into the page.
+
+    Returns whether each was refused within the limits.
+    """
     sys.path.insert(0, str(ROOT))
     from tests.bombs import BOMBS, BYTES, SECONDS, attempt
 
-    lines = ["| file | bytes | refused | seconds | MB |", "| --- | --- | --- | --- | --- |"]
-    right = True
+    held = []
     for name in BOMBS:
         with tempfile.TemporaryDirectory() as folder:
             told, seconds, memory, size = attempt(name, Path(folder))
         refused = ": expected " in told and "\n" not in told
-        right &= refused and seconds < SECONDS and memory < BYTES / 1e6
-        lines.append(f"| {name} | {size:,} | {'in one line' if refused else told} | {seconds:.1f} | {memory:.0f} |")
-    return lines, right
-
-
-def put_bombs(write: bool) -> bool:
-    """Print the table of bombs, and with `write` put it into the page; whether all is as it should be."""
-    lines, right = bomb_table()
-    origin = provenance("cpu")
-    held = [[cell.strip() for cell in line.split("|")[4:6]] for line in lines[2:]]
-    seconds, memory = (max((row[place] for row in held), key=float) for place in (0, 1))
-    refused = sum("| in one line |" in line for line in lines)
-    said = f"{refused} of {len(held)} refused in one line, in at most {seconds} s and {memory} MB."
-    head = f"Run on {origin['date']} at commit {origin['commit']}."
-    text = f"{head}\n\n{filed('robustness-files', chr(10).join(lines), said)}"
+        held.append((name, size, "in one line" if refused else told, seconds, memory))
+    tried = pd.DataFrame(held, columns=["file", "bytes", "refused", "seconds", "MB"])
+    refused = tried.refused == "in one line"
+    most = f"{tried.seconds.max():.1f} s and {tried.MB.max():.0f} MB"
+    said = f"{refused.sum()} of {len(tried)} refused in one line, in at most {most}."
+    rows = ((name, f"{size:,}", end, f"{seconds:.1f}", f"{memory:.0f}") for name, size, end, seconds, memory in held)
+    text = f"{origin('Run')}.\n\n{filed('robustness-files', markdown(tried.columns, rows), said)}"
     print(text)
     if write:
-        put_between(PAGE, "<!-- bombs -->", "<!-- end bombs -->", text)
-    return right
+        put(PAGE, "bombs", text)
+    return bool((refused & (tried.seconds < SECONDS) & (tried.MB < BYTES / 1e6)).all())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -128,18 +124,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if right else 1
     with tempfile.TemporaryDirectory() as folder:
         cases, examples = run_tests(Path(folder), more)
-    origin = provenance("cpu")
     counts = f"{sum(cases.values()):,} cases, {sum(examples.values()):,} random examples"
-    head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}: {counts}."
+    head = f"{origin('Run')}, torch {torch.__version__}: {counts}."
     ends: Counter[str] = Counter()
     for (_, outcome), count in examples.items():
         ends[outcome] += count
     said = f"Random examples: {', '.join(f'{count:,} {end}' for end, count in ends.most_common())}."
-    random = filed("robustness-random", "\n".join(example_table(examples)), said)
-    text = "\n\n".join([head, "\n".join(case_table(cases)), random])
+    random = filed("robustness-random", example_table(examples), said)
+    text = "\n\n".join([head, case_table(cases), random])
     print(text)
     if options.write:
-        put_between(PAGE, "<!-- robustness -->", "<!-- end robustness -->", text)
+        put(PAGE, "robustness", text)
     return 0 if right and all(end in ("passed", "skipped") for _, end in cases) else 1
 
 

@@ -33,6 +33,7 @@ from benchmarks.families.general_starts import (
 from benchmarks.lib import DATA
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.comparison import timed
+from benchmarks.lib.kept import append, rows_of
 from benchmarks.lib.limited import limited
 from torchgco import InputError, Problem
 from torchgco.baselines import CasADiSolver
@@ -53,7 +54,7 @@ def main(words: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     for name in asked.families:
         for row in flights(name, asked.seed, asked.limit, asked.family_limit, asked.file):
-            append(asked.file, row)
+            append(asked.file, COLUMNS, row)
             print(*(row.get(column, "-") for column in COLUMNS), flush=True)
     return 0
 
@@ -68,19 +69,9 @@ def _parser() -> ArgumentParser:
     return parser
 
 
-def rows_of(file: Path = FILE) -> pd.DataFrame:
-    """The kept rows; none where there is no file."""
-    return pd.read_csv(file) if file.is_file() else pd.DataFrame(columns=pd.Index(COLUMNS))
-
-
-def append(file: Path, row: dict[str, Any]) -> None:
-    """Add a row to the file, which is complete again when this returns."""
-    pd.DataFrame([row], columns=list(COLUMNS)).to_csv(file, mode="a", header=not file.is_file(), index=False)
-
-
 def known_of(name: str, seed: int, digests: Sequence[str], file: Path = FILE) -> pd.DataFrame:
     """The rows of a family's problems as they are drawn now."""
-    rows = rows_of(file)
+    rows = rows_of(file, COLUMNS)
     rows = rows[(rows.family == name) & (rows.seed == seed)]
     rows = rows[rows.digest == rows.instance.map(dict(enumerate(digests)))]
     return rows.astype(dict.fromkeys(("cost", "violation", "seconds"), float))

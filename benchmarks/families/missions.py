@@ -8,7 +8,6 @@ takes a few minutes.
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +17,8 @@ import pandas as pd
 import torch
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import chosen, filed, markdown, put, put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import chosen, filed, machine, markdown, origin, put, tally
+from benchmarks.lib.studies import flown, named
 from torchgco import compose
 from torchgco.experiments.statistics.statistics import wilson
 from torchgco.missions.outcome import Outcome
@@ -58,16 +57,12 @@ HEAD = ("missions", "planner", "n", *(outcome.name for outcome in Outcome), "fli
 
 def fly(case: str, solver: str, count: int, outputs: Path) -> pd.DataFrame:
     """The trials of one case, flown now or read."""
-    name = "".join(letter if letter.isalnum() else "-" for letter in f"{case}-{solver}-{count}-0")
-    folder = outputs / name
-    command = [
-        sys.executable, "-m", "torchgco", "experiment=mission_study", *CASES[case], f"solver={solver}",
-        f"study.layouts={count}", "study.baselines=[]", "study.workers=1", f"study.shard_size={AT_ONCE}",
-        "study.figures=false", f"hydra.run.dir={folder}",
-    ]  # fmt: skip
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    trials = pd.read_parquet(folder / "trials.parquet").assign(case=case)
-    return trials.assign(cause=_causes(trials, pd.read_parquet(folder / "mission.parquet")))
+    folder = outputs / named(f"{case}-{solver}-{count}-0")
+    trials = flown(
+        folder, "experiment=mission_study", *CASES[case], f"solver={solver}", f"study.layouts={count}",
+        "study.baselines=[]", "study.workers=1", f"study.shard_size={AT_ONCE}", "study.figures=false",
+    )  # fmt: skip
+    return trials.assign(case=case, cause=_causes(trials, pd.read_parquet(folder / "mission.parquet")))
 
 
 def _causes(trials: pd.DataFrame, log: pd.DataFrame) -> list[str]:
@@ -95,28 +90,25 @@ def misses(trials: pd.DataFrame) -> str:
     missed = trials[(trials["solver"] == "gco") & (trials["outcome"] != Outcome.REACHED.name)]
     if missed.empty:
         return "With `gco` no mission missed its goal."
-    lines = ["| missions | number | outcome | after | clearance | cause |", "|---|---|---|---|---|---|"]
-    lines += [
-        f"| {row.case} | {row.layout} | {row.outcome} | {row.flight_time:.2f} s | {row.clearance:.3f} m | {row.cause} |"
+    rows = (
+        (row.case, row.layout, row.outcome, f"{row.flight_time:.2f} s", f"{row.clearance:.3f} m", row.cause)
         for row in missed.itertuples()
-    ]
-    return "\n".join(["Every mission that missed its goal with `gco`:", "", *lines])
+    )
+    head = ("missions", "number", "outcome", "after", "clearance", "cause")
+    return f"Every mission that missed its goal with `gco`:\n\n{markdown(head, rows)}"
 
 
 def table(trials: pd.DataFrame) -> str:
     """Markdown: a row per case and planner, outcomes with 95 % Wilson intervals in percent."""
-    lines = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
+    lines = []
     for (case, solver), rows in trials.groupby(["case", "solver"], sort=False):
         cells: list[object] = [case, f"`{solver}`", len(rows)]
-        for outcome in Outcome:
-            count = int((rows["outcome"] == outcome.name).sum())
-            low, high = wilson(count, len(rows))
-            cells.append(f"{count} [{100 * low:.0f}, {100 * high:.0f}]" if count else "0")
+        cells += [tally(int((rows["outcome"] == outcome.name).sum()), len(rows)) for outcome in Outcome]
         reached = rows[rows["outcome"] == Outcome.REACHED.name]
         cells += [f"{reached['flight_time'].median():.2f} s", f"{reached['clearance'].min():.3f} m"]
         cells.append(f"{rows['shifted_plans'].mean():.1f}")
-        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown(HEAD, lines)
 
 
 def short(table: str, misses: str) -> str:
@@ -184,8 +176,7 @@ def _periods(words: list[str], seed: int, count: int = 1) -> list[np.ndarray]:
 
 
 def _origin(done: str) -> str:
-    origin = provenance("cpu")
-    return f"{done} on {origin['date']} at commit {origin['commit']}, seed 0, {origin['processor']}."
+    return f"{origin(done)}, seed 0, {machine()}."
 
 
 def _flown(asked: argparse.Namespace) -> str:
@@ -229,7 +220,7 @@ def main(words: Sequence[str] | None = None) -> int:
     for name, text in blocks.items():
         print(text)
         if asked.write:
-            put_between(RESULTS / "missions.md", f"<!-- {name} -->", f"<!-- end {name} -->", text)
+            put(RESULTS / "missions.md", name, text)
     return 0
 
 

@@ -8,7 +8,6 @@ results/ladder.md, unless --page names another page.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from benchmarks.lib import ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, FAMILIES, Family
 from benchmarks.lib.page import chosen, crossed, filed, interval, machine, markdown, origin, put, share, shown
+from benchmarks.lib.studies import flown
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.judging.judge import SUCCESS_VIOLATION
@@ -85,12 +85,10 @@ def fly(family: Family, asked: Namespace) -> pd.DataFrame:
 def study(family: Family, solver: str, asked: Namespace) -> pd.DataFrame:
     """The trials of one solver, with the family's name as scenario, and success by the best costs known now."""
     folder = asked.outputs / f"{family.name}-{asked.fresh}-{asked.seed}-{solver}"
-    command = [
-        sys.executable, "-m", "torchgco", *family.overrides(asked.fresh, asked.seed), f"solver={solver}",
-        "study.baselines=[]", "study.shard_size=32", f"hydra.run.dir={folder}", *asked.overrides,
-    ]  # fmt: skip
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    trials = pd.read_parquet(folder / "trials.parquet").assign(scenario=family.name)
+    trials = flown(
+        folder, *family.overrides(asked.fresh, asked.seed), f"solver={solver}", "study.baselines=[]",
+        "study.shard_size=32", *asked.overrides,
+    ).assign(scenario=family.name)  # fmt: skip
     best = family.file(asked.fresh, asked.seed)
     return succeeded(trials, Layouts.load(best)) if best.exists() else trials
 

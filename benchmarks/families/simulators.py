@@ -21,6 +21,7 @@ import torch
 
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.page import machine, markdown, origin, put, share
+from benchmarks.lib.studies import named
 from torchgco import Airframe, compose, presets
 from torchgco.missions import Mission, Outcome, Planner, endings
 from torchgco.missions.identification import identify, record
@@ -56,14 +57,10 @@ def cases(x2: str | None) -> list[Case]:
         Case("MuJoCo", "the paper's, as MJCF", "paper", lambda frame: MujocoPlant(frame), False),
         Case("RotorPy", "its crazyflie", "crazyflie", lambda frame: RotorpyPlant(frame, parameters="crazyflie")),
         Case(
-            "RotorPy",
-            "its hummingbird",
-            "paper",
-            lambda frame: RotorpyPlant(frame, parameters="hummingbird"),
-            blind=0,
-            most=32,
+            "RotorPy", "its hummingbird", "paper", lambda frame: RotorpyPlant(frame, parameters="hummingbird"),
+            blind=0, most=32,
         ),
-    ]
+    ]  # fmt: skip
     given = [Case("MuJoCo", "Skydio X2 of menagerie", "paper", lambda frame: MujocoPlant(frame, model=x2))]
     return [*own[:1], *(given if x2 else []), *own[1:]]
 
@@ -78,10 +75,8 @@ def base_of(name: str) -> Airframe:
 
 def flown(case: Case, identified: bool, count: int, outputs: Path) -> list[dict]:
     """A row for each mission, flown now or read."""
-    name = "".join(
-        c if c.isalnum() or c == "." else "-" for c in f"{case.simulator}-{case.vehicle}-{identified}-{SEED}.json"
-    )
-    kept: list[dict] = json.loads((outputs / name).read_text()) if (outputs / name).is_file() else []
+    file = outputs / f"{named(f'{case.simulator}-{case.vehicle}-{identified}-{SEED}')}.json"
+    kept: list[dict] = json.loads(file.read_text()) if file.is_file() else []
     frame = base_of(case.base)
     if identified:
         plant = case.make(frame)
@@ -98,15 +93,9 @@ def flown(case: Case, identified: bool, count: int, outputs: Path) -> list[dict]
                 "seconds": seconds,
             })  # fmt: skip
         outputs.mkdir(parents=True, exist_ok=True)
-        (outputs / name).write_text(json.dumps(kept))
-        print(
-            case.simulator,
-            case.vehicle,
-            identified,
-            len(kept),
-            [row["outcome"] for row in kept[-len(ids) :]],
-            flush=True,
-        )
+        file.write_text(json.dumps(kept))
+        ended = [row["outcome"] for row in kept[-len(ids) :]]
+        print(case.simulator, case.vehicle, identified, len(kept), ended, flush=True)
     return kept[:count]
 
 

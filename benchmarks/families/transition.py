@@ -7,7 +7,6 @@ With --write the figure and the table go into benchmarks/results.
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from matplotlib.lines import Line2D
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.page import cells_of, chosen, filed, machine, markdown, origin, put
+from benchmarks.lib.studies import torchgco
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting.style import INK, SMALL, legend, panels, save, solver_colours, tidy
@@ -59,12 +59,11 @@ def sweep(solver: str, asked: Namespace) -> None:
     """Fly one solver at all densities and speeds, in a folder of its own; what is there already isn't flown again."""
     peer = solver in PEERS
     densities, layouts = (PEER_DENSITIES, PEER_LAYOUTS) if peer else (DENSITIES, asked.layouts)
-    command = [
-        sys.executable, "-m", "torchgco", "-m", "scenario=woods", f"{DENSITY}={','.join(map(str, densities))}",
+    torchgco(
+        "-m", "scenario=woods", f"{DENSITY}={','.join(map(str, densities))}",
         f"{HORIZON}={','.join(map(str, STAGES))}", f"solver={solver}", "study.baselines=[]", "device.threads=1",
         f"study.layouts={layouts}", f"seed={asked.seed}", f"hydra.sweep.dir={asked.outputs / solver}",
-    ]  # fmt: skip
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    )  # fmt: skip
 
 
 def _parser() -> ArgumentParser:

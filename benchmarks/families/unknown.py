@@ -8,7 +8,6 @@ commit: those of `--count` missions per case, and with --long those of the long 
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import chosen, filed, machine, markdown, origin, put
-from torchgco.experiments.statistics.statistics import wilson
+from benchmarks.lib.page import chosen, filed, machine, markdown, origin, put, tally
+from benchmarks.lib.studies import flown, named
 from torchgco.missions.outcome import Outcome
 
 
@@ -88,15 +87,12 @@ PERIOD = 0.05  # s
 
 def fly(name: str, count: int, outputs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The trials of one case and the rows of their control periods, flown now or read."""
-    folder = outputs / f"{''.join(letter if letter.isalnum() else '-' for letter in name)}-{count}"
-    command = [
-        sys.executable, "-m", "torchgco", "experiment=mission_unknown", *CASES[name].overrides,
-        f"study.layouts={count}", "study.workers=1", "study.shard_size=1", "study.figures=false", "device.threads=1",
-        f"hydra.run.dir={folder}",
-    ]  # fmt: skip
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    trials, log = pd.read_parquet(folder / "trials.parquet"), pd.read_parquet(folder / "mission.parquet")
-    return trials.assign(case=name), log.assign(case=name)
+    folder = outputs / named(f"{name}-{count}")
+    trials = flown(
+        folder, "experiment=mission_unknown", *CASES[name].overrides, f"study.layouts={count}", "study.workers=1",
+        "study.shard_size=1", "study.figures=false", "device.threads=1",
+    )  # fmt: skip
+    return trials.assign(case=name), pd.read_parquet(folder / "mission.parquet").assign(case=name)
 
 
 def largest(log: pd.DataFrame) -> tuple[float, float, float]:
@@ -119,10 +115,7 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     lines = []
     for case, rows in trials.groupby("case", sort=False):
         steps, cells = log[log["case"] == case], [case, len(rows)]
-        for outcome in Outcome:
-            count = int((rows["outcome"] == outcome.name).sum())
-            low, high = wilson(count, len(rows))
-            cells.append(f"{count} [{100 * low:.0f}, {100 * high:.0f}]" if count else "0")
+        cells += [tally(int((rows["outcome"] == outcome.name).sum()), len(rows)) for outcome in Outcome]
         reached, (speed, acceleration, jerk) = rows[rows["outcome"] == Outcome.REACHED.name], largest(steps)
         safe = f"{int(steps['safe'].sum())} of {len(steps)}" if CASES[str(case)].at_rest else "-"
         late = steps["planner_seconds"][steps["step"] > 0] > PERIOD
@@ -188,8 +181,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/maps.md")
     asked = parser.parse_args(words)
     counts = {name: asked.count or (CASES[name].long if asked.long else CASES[name].count) for name in asked.cases}
-    flown = [fly(name, count, asked.outputs) for name, count in counts.items()]
-    trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*flown, strict=True))
+    tables = [fly(name, count, asked.outputs) for name, count in counts.items()]
+    trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
     head = f"{origin('Flown')}, seed 0, {machine()}."
     kind = "unknown-long" if asked.long else "unknown"
     flights = table(trials, log)

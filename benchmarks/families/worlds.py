@@ -17,10 +17,11 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.families.quality import source, study, succeeded
-from benchmarks.families.worlds_peers import FILE, NAMES, rows_of
+from benchmarks.families.worlds_peers import COLUMNS, FILE, NAMES
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import WORLDS
+from benchmarks.lib.kept import rows_of
 from benchmarks.lib.page import chosen, crossed, filed, machine, markdown, put, share, shown
 from torchgco.experiments.results.success import sound
 from torchgco.experiments.statistics.statistics import summarise
@@ -41,14 +42,14 @@ def main(words: Sequence[str] | None = None) -> int:
     for name in asked.worlds:
         trials = pd.concat([study(WORLDS[name], solver, asked) for solver in SOLVERS], ignore_index=True)
         if not asked.fresh:
-            trials = with_peers(name, trials, rows_of(asked.peers))
+            trials = with_peers(name, trials, rows_of(asked.peers, COLUMNS))
         new = table(trials, solved(name, trials, asked))
         print(markdown(HEAD, new), flush=True)
         rows += new
     if asked.write and set(asked.worlds) == set(WORLDS):
         head = f"{source(asked, 'world')}, two processes, {machine()}."
         if not asked.fresh:
-            head += _peers_source(rows_of(asked.peers))
+            head += _peers_source(rows_of(asked.peers, COLUMNS))
         name, file = ("drawn", "worlds-drawn") if asked.fresh else ("worlds", "worlds")
         put(RESULTS / "worlds.md", name, f"{head}\n\n{short(file, markdown(HEAD, rows))}")
     return 0

@@ -17,7 +17,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from torch import Tensor
 
@@ -25,6 +24,7 @@ from benchmarks.lib import acados
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.comparison import timed
 from benchmarks.lib.families import DATA, WORLDS, Family
+from benchmarks.lib.kept import append, rows_of
 from benchmarks.lib.limited import limited
 from benchmarks.lib.provenance import provenance
 from torchgco import Problem, compose, judge, presets
@@ -62,7 +62,7 @@ def main(words: Sequence[str] | None = None) -> int:
             for name in asked.worlds:
                 world = World.of(WORLDS[name], Path(folder) / name)
                 for row in flights(world, asked.solvers, block, asked.limit, asked.file):
-                    append(asked.file, row | {"date": origin["date"], "commit": origin["commit"]})
+                    append(asked.file, COLUMNS, row | {"date": origin["date"], "commit": origin["commit"]})
                     print(*(row[column] for column in COLUMNS[:-2] if column in row), flush=True)
     return 0
 
@@ -76,16 +76,6 @@ def _parser() -> ArgumentParser:
     parser.add_argument("--block", type=int, default=BLOCK, metavar="N", help="layouts of all worlds before the next")
     parser.add_argument("--file", type=Path, default=FILE, help="where the rows are kept")
     return parser
-
-
-def rows_of(file: Path) -> pd.DataFrame:
-    """The kept rows; none where there is no file."""
-    return pd.read_csv(file) if file.is_file() else pd.DataFrame(columns=pd.Index(COLUMNS))
-
-
-def append(file: Path, row: dict[str, object]) -> None:
-    """Add a row to the file, which is complete again when this returns."""
-    pd.DataFrame([row], columns=list(COLUMNS)).to_csv(file, mode="a", header=not file.is_file(), index=False)
 
 
 @dataclass
@@ -116,7 +106,7 @@ def flights(
 ) -> Iterator[dict[str, object]]:
     """The rows that the file lacks, one after the other, without date and commit."""
     keys = ["world", "solver", "layout", "layout_digest"]
-    known = {tuple(key) for key in rows_of(file)[keys].itertuples(index=False)}
+    known = {tuple(key) for key in rows_of(file, COLUMNS)[keys].itertuples(index=False)}
     for plugin, names in SOLVERS.items():
         lacking = [
             (name, layout)

@@ -68,6 +68,11 @@ def interval(hits: int, n: int, digits: int = 0) -> str:
     return f"[{low:.{digits}f}, {high:.{digits}f}]"
 
 
+def tally(hits: int, n: int) -> str:
+    """A count, with the interval of its rate where it isn't 0."""
+    return f"{hits} {interval(hits, n)}" if hits else "0"
+
+
 def share(hits: int, n: int, digits: int = 0) -> str:
     """How many of how many, with the interval; "-" of none."""
     return f"{int(hits)} of {int(n)} {interval(hits, n, digits)}" if n else "-"

@@ -50,7 +50,7 @@ from torchgco import (
     StateBounds,
 )
 from torchgco.exploration.sensing.sensors import Lidar
-from torchgco.exploration.sensing.world import World
+from torchgco.exploration.sensing.world import Motion, World
 
 STAGES = 100  # of a plan
 LIMIT = 100.0  # s, after which the challenge ends a run
@@ -185,7 +185,7 @@ def world_of(centers: np.ndarray) -> World:
     boxes = np.zeros((len(here), 16))
     boxes[:, :2], boxes[:, 3:12] = here, np.eye(3).ravel()
     boxes[:, 14], boxes[:, 15] = 1.0, RADIUS
-    return World(boxes, np.zeros((len(here), 3)))
+    return World(boxes, Motion.steady(np.zeros((len(here), 3))))
 
 
 @dataclass(frozen=True)

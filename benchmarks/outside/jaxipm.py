@@ -137,7 +137,7 @@ def by_ipopt(scenario: Scenario, places: Tensor) -> list[pd.DataFrame]:
     held = {"converged": ends, "iterations": iterations, "seconds": seconds}
     flights = [flight(scenario, places, MX, torch.from_numpy(np.stack(U)), **held)]
     prepared = IPOPT.prepare(problem)
-    found, whole = lib.timed(lambda: prepared.run_from(*guess))
+    found, whole = lib.timed(lambda: prepared.solve(problem, guess[1], X0=guess[0]))
     ended = {"converged": (found.status == Status.CONVERGED).numpy(), "iterations": found.iterations.numpy()}
     return [*flights, flight(scenario, places, SX, found.U, seconds=whole / problem.B, **ended)]
 

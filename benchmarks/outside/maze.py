@@ -65,8 +65,8 @@ def ours(name: str, problem: Problem, solver: Restarts) -> pd.DataFrame:
 
 def ipopt(problem: Problem) -> pd.DataFrame:
     """IPOPT from the waypoints, one start after the other; building the program isn't timed."""
-    solver = IPOPT.prepare(problem)
-    return COMPARISON.fly("IPOPT", problem, lambda: solver.run_from(*waypoint_guess(problem.x0)), guess=WAYPOINTS)
+    solver, (X0, U0) = IPOPT.prepare(problem), waypoint_guess(problem.x0)
+    return COMPARISON.fly("IPOPT", problem, lambda: solver.solve(problem, U0, X0=X0), guess=WAYPOINTS)
 
 
 def alone(problem: Problem) -> pd.DataFrame:
@@ -74,10 +74,11 @@ def alone(problem: Problem) -> pd.DataFrame:
     U = torch.full((problem.B, problem.N, problem.m), torch.nan, dtype=torch.float64)
     iterations, seconds = torch.full((2, problem.B), torch.nan, dtype=torch.float64)
     for b in range(problem.B):
-        prepared, guess = FATROP.prepare(problem.take(slice(b, b + 1))), waypoint_guess(problem.x0[b : b + 1])
+        one = problem.take(slice(b, b + 1))
+        prepared, (X0, U0) = FATROP.prepare(one), waypoint_guess(one.x0)
 
-        def solve(prepared=prepared, guess=guess) -> tuple[np.ndarray, int, float]:
-            solution, took = timed(lambda: prepared.run_from(*guess))
+        def solve(one=one, prepared=prepared, X0=X0, U0=U0) -> tuple[np.ndarray, int, float]:
+            solution, took = timed(lambda: prepared.solve(one, U0, X0=X0))
             return solution.U[0].numpy(), int(solution.iterations), took
 
         try:

@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks.lib import RESULTS
-from benchmarks.lib.page import put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import machine, origin, put_between
 from benchmarks.paper import flights, missions, planar_figures, quadrotor_figures, tables
 from benchmarks.paper.runs import Solve, planar, quadrotor
 from torchgco.plotting.style import save
@@ -84,8 +83,7 @@ def page_of(outputs: Path) -> Path:
 
 
 def _head() -> str:
-    origin = provenance("cpu")
-    return f"Measured on {origin['date']} at commit {origin['commit']}, {origin['processor']}."
+    return f"{origin('Measured')}, {machine()}."
 
 
 def write_picture(figure: Figure, path: Path) -> None:

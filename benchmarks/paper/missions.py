@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
+from benchmarks.lib import page
 from benchmarks.lib.recorded import solve
 from benchmarks.paper import drawing
 from benchmarks.paper.flights import Flight
@@ -142,9 +143,7 @@ def _tilt(fine: pd.DataFrame) -> float:
 
 def markdown(rows: pd.DataFrame) -> str:
     """The table in Markdown."""
-    lines = [["", *map(str, rows.columns)], ["---"] * (rows.shape[1] + 1)]
-    lines += [[str(name), *map(str, values)] for name, values in zip(rows.index, rows.to_numpy(), strict=True)]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+    return page.markdown(["", *rows.columns], rows.reset_index().to_numpy())
 
 
 def animate(flights: Sequence[Flight], outputs: Path) -> None:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from benchmarks.lib import page
 from benchmarks.paper import drawing
 from benchmarks.paper.runs import Solve, Step
 from torchgco.plotting import trajectory as draw
@@ -141,8 +142,7 @@ def markdown(rows: pd.DataFrame) -> str:
         "iterations, ours": [f"{x}" for x in rows.iterations],
         "outer iterations with guidance, ours": [f"{x}" for x in rows.guided],
     }
-    table = [heads, ["---"] * len(heads), *([name, *cells] for name, cells in lines.items())]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in table)
+    return page.markdown(heads, ([name, *cells] for name, cells in lines.items()))
 
 
 def _chosen(steps: Sequence[Step]) -> list[Step]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.lib.recorded import Told
 from benchmarks.paper.drawing import inside
 from torchgco import compose
 from torchgco.base.draws import DrawKey
@@ -81,25 +82,15 @@ class Witness:
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
         self.sampling = None
-        sampler = self.guidance.sampler
-        noted = _Noted(**{option.name: getattr(sampler, option.name) for option in fields(sampler)}, witness=self)
-        advice = replace(self.guidance, sampler=noted).update(problem, X, U, penalty, key)
+        sampler = Told.of(self.guidance.sampler, self._told)
+        advice = replace(self.guidance, sampler=sampler).update(problem, X, U, penalty, key)
         assert advice.penalty is not None
         path, center, radius = (x[0].clone().numpy() for x in (X, advice.penalty.center, advice.penalty.radius))
         self.solves[-1].append(Step(int(key.outer[0]), path[:, problem.position], center, radius, self.sampling))
         return advice
 
-
-@dataclass(frozen=True)
-class _Noted(MPPI):
-    """A sampler that tells the witness of its calls."""
-
-    witness: Any = None
-
-    def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
-        X, plan = super().improve(problem, U, key)
-        self.witness.sampling = Sampling(self.witness.guidance.sampler, problem, U.clone(), key, X[0].clone())
-        return X, plan
+    def _told(self, problem: Problem, U: Tensor, key: DrawKey, X: Tensor) -> None:
+        self.sampling = Sampling(self.guidance.sampler, problem, U.clone(), key, X[0].clone())
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from benchmarks.lib import acados
 from benchmarks.lib.families import FAMILIES
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import GUIDED, AcadosPeer, CasADiPeer, Peer, first
-from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import Setup
 from torchgco.judging.judge import Verdict, judge
 
@@ -46,7 +45,7 @@ def _family(bench: Bench, name: str, share: float) -> None:
     """
     setup = bench.setup(*FAMILIES[name].generated)
     with tempfile.TemporaryDirectory() as folder:
-        peers = [peer for peer in _peers(bench, name, setup, Path(folder)) if _flown(bench, name, peer)]
+        peers = [peer for peer in _peers(bench, name, setup, Path(folder)) if peer.flies(bench, SECTION, name)]
         flights = _fly(bench, name, setup, share)
         for peer in reversed(peers):
             peer.fly(bench)
@@ -70,16 +69,6 @@ def _peers(bench: Bench, name: str, setup: Setup, folder: Path) -> list[Peer]:
     if name in sizes.ipopt_families:
         peers.append(CasADiPeer.ready(bench, "ipopt", first(task, sizes.ipopt_layouts)))
     return peers
-
-
-def _flown(bench: Bench, name: str, peer: Peer) -> bool:
-    """Fly a peer for the first time; False, with a row that says why, where it fails."""
-    try:
-        peer.fly(bench)
-    except (InputError, RuntimeError) as error:
-        bench.row(SECTION, name, peer.name, "ended with", str(error).strip().splitlines()[-1][:80])
-        return False
-    return True
 
 
 def _fly(bench: Bench, name: str, setup: Setup, share: float) -> list[Ours]:

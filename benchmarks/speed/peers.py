@@ -16,6 +16,7 @@ from torch import Tensor
 
 from benchmarks.lib import acados
 from benchmarks.speed.bench import Bench, Took
+from torchgco.base.errors import InputError
 from torchgco.baselines import GuidedCasADi
 from torchgco.judging.judge import Verdict, judge
 from torchgco.scenarios import Task
@@ -79,6 +80,15 @@ class Peer(ABC):
         self.times.append(took.each(self.count))
         self.verdict = judge(self.task.problem, U, self.task.goal, self.task.goal_radius)
         bench.say(f"  {self.name} flew {self.count}: {self.times[-1].seconds:.3g} s per problem")
+
+    def flies(self, bench: Bench, section: str, case: str) -> bool:
+        """As `fly`; False, with a row that says why, where it fails."""
+        try:
+            self.fly(bench)
+        except (InputError, RuntimeError) as error:
+            bench.row(section, case, self.name, "ended with", str(error).strip().splitlines()[-1][:80])
+            return False
+        return True
 
 
 @dataclass

@@ -16,7 +16,6 @@ from benchmarks.lib import acados
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import AcadosPeer, CasADiPeer, Peer, first
 from torchgco import Problem, Spheres
-from torchgco.base.errors import InputError
 from torchgco.judging.judge import Verdict, judge
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.scenarios import Task
@@ -70,7 +69,10 @@ def _beside_peers(bench: Bench, case: str, task: Task, peers: bool) -> float:
     seconds = _ours(bench, case, task)
     if peers:
         with tempfile.TemporaryDirectory() as folder:
-            _fly(bench, case, first(task, bench.sizes.peers_layouts), Path(folder))
+            for peer in _peers(bench, first(task, bench.sizes.peers_layouts), Path(folder)):
+                if peer.flies(bench, SECTION, case):
+                    assert peer.verdict is not None
+                    _say(bench, case, peer.name, peer.took, peer.verdict)
     return seconds
 
 
@@ -86,18 +88,6 @@ def _peers(bench: Bench, task: Task, folder: Path) -> Iterator[Peer]:
     yield CasADiPeer.ready(bench, "fatrop", task)
     if acados.installed():
         yield AcadosPeer.ready(bench, "acados", task, folder)
-
-
-def _fly(bench: Bench, case: str, task: Task, folder: Path) -> None:
-    """The peers on the first layouts; a row says why where one fails."""
-    for peer in _peers(bench, task, folder):
-        try:
-            peer.fly(bench)
-        except (InputError, RuntimeError) as error:
-            bench.row(SECTION, case, peer.name, "ended with", str(error).strip().splitlines()[-1][:80])
-            continue
-        assert peer.verdict is not None
-        _say(bench, case, peer.name, peer.took, peer.verdict)
 
 
 def _say(bench: Bench, case: str, solver: str, took: Took, verdict: Verdict) -> float:

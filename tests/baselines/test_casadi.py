@@ -121,17 +121,17 @@ def test_a_guess_of_states(plugin: str) -> None:
     problem, U0 = three_problems()
     prepared = CasADiSolver(plugin).prepare(problem)
     plain = prepared.solve(problem, U0)
-    same = prepared.run_from(open_loop(problem.dynamics, problem.x0, U0), U0)
+    same = prepared.solve(problem, U0, X0=open_loop(problem.dynamics, problem.x0, U0))
     assert torch.equal(same.U, plain.U) and torch.equal(same.iterations, plain.iterations)
-    near = prepared.run_from(plain.X, plain.U)
+    near = prepared.solve(problem, plain.U, X0=plain.X)
     assert near.statuses == [Status.CONVERGED] * 3
-    assert bool((near.iterations < prepared.run_from(plain.X.flip(1), U0).iterations).all())
+    assert bool((near.iterations < prepared.solve(problem, U0, X0=plain.X.flip(1)).iterations).all())
     with pytest.raises(InputError, match="X0"):
-        prepared.run_from(plain.X[:, 1:], U0)
+        prepared.solve(problem, U0, X0=plain.X[:, 1:])
     with pytest.raises(InputError, match="X0"):
-        prepared.run_from(plain.X.float(), U0)
+        prepared.solve(problem, U0, X0=plain.X.float())
     with pytest.raises(InputError, match="U0"):
-        prepared.run_from(plain.X, U0[:, 1:])
+        prepared.solve(problem, U0[:, 1:], X0=plain.X)
 
 
 def test_every_kind_of_row_holds() -> None:

@@ -12,6 +12,7 @@ from benchmarks.families import general, general_exact, general_peers
 from benchmarks.families.general_problems import FAMILIES
 from benchmarks.families.general_starts import STARTS, digest, judged, starts
 from benchmarks.families.general_tables import FAMILY_HEAD, SET_HEAD, better, references_of, within, worse
+from benchmarks.lib.kept import append, rows_of
 from tests.slow import mostly
 
 
@@ -80,8 +81,8 @@ def test_peers_are_those_of_the_problems_as_they_are_drawn(tmp_path: Path) -> No
     ]  # fmt: skip
     for peer, start, status, cost in rows:
         own = {"peer": peer, "start": start, "status": status, "cost": cost}
-        general_peers.append(file, base | own | {"instance": 0, "digest": digests[0]})
-        general_peers.append(file, base | own | {"instance": 1, "digest": "changed"})
+        append(file, general_peers.COLUMNS, base | own | {"instance": 0, "digest": digests[0]})
+        append(file, general_peers.COLUMNS, base | own | {"instance": 1, "digest": "changed"})
     known = general_peers.known_of(family.name, 0, digests, file)
     assert set(known.instance) == {0} and len(known) == 5
     (found,) = references_of(known).to_dict("records")
@@ -94,7 +95,7 @@ def test_peers_are_those_of_the_problems_as_they_are_drawn(tmp_path: Path) -> No
 
 
 def test_kept_peers_are_of_known_families() -> None:
-    rows = general_peers.rows_of()
+    rows = rows_of(general_peers.FILE, general_peers.COLUMNS)
     assert set(rows.family) <= set(FAMILIES) and set(rows.start) <= set(STARTS)
     assert not rows.duplicated(["family", "seed", "instance", "digest", "peer", "start"]).any()
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from benchmarks.families import oracle, quality
-from benchmarks.lib import ROOT
+from benchmarks.lib import ROOT, studies
 from benchmarks.lib.families import FAMILIES
 from torchgco import compose
 from torchgco.base.errors import InputError
@@ -32,7 +32,7 @@ def studies_here(monkeypatch) -> None:
         monkeypatch.setattr(sys, "argv", command[2:])
         assert app.main() == 0
 
-    monkeypatch.setattr(quality, "subprocess", SimpleNamespace(run=started, DEVNULL=subprocess.DEVNULL))
+    monkeypatch.setattr(studies, "subprocess", SimpleNamespace(run=started, DEVNULL=subprocess.DEVNULL))
     monkeypatch.setattr(study, "write_report", lambda *arguments: "")
 
 

@@ -12,6 +12,7 @@ import torch
 from benchmarks.families import worlds, worlds_peers
 from benchmarks.lib import acados
 from benchmarks.lib.families import WORLDS
+from benchmarks.lib.kept import append, rows_of
 from tests.problems import quadrotor_batch
 from torchgco import Problem, compose, judge, presets
 from torchgco.baselines import CasADiSolver
@@ -38,7 +39,7 @@ def fly(world: worlds_peers.World, file: Path, solvers: list[str], layouts: list
     """The flights that were made, as (solver, layout, guess)."""
     made = []
     for row in worlds_peers.flights(world, solvers, layouts, 60, file):
-        worlds_peers.append(file, row | {"date": "2026-01-01", "commit": "abc"})
+        append(file, worlds_peers.COLUMNS, row | {"date": "2026-01-01", "commit": "abc"})
         made.append((row["solver"], row["layout"], row["guess"]))
     return made
 
@@ -48,7 +49,7 @@ def test_kept_flights_are_those_of_the_layouts(name: str) -> None:
     """Where a digest takes in more than before, these flights are lost to the tables without a word."""
     setup = compose(WORLDS[name].overrides())
     now = layout_digests(setup.task().layouts, setup.configuration["model"]["vehicle"])
-    rows = worlds_peers.rows_of(worlds_peers.FILE)
+    rows = rows_of(worlds_peers.FILE, worlds_peers.COLUMNS)
     rows = rows[rows["world"] == name]
     assert len(rows) >= 96 and rows["layout_digest"].tolist() == rows["layout"].map(now).tolist()
 
@@ -62,7 +63,7 @@ def test_a_stopped_run_resumes(tmp_path: Path) -> None:
     assert fly(world, file, ["fatrop"], [0, 1]) == []
     world.digests[1] = "changed"
     assert fly(world, file, ["fatrop"], [0, 1]) == [("fatrop", 1, "rest")]
-    rows = worlds_peers.rows_of(file)
+    rows = rows_of(file, worlds_peers.COLUMNS)
     assert tuple(rows.columns) == worlds_peers.COLUMNS and len(rows) == 5
     solution = CasADiSolver("fatrop").solve(world.problem(0), world.task.U0[:1])
     verdict = judge(world.problem(0), solution.U, world.task.goal[:1], 0.5)
@@ -121,6 +122,6 @@ def test_the_table_counts_the_peers() -> None:
 
 
 def test_the_kept_rows_are_of_known_worlds_and_solvers() -> None:
-    rows = worlds_peers.rows_of(worlds_peers.FILE)
+    rows = rows_of(worlds_peers.FILE, worlds_peers.COLUMNS)
     assert set(rows["world"]) <= set(WORLDS) and set(rows["solver"]) <= set(worlds_peers.NAMES)
     assert not rows.duplicated(["world", "solver", "layout", "layout_digest"]).any()

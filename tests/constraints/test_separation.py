@@ -105,7 +105,7 @@ def test_solves_natively_and_in_pytorch_as_ipopt_does(native: bool) -> None:
     near = problem.constraints[0].value(found.X, found.U).flatten(1).amax(-1)
     assert float(near.min()) > -1e-2  # the distance binds in every problem
     if native:
-        there = CasADiSolver("ipopt").prepare(problem).run_from(found.X, found.U)
+        there = CasADiSolver("ipopt").solve(problem, found.U, X0=found.X)
         torch.testing.assert_close(found.cost, there.cost, rtol=1e-6, atol=0)
         assert float(certify(problem, found.X, found.U).kkt_residual.max()) < 1e-4
 

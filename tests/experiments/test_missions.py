@@ -18,9 +18,9 @@ from tests.experiments.commands import problem_line
 from tests.trials import missions
 from tests.trials import trials as hand_made
 from torchgco.experiments.flying import progress, study
-from torchgco.experiments.reports import report
+from torchgco.experiments.reports import mission_report, report
 from torchgco.experiments.reports.verify import verify
-from torchgco.experiments.statistics.mission_tables import mission_lines
+from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.missions import RotorPlant
 from torchgco.plotting import missions as draw
 
@@ -56,6 +56,15 @@ def test_one_mission_writes_log_figures_and_animation(run, tmp_path, monkeypatch
     assert code == 0 and "Already done" in out and "TIMEOUT after 0.20 s" in out
 
 
+@pytest.fixture
+def few_figures(monkeypatch) -> None:
+    """No animation, and empty figures of what has no place: the first test draws them all, for most of its time."""
+    monkeypatch.setattr(mission_report, "mission_animation", lambda *_: None)
+    for name in ("compute", "commands", "states", "tracking"):
+        monkeypatch.setattr(draw, f"{name}_figure", lambda *_: Figure())
+
+
+@pytest.mark.usefixtures("few_figures")
 def test_a_mission_with_a_footprint_is_drawn_and_verified_with_it(run, tmp_path) -> None:
     """The command's own judge: a flat body beside a sphere, which it touches unless it is turned, as by hand."""
     body = ["+model.vehicle.footprint=[[-0.3,-0.3,-0.1],[0.3,0.3,0.1]]", "+model.vehicle.cells=[2,2,1]"]
@@ -71,6 +80,7 @@ def test_a_mission_with_a_footprint_is_drawn_and_verified_with_it(run, tmp_path)
     assert not verified.differs
 
 
+@pytest.mark.usefixtures("few_figures")
 def test_the_figures_show_all_commands(run, tmp_path, monkeypatch) -> None:
     seen = {}
     for name in ("commands", "states", "distance"):

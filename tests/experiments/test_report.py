@@ -8,11 +8,10 @@ import pytest
 from tests.trials import flights, manifest, missions, trials
 from torchgco.base.errors import InputError
 from torchgco.experiments.reports.report import main, write_report
-from torchgco.experiments.results.kinds import format_report, joined, parts_of
+from torchgco.experiments.results.kinds import TRAJECTORIES, format_report, joined, parts_of
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
-from torchgco.experiments.statistics.tables import format_table
 from torchgco.scenarios.layouts import Layouts
 
 HITS = [i < 30 for i in range(32)]
@@ -29,7 +28,7 @@ def study(folder: Path, *rows: dict[str, Any], **configuration: Any) -> Path:
 
 def table(*rows: dict[str, Any]) -> str:
     frame = trials(*rows)
-    return format_table(summarise(frame), compare(frame))
+    return TRAJECTORIES.text(summarise(frame), compare(frame))
 
 
 def test_rates_are_written_with_counts_and_interval() -> None:
@@ -278,7 +277,7 @@ def test_pairs_without_a_trial_are_not_printed_and_whole_numbers_have_no_point()
     summary, pairs = summarise(trials(*rows)), compare(trials(*({**row, "success": pd.NA} for row in rows)))
     pairs.insert(2, "scenario.num_obstacles", 10.0)
     summary.insert(2, "scenario.num_obstacles", 10.0)
-    text = format_table(summary, pairs)
+    text = TRAJECTORIES.text(summary, pairs)
     paired = text.split("\n\n")[-2]
     assert "reached" in paired and "success" not in paired
     assert "10.0" not in text and paired.splitlines()[1].startswith("10 ")

@@ -15,10 +15,10 @@ from tests.trials import trials
 from torchgco.experiments.reports.report import main
 from torchgco.experiments.results.folder import read_manifest
 from torchgco.experiments.results.identity import Manifest, digest, layout_digests
+from torchgco.experiments.results.kinds import TRAJECTORIES
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import summarise
-from torchgco.experiments.statistics.tables import format_table
 from torchgco.scenarios import Layouts
 
 HIT, MISS = True, False
@@ -91,7 +91,7 @@ def test_flights_on_different_layouts_are_never_paired(tmp_path) -> None:
     table = merge([tmp_path])
     assert counts(table, OBSTACLES) == {(5, "gco"): (4, 4), (60, "al_ilqr"): (0, 4)}
     assert pairs(table, OBSTACLES) == []
-    text = format_table(summarise(table), compare(table))
+    text = TRAJECTORIES.text(summarise(table), compare(table))
     assert "num_obstacles  solver" in text and "gco - al_ilqr" not in text
 
 

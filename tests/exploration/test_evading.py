@@ -21,7 +21,7 @@ def swinging(seed: int, count: int = 9) -> tuple[Moving, np.ndarray, Motion]:
     boxes[:, 12:15], boxes[:, 15] = rng.uniform(0.2, 0.6, (count, 3)), rng.uniform(0, 0.2, count)
     sines = rng.uniform(-1, 1, (count, 2, 3)), rng.uniform(0.2, 1, (count, 2, 3)), rng.uniform(0, 6, (count, 2, 3))
     motion = Motion(rng.uniform(-0.5, 0.5, (count, 3)), *sines)
-    return Known(World(boxes, motion.velocities, swings=motion)).now(0.0), boxes, motion
+    return Known(World(boxes, motion)).now(0.0), boxes, motion
 
 
 def far(points: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def distance(boxes: np.ndarray, motion: Motion, p: np.ndarray, t: float) -> np.n
 
 def test_known_boxes_are_boxes_where_they_will_be() -> None:
     moving, boxes, motion = swinging(0)
-    later = Known(World(boxes, motion.velocities, swings=motion)).now(0.7)
+    later = Known(World(boxes, motion)).now(0.7)
     rng = np.random.default_rng(1)
     points, t = rng.uniform([2, -2, 1], [12, 2, 3], (60, 3)), rng.uniform(0, 3, 60)
     for own, at in ((moving, 0.0), (later, 0.7)):

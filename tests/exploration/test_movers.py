@@ -10,6 +10,7 @@ from torchgco import Goal, Problem, Spheres, compose
 from torchgco.exploration.movers import Known, Moving, Tracks, clusters, seen_ball
 from torchgco.exploration.sensing import Lidar, SeenMap, World
 from torchgco.exploration.sensing.grid import OCCUPIED
+from torchgco.exploration.sensing.world import Motion
 
 
 def ball(center: list[float], radius: float) -> np.ndarray:
@@ -21,9 +22,9 @@ def watched(velocity: list[float], steps: int, wall: bool = True) -> tuple[Track
     boxes = [ball([5.0, -2.0, 0.0], 0.5)]
     if wall:
         boxes.append(np.concatenate([[8.0, 0.0, 0.0], np.eye(3).ravel(), [0.2, 6.0, 2.0], [0.0]]))
-    world = World(np.array(boxes), np.array([velocity, [0.0, 0.0, 0.0]])[: len(boxes)])
+    world = World(np.array(boxes), Motion.steady(np.array([velocity, [0.0, 0.0, 0.0]])[: len(boxes)]))
     lidar, seen = Lidar(noise=0.01), SeenMap(np.array([-1.0, -6.0, -2.0]), (60, 60, 20), 0.2)
-    tracks, without = Tracks(lidar.pitch), World(world.boxes[1:], world.velocities[1:])
+    tracks, without = Tracks(lidar.pitch), World(world.boxes[1:], world.motion.take(np.arange(1, len(boxes))))
     for step in range(-8, steps):  # at first without the sphere
         now = world.at(0.1 * step) if step >= 0 else without
         scan = lidar.scan(now, [0.0, 0.0, 0.0], [1, 0, 0, 0], 0.0, (0, 0, step + 8))
@@ -93,7 +94,8 @@ def test_returns_are_joined_to_clusters_and_single_ones_left_out() -> None:
 
 
 def test_a_ball_is_found_from_its_near_side() -> None:
-    world, lidar = World(np.array([ball([4.0, 1.0, 0.5], 0.6)]), np.zeros((1, 3))), Lidar(rays=(720, 180), noise=0.0)
+    world = World(np.array([ball([4.0, 1.0, 0.5], 0.6)]), Motion.steady(np.zeros((1, 3))))
+    lidar = Lidar(rays=(720, 180), noise=0.0)
     scan = lidar.scan(world, [0.0, 0.0, 0.0], [1, 0, 0, 0], 0.0, (0, 0, 0))
     hit = np.isfinite(scan.distances)
     center, radius = seen_ball(scan.distances[hit, None] * scan.directions[hit], np.zeros(3), lidar.pitch)

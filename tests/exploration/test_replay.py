@@ -23,17 +23,17 @@ def test_the_map_and_the_safe_periods_are_found_again_from_the_states() -> None:
     log = flight.fly(problem, seed=5, ids=ids)
     for b, number in enumerate(ids.tolist()):
         K = int(log.steps()[b])
-        found = replayed(flight, problem.take(torch.tensor([b])), log.x[b, :K, 0], 5, number)
-        assert len(found.seen.changes) == len(found.sought) == K == 30
-        for (cells, states), (own, new) in zip(log.seen[b].changes, found.seen.changes, strict=True):
+        seen, sought = replayed(flight, problem.take(torch.tensor([b])), log.x[b, :K, 0], 5, number)
+        assert len(seen.changes) == len(sought) == K == 30
+        for (cells, states), (own, new) in zip(log.seen[b].changes, seen.changes, strict=True):
             np.testing.assert_array_equal(cells, own)
             np.testing.assert_array_equal(states, new)
-        again = safe_periods(replace(found.seen, safe=log.seen[b].safe), 0.95 * 0.2, log.period)
+        again = safe_periods(replace(seen, safe=log.seen[b].safe), 0.95 * 0.2, log.period)
         np.testing.assert_array_equal(again, safe_periods(log.seen[b], 0.95 * 0.2, log.period))
-        for path, x in zip(found.sought, log.x[b, :K, 0].numpy(), strict=True):
+        for path, x in zip(sought, log.x[b, :K, 0].numpy(), strict=True):
             assert np.linalg.norm(path[0] - x[:3]) < 0.1 and np.allclose(path[-1], GOALS[b])
             assert np.linalg.norm(np.diff(path[1:-1], axis=0), axis=1).max() < 0.4 * 3**0.5 + 1e-6
-        assert len(found.seen.changes[0][0]) > 100  # it sees something at once
+        assert len(seen.changes[0][0]) > 100  # it sees something at once
 
 
 def test_only_one_mission_with_a_sensor_is_replayed() -> None:

@@ -6,10 +6,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.trials import flights, missions, trials
-from torchgco.experiments.statistics.mission_statistics import summarise_missions
+from torchgco.experiments.statistics.missions import summarise_missions
 from torchgco.experiments.statistics.statistics import summarise
+from torchgco.plotting.rates import sweep_figure
 from torchgco.plotting.style import solver_colours
-from torchgco.plotting.sweeps import sweep_figure
 
 VARIABLE = "scenario.num_obstacles"
 

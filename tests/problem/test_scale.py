@@ -120,11 +120,12 @@ def in_units(s: float, kind: str) -> Problem:
     weights = {"Q": [1.0, 1.0, 0.1, 0.1], "R": [0.1, 0.1], "Qf": [20.0, 20.0, 1.0, 1.0]}
     cost = QuadraticCost(**{name: [w / s**2 for w in W] for name, W in weights.items()}, x_ref=[s, 0.0, 0.0, 0.0])
     slow = StateBounds([-9.0 * s, -9.0 * s, -0.5 * s, -0.5 * s], [9.0 * s, 9.0 * s, 0.5 * s, 0.5 * s], slice(5, 9))
+    unit = {"s": torch.full((16, 1), s, dtype=D)}  # a value of each problem: one library serves all of them
     rows = {
         "controls": [ControlBounds(-s, s)],
         "states": [slow, ControlBounds(-2.0 * s, 2.0 * s)],
-        "rows of order 1": [FunctionConstraint(lambda u: torch.cat((u / s - 1.0, -u / s - 1.0), -1), of="u")],
-        "norm": [FunctionConstraint(lambda u: u.square().sum(-1, keepdim=True) - s**2, of="u")],
+        "rows of order 1": [FunctionConstraint(lambda u, s: torch.cat((u / s, -u / s), -1) - 1.0, of="u", values=unit)],
+        "norm": [FunctionConstraint(lambda u, s: (u.square() - 0.5 * s**2).sum(-1, keepdim=True), of="u", values=unit)],
     }[kind]
     return Problem(drag, cost, rows, s * x0, 8)
 
@@ -199,10 +200,12 @@ def test_equality_rows_in_mixed_units_change_no_answer(units: tuple[float, float
         number = lambda *shape: torch.rand(*shape, generator=random, dtype=D)
         s = torch.tensor([units[0]] * 3 + [units[1]] * 3, dtype=D)
         decay, w, r, aim = 0.9 + 0.1 * number(6), 0.5 + 4.0 * number(6), 0.3 + number(6), 2.0 * number(6) - 1.0
-        away = lambda x: (w * (x / s - aim).square()).sum(-1)
-        cost = FunctionCost(lambda x, u: away(x) + (r * (u / s).square()).sum(-1), lambda x: 5.0 * away(x))
-        rows = lambda u: (u / s).unflatten(-1, (2, 3)).sum(-1) * s[::3] - sums * s[::3]
-        parts = [FunctionConstraint(rows, "equality", of="u"), ControlBounds(-0.6 * s, 0.6 * s)]
+        away = lambda x, s: (w * (x / s - aim).square()).sum(-1)
+        stage, last = lambda x, u, s: away(x, s) + (r * (u / s).square()).sum(-1), lambda x, s: 5.0 * away(x, s)
+        rows = lambda u, s: (u / s).unflatten(-1, (2, 3)).sum(-1) * s[..., ::3] - sums * s[..., ::3]
+        unit = {"s": s.unsqueeze(0)}
+        parts = [FunctionConstraint(rows, "equality", of="u", values=unit), ControlBounds(-0.6 * s, 0.6 * s)]
+        cost = FunctionCost(stage, last, unit)
         model = FunctionDynamics(lambda x, u: decay * x + 0.5 * u, 6, 6, 1.0, "none")
         return Problem(model, cost, parts, s * (2.0 * number(1, 6) - 1.0), 12)
 
@@ -232,19 +235,19 @@ def mixed(kind: str, states: Tensor, controls: Tensor) -> Problem:
         number(2),
         number(2),
     )
-    rates = lambda x, u: (x @ A.T + torch.tanh(u @ B.T) + 0.2 * x.sin()) / states
-    away = lambda x: (q * (x * states - goal).square()).sum(-1)
-    cost = FunctionCost(lambda x, u: away(x) + (r * (u * controls).square()).sum(-1), lambda x: 5.0 * away(x))
+    units = {"y": states.unsqueeze(0), "v": controls.unsqueeze(0)}
+    rates = lambda x, u: x @ A.T + torch.tanh(u @ B.T) + 0.2 * x.sin()
+    away = lambda x, y: (q * (x * y - goal).square()).sum(-1)
+    cost = FunctionCost(
+        lambda x, u, y, v: away(x, y) + (r * (u * v).square()).sum(-1), lambda x, y, v: 5.0 * away(x, y), units
+    )
     ends = torch.stack((x0, goal))
     low, high = (ends.amin(0) - 0.02) / states, (ends.amax(0) + 0.02) / states
     rows = {
         "states": StateBounds(low, high, slice(1, None)),
-        "product": FunctionConstraint(lambda x, u: (x * states * u * controls)[..., :1] - 0.05, of="xu"),
-        "equality": FunctionConstraint(
-            lambda u: (u * controls).square().sum(-1, keepdim=True) - 0.1, "equality", of="u"
-        ),
+        "product": FunctionConstraint(lambda x, u, y, v: (x * y * u * v)[..., :1] - 0.05, of="xu", values=units),
     }[kind]
-    model = FunctionDynamics(lambda x, u: rates(x * states, u * controls), 2, 2, 0.1, "rk4")
+    model = FunctionDynamics(lambda x, u, y, v: rates(x * y, u * v) / y, 2, 2, 0.1, "rk4", values=units)
     return Problem(model, cost, [rows], (x0 / states).unsqueeze(0), 15)
 
 

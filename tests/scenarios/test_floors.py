@@ -15,7 +15,7 @@ from torchgco.experiments.config.build import compose
 from torchgco.experiments.results.identity import layout_digests
 from torchgco.maps import OccupancyGrid
 from torchgco.scenarios import Floors, Layouts, concatenate
-from torchgco.scenarios.plans import RIM, Canvas, rooms, track
+from torchgco.scenarios.floors import RIM, Canvas
 
 SMALL: dict[str, Any] = {"size": (9.0, 7.0), "apart": 4.0}
 
@@ -57,7 +57,7 @@ def test_all_rooms_are_joined_by_doors_and_walls_are_as_thick_as_asked() -> None
     thick = set()
     for seed in range(20):
         canvas = Canvas.of((20.0, 14.0), 0.1)
-        rooms(np.random.default_rng(seed), canvas, (0.1, 1.6), 2.4, (1.0, 1.6), 0.0, 0.0, (0.3, 1.4))
+        Floors(loops=0.0, furniture=0.0).draw_rooms(np.random.default_rng(seed), canvas)
         free = ~canvas.occupied
         away = 0.1 * distance_transform_edt(free)
         regions, _ = label(away > 0.3)
@@ -71,8 +71,8 @@ def test_all_rooms_are_joined_by_doors_and_walls_are_as_thick_as_asked() -> None
 
 def test_furniture_keeps_off_doors() -> None:
     bare, full = (Canvas.of((20.0, 14.0), 0.1) for _ in range(2))
-    rooms(np.random.default_rng(3), bare, (0.1, 0.4), 2.4, (1.0, 1.6), 0.3, 0.0, (0.3, 1.4))
-    rooms(np.random.default_rng(3), full, (0.1, 0.4), 2.4, (1.0, 1.6), 0.3, 2.0, (0.3, 1.4))
+    Floors(thickness=(0.1, 0.4), furniture=0.0).draw_rooms(np.random.default_rng(3), bare)
+    Floors(thickness=(0.1, 0.4), furniture=2.0).draw_rooms(np.random.default_rng(3), full)
     more = full.occupied & ~bare.occupied
     assert more.sum() > 500 and not (bare.occupied & ~full.occupied).any()
     regions, _ = label(0.1 * distance_transform_edt(~bare.occupied) > 0.25)
@@ -83,7 +83,7 @@ def test_furniture_keeps_off_doors() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_a_track_is_one_lane_as_wide_as_asked(seed: int) -> None:
     canvas = Canvas.of((20.0, 14.0), 0.1)
-    start, goal = track(np.random.default_rng(seed), canvas, (0.1, 1.6), (1.1, 2.0), (3, 5))
+    start, goal = Floors().draw_track(np.random.default_rng(seed), canvas)
     free = ~canvas.occupied
     away = distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * 0.1
     assert label(free)[1] == 1 and 0.5 <= away.max() <= 1.45, "half its width, more in corners"

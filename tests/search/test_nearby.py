@@ -60,6 +60,20 @@ def test_fewer_obstacles_leave_the_scale_of_the_cost_as_it_is() -> None:
     assert all(map(torch.equal, scale, near.call.problem.renewed().cost_scale))
 
 
+@pytest.mark.parametrize("inside", [False, True], ids=["all clear", "one inside a far one"])
+def test_what_is_known_of_starts_holds_among_fewer_obstacles(inside: bool) -> None:
+    _, many, U0 = planar("spheres", 9.0)
+    X = many.x0.unsqueeze(1).expand(-1, many.N + 1, -1)
+    if inside:
+        x0 = many.x0.clone()
+        x0[1, :2] = many.obstacles[0].centers[1, -1]  # which is left out, as X is elsewhere
+        many = replace(many, x0=x0)
+    call = Call.checked(many, U0)
+    assert call.problem.start_is_clear.tolist() == [True, not inside, True]
+    near = Nearby.along(call, X)
+    assert near is not None and bool(near.call.problem.start_is_clear.all())
+
+
 @pytest.mark.parametrize("kind", mostly(["spheres", "boxes", "body"], "body"))
 def test_far_obstacles_change_no_bit(kind: str) -> None:
     few, many, U0 = planar(kind, 9.0)

@@ -300,7 +300,7 @@ def test_all_that_a_problem_may_have_at_the_cost_of_ipopt() -> None:
     problem = everything()
     solution = solved(problem, tolerance=1e-10)
     assert_solved(problem, solution)
-    continued = NEAR.prepare(problem).run_from(solution.X, solution.U)
+    continued = NEAR.solve(problem, solution.U, X0=solution.X)
     assert continued.statuses == [Status.CONVERGED] * problem.B
     torch.testing.assert_close(solution.cost, continued.cost, rtol=1e-6, atol=0)
     binding = [float(part.value(solution.X, solution.U).max()) > -1e-6 for part in problem.constraints]

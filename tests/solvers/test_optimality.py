@@ -32,7 +32,7 @@ from torchgco.baselines import Hold, IteratedMPPI
 from torchgco.costs.base import Cost
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.search.suitability import suited_paths
-from torchgco.solvers.ending import STATIONARY, final_status, optimality
+from torchgco.solvers.ending import STATIONARY, final_status, optimality, start_status
 
 CAREFUL = ILQR(max_iterations=300)
 
@@ -252,3 +252,14 @@ def test_a_status_counts_what_lies_at_its_limit() -> None:
     status = final_status(ended, left, violation, 1e-3, constrained=True)
     want = [Status.CONVERGED, Status.FEASIBLE, Status.MAX_ITERATIONS, Status.NOT_POSITIVE_DEFINITE]
     assert [Status(int(s)) for s in status] == want
+
+
+def test_what_is_not_finite_does_not_start() -> None:
+    problem, _ = planar_batch(B=6, N=2, obstacles=1)
+    X, merit = torch.zeros(6, 3, problem.n, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
+    for row, value in ((1, torch.nan), (2, torch.inf), (3, -torch.inf)):
+        X[row, 1, 0] = value
+    merit[4] = torch.nan
+    clear = torch.tensor([True, False, True, True, True, False])
+    want = [Status.RUNNING, *[Status.NON_FINITE] * 4, Status.INVALID_START]
+    assert start_status(problem, X, merit, clear).tolist() == want

@@ -12,9 +12,9 @@ from torch import Tensor
 from tests.view.scenes import N, problem, trajectories
 from torchgco import Problem
 from torchgco.base.draws import DrawKey
+from torchgco.experiments.reports.searched import Watched
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.solvers.contracts import Advice
-from torchgco.view.guides import Watched
 
 
 @dataclass(frozen=True)

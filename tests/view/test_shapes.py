@@ -77,7 +77,6 @@ def test_equal_rows_are_kept_once() -> None:
 def test_a_kind_that_is_added_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     part = problem(1).obstacles[1]
     other = Shapes(np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1))
-    monkeypatch.delitem(SHAPES, BoundBoxes)
     seen = shapes_of(part, 0)  # as the search for paths sees boxes
     assert seen is not None and np.allclose(seen.half, part.half_sizes[0])  # type: ignore[attr-defined]
     monkeypatch.setitem(SHAPES, BoundBoxes, lambda part, b: other)
@@ -121,15 +120,15 @@ def test_cells_and_points_of_maps_are_drawn_where_they_are(batch: bool) -> None:
 def test_violations_are_those_of_the_worst_constraint_at_each_knot() -> None:
     task, X = problem(2), trajectories(2)[SOLVERS[1]]
     U = X.new_zeros(2, N, 3)
-    knots = violated(task, X, U, 1e-3)
+    violation, which = violated(task, X, U, 1e-3)
     for k in range(N + 1):
         depth = [
             float((-part.signed_distance(X[:1, k : k + 1], torch.tensor([k * DT])).amin()).clamp(min=0)) if k else 0.0
             for part in task.obstacles
         ]
         worst = int(np.argmax(depth)) if max(depth) > 1e-3 else -1
-        assert knots.worst[0, k] == worst
-        np.testing.assert_allclose(knots.violation[0, k], max(depth) if worst >= 0 else 0.0, atol=1e-9)
+        assert which[0, k] == worst
+        np.testing.assert_allclose(violation[0, k], max(depth) if worst >= 0 else 0.0, atol=1e-9)
 
 
 def test_the_worst_constraint_is_named_in_the_table() -> None:

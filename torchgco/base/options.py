@@ -113,7 +113,7 @@ def check_options(options: Any, prefix: str) -> None:
 
 def check_value(value: Any, kind: Any, field: str) -> Any:
     """A single argument checked against an annotation; as `check_options`."""
-    rule = _rule(kind)
+    rule = _argument_rule(kind)
     return value if rule is None or rule.fits(value) else _plain(value, rule, field)
 
 
@@ -173,6 +173,9 @@ def _rule(kind: Any) -> Rule | None:
     # A class in the place of its instance would have the methods of a protocol.
     text = f"of class {kind.__name__}"
     return Rule(lambda v: isinstance(v, kind) and not isinstance(v, type), f"an object {text}", f"objects {text}")
+
+
+_argument_rule = cache(_rule)  # of the kinds that our own code names
 
 
 def _limited(kind: Any, limits: list[Limit]) -> Rule | None:

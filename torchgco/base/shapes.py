@@ -187,6 +187,12 @@ def check_finite(value: Tensor, field: str, expected: str = "finite numbers") ->
         raise InputError(field, expected, "NaN or infinity")
 
 
+def repeated(values: Tensor, count: int) -> Tensor:
+    """Values (B, ...) once for each of some knots or points, (B, count, ...), in memory of their own."""
+    every = values.unsqueeze(1).expand(-1, count, *values.shape[1:])
+    return every.clone(memory_format=torch.contiguous_format)  # several times as fast as `repeat`
+
+
 def lead(parameter: Tensor | float, component: Tensor) -> Tensor | float:
     """A model parameter shaped to multiply a component (B, ...) of states with leading batch axis.
 

@@ -23,7 +23,7 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Call, Callback, Progress, Solver, check_states
+from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.solvers.timing import Chooser
 
 if TYPE_CHECKING:
@@ -143,12 +143,26 @@ class PreparedCasADi(Solver):
         return True
 
     def run(self, call: Call) -> Solution:
-        """As `CasADiSolver.run`; InputError for another problem than the prepared one."""
+        """As `CasADiSolver.run`, one problem after the other, without those whose start is invalid.
+
+        Raises:
+            InputError: another problem than the prepared one.
+        """
         problem, U0 = call.problem, call.U0
         if not problem.is_same(self.problem):
             raise InputError("problem", "the one that was prepared", "another")
         X0 = open_loop(problem.dynamics, problem.x0, U0) if call.X0 is None else call.X0
-        return self._all(torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1)), U0, call.callback)
+        X0 = torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1))
+        valid = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
+        U, start, ends = U0.clone(), problem.x0.clone(), [(Status.CONVERGED, 0)] * problem.B
+        for b in range(problem.B):
+            if bool(valid[b]):
+                start[b], U[b], ends[b] = self._one(b, X0[b], U0[b])
+            if call.callback is not None:
+                rows = torch.arange(b, b + int(valid[b]), device=U.device)
+                call.callback(Progress(b + 1, rows, b + 1, problem.B))
+        solution = rolled_out(problem.held_at(start), U, self.solver.violation_tolerance, iterations=0)
+        return _with_ends(solution, ends)
 
     def of(self, problem: Problem) -> PreparedCasADi:
         """The same solver for other problems of the same form: only the parts' own numbers may differ.
@@ -158,31 +172,6 @@ class PreparedCasADi(Solver):
         """
         problem = current_problem(problem)
         return replace(self, problem=problem, program=self.program.of(problem))
-
-    def run_from(self, X0: Tensor, U0: Tensor) -> Solution:
-        """Solve from states X0 (B, N+1, n) that the controls U0 (B, N, m) need not lead to, such as waypoints.
-
-        Raises:
-            InputError: X0 or U0 don't fit the problem.
-        """
-        problem = self.problem
-        problem.check_controls(U0, "U0")
-        check_states(X0, problem)
-        return self._all(X0, U0, None)
-
-    def _all(self, X0: Tensor, U0: Tensor, callback: Callback | None) -> Solution:
-        """Every problem of the batch in turn; problems with an invalid start are left out."""
-        problem = self.problem
-        valid = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
-        U, start, ends = U0.clone(), problem.x0.clone(), [(Status.CONVERGED, 0)] * problem.B
-        for b in range(problem.B):
-            if bool(valid[b]):
-                start[b], U[b], ends[b] = self._one(b, X0[b], U0[b])
-            if callback is not None:
-                rows = torch.arange(b, b + int(valid[b]), device=U.device)
-                callback(Progress(b + 1, rows, b + 1, problem.B))
-        solution = rolled_out(problem.held_at(start), U, self.solver.violation_tolerance, iterations=0)
-        return _with_ends(solution, ends)
 
     def _one(self, b: int, X0: Tensor, U0: Tensor) -> tuple[Tensor, Tensor, _End]:
         """The start (n,) and the controls (N, m) of problem b, and how it ended."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -93,6 +94,10 @@ class BoundQuadratic(Cost):
     def bind(self, dims: Dimensions) -> BoundQuadratic:
         return self
 
+    def precision(self, dtype: torch.dtype) -> AbstractContextManager[None]:
+        # No number is made of a knot's; a user's subclass may.
+        return nullcontext() if type(self) is BoundQuadratic else super().precision(dtype)
+
     @property
     def control_curvatures(self) -> Tensor:
         """The second derivatives by each control alone, (B|1, N|1, m)."""
@@ -108,7 +113,7 @@ class BoundQuadratic(Cost):
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         def at_k(part: Tensor) -> Tensor:
-            if not isinstance(k, int):
+            if not isinstance(k, int) or (x.dim() == 3 and part.shape[1] == 1):
                 return part
             at = k if part.shape[1] > 1 else 0
             # The axis of samples, if any, follows the batch axis.

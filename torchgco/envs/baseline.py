@@ -67,7 +67,8 @@ class PlannerPolicy:
             for rows, anew in ((begun, True), (~begun & ~waiting, False)):
                 at = rows.nonzero().flatten()
                 if len(at) > 0:
-                    action[at] = _asked(self._planned(x, at, anew).X)
+                    X = self._planned(x, at, anew).X
+                    action[at] = X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
             self._number, self._step = torch.where(waiting, self._number, flying.number), self._step + 1
             return action.clamp(*self.env._bounds).to(torch.float32).numpy()
 
@@ -81,19 +82,8 @@ class PlannerPolicy:
         plan, _, _ = planner.plan(whole, posed, x, self._step, before, seed, ids)
         plan = replace(plan, model=whole.dynamics)
         if self._plan is None:
-            self._plan = _room(plan, len(flying.x))
+            self._plan = plan.take(torch.zeros(len(flying.x), dtype=torch.int64))  # room for the plans of all
         for name in (*TRAJECTORY, *OTHERS):
             put(getattr(self._plan, name), rows, getattr(plan, name))
         self._plan = replace(self._plan, model=flying.problem.dynamics.take(flying.layout), step=plan.step)
         return plan
-
-
-def _asked(X: Tensor) -> Tensor:
-    """Body rates and thrust accelerations (b, 4) of plans X (b, N+1, 14)."""
-    return X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
-
-
-def _room(plan: Plan, B: int) -> Plan:
-    """Plans of B vehicles, to be written to, that are like the first of `plan`."""
-    first = plan.take(torch.zeros(B, dtype=torch.int64))
-    return replace(first)

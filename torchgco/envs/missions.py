@@ -172,7 +172,9 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
             before = self.episodes.distance()
             outcome = self.episodes.fly(action, torch.from_numpy(waiting)).numpy()
             after = self.episodes.distance()
-            reward = np.where(waiting, 0.0, (before - after).numpy() + BONUS * _bonus(outcome))
+            lost = np.isin(outcome, (Outcome.COLLISION, Outcome.DIVERGED))
+            ended = (outcome == Outcome.REACHED).astype(float) - lost  # 1 at the goal, -1 in contact or lost
+            reward = np.where(waiting, 0.0, (before - after).numpy() + BONUS * ended)
             over = (self.episodes.step >= self.episodes.steps).numpy() & (outcome == FLYING)
             outcome = np.where(over, int(Outcome.TIMEOUT), outcome)
             again, info = waiting, dict[str, Any]()
@@ -249,11 +251,6 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
         return {"final_obs": final, "_final_obs": done.copy(), "final_info": infos, "_final_info": done.copy()}
 
 
-def _bonus(outcome: np.ndarray) -> np.ndarray:
-    """1 at the goal, -1 in contact or lost, else 0."""
-    return (outcome == Outcome.REACHED).astype(float) - np.isin(outcome, (Outcome.COLLISION, Outcome.DIVERGED))
-
-
 class MissionEnv(gymnasium.Env):
     """One mission: `MissionVectorEnv` with a single environment, which the user resets.
 
@@ -275,18 +272,15 @@ class MissionEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """See `MissionVectorEnv.reset`."""
         super().reset(seed=seed)
-        seen, info = self.vector.reset(seed=seed, options=_batched(options))
+        if options is not None and "layout" in options:
+            options = {"layout": np.asarray(options["layout"])[None]}
+        seen, info = self.vector.reset(seed=seed, options=options)
         return seen[0], _only(info)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """See `MissionVectorEnv.step`."""
         seen, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
         return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), _only(info)
-
-
-def _batched(options: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The options of a single environment as a vector's."""
-    return None if options is None or "layout" not in options else {"layout": np.asarray(options["layout"])[None]}
 
 
 def _only(info: dict[str, Any]) -> dict[str, Any]:

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from torchgco.base.status import Status
 from torchgco.constraints.base import CONTACT_FACTOR
-from torchgco.maps.exact import distance_within
-from torchgco.maps.field import BoundField
+from torchgco.maps.field import BoundField, distance_within
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.passage import widest_passage
 from torchgco.obstacles.base import ADMITTED

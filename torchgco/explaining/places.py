@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -103,7 +102,8 @@ def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
     if isinstance(constraint, Obstacles):
         return f"obstacle {row}, "
     if isinstance(constraint, ControlBounds | StateBounds):
-        above, below = (_places(constraint, part) for part in (constraint.above, constraint.below))
+        places = torch.arange(constraint.lower.shape[-1])
+        above, below = (places[part].tolist() for part in (constraint.above, constraint.below))
         side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
         kind, of = ("control", controls_of) if constraint.of == "u" else ("state", states_of)
         named = getattr(dynamics, f"{kind}_names")
@@ -117,7 +117,3 @@ def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
         places = listed(constraint.components.tolist())  # type: ignore[union-attr]
         return f"{what} {'controls' if constraint.of == 'u' else 'states'} {places}, "
     return f"row {row}, "
-
-
-def _places(bounds: ControlBounds | StateBounds, part: Any) -> list[int]:
-    return torch.arange(bounds.lower.shape[-1])[part].tolist()

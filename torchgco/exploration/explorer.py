@@ -176,16 +176,14 @@ class PlanningForm:
 
     def _first_step(self, x: Tensor, x0: Tensor) -> StateBounds:
         """`FirstStepRates` as bounds, which native kernels know."""
-        asked = first_step(self.whole, x).bind(self._dimensions(x0)).target
+        model = self.whole.dynamics
+        size = Dimensions(len(x0), self.explorer.stages, 14, 4, float(model.dt), model.position, x0, 1)
+        asked = first_step(self.whole, x).bind(size).target
         assert asked is not None
         upper = x0.new_full((x0.shape[0], 1, 14), torch.inf)
         lower = -upper
         lower[:, 0, 10:13] = upper[:, 0, 10:13] = asked
         return StateBounds(lower, upper, knots=[1])
-
-    def _dimensions(self, x0: Tensor) -> Dimensions:
-        model = self.whole.dynamics
-        return Dimensions(len(x0), self.explorer.stages, 14, 4, float(model.dt), model.position, x0, 1)
 
     def _rest(self, N: int) -> StateBounds:
         upper = torch.full((14,), torch.inf, dtype=torch.float64)

@@ -222,7 +222,7 @@ class Exploration:
                 for parts, part in new:
                     parts.append(part)
                 scout.seconds["field_seconds"] += time.perf_counter() - began
-        form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
+        form = PlanningForm(self.explorer, self.planner, self.whole.take(torch.arange(self.whole.B).repeat(C)))
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, inside, allowed, regions)]
         return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack)
 
@@ -320,7 +320,3 @@ class Exploration:
         if near < 0:
             asked[: TESTED_POINTS * EARLY] = near - BETTER
         return float((gaps - least - asked).min())
-
-
-def _repeated(problem: Problem, count: int) -> Problem:
-    return problem.take(torch.arange(problem.B).repeat(count))

@@ -7,7 +7,6 @@ measured states: a log need not hold what it can be found again from. Plans are 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,23 +21,9 @@ from torchgco.missions.mission import Mission
 from torchgco.problem.problem import Problem
 
 
-@dataclass(frozen=True)
-class Replay:
-    """One mission with a sensor, K control periods.
-
-    Args:
-        seen: how the vehicle's map changed; its `safe` is empty, as plans are not made again.
-        sought: for each period the path (P, 3), m, from the vehicle to its goal, over all cells that aren't known to be
-            occupied; it ends early where there is none.
-    """
-
-    seen: SeenLog
-    sought: list[np.ndarray]
-
-
 def replayed(
     mission: Mission, problem: Problem, x: Tensor, seed: int, number: int, report: Callable[[], object] = lambda: None
-) -> Replay:
+) -> tuple[SeenLog, list[np.ndarray]]:
     """What the vehicle of a mission saw and sought.
 
     Args:
@@ -47,6 +32,11 @@ def replayed(
         x: (K, 17): true states at the starts of its control periods.
         seed, number: the key of its random draws.
         report: called after each control period.
+
+    Returns:
+        How the vehicle's map changed; its `safe` is empty, as plans are not made again. And for each period the path
+        (P, 3), m, from the vehicle to its goal, over all cells that aren't known to be occupied; it ends early where
+        there is none.
 
     Raises:
         InputError: a mission without a sensor, more than one problem, or states of another shape.
@@ -68,4 +58,4 @@ def replayed(
         near = np.linalg.norm(path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution
         sought.append(np.concatenate([path, scout.goal[None]]) if near else path)
         report()
-    return Replay(scout.log, sought)
+    return scout.log, sought

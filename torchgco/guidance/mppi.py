@@ -71,7 +71,8 @@ class MPPI:
 
     def check(self, problem: Problem) -> None:
         """Raise InputError where the covariance doesn't fit the controls."""
-        self._sigma(problem)
+        if self.covariance is not None:
+            self._sigma(problem)
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
         """The weighted mean of the last round's samples, X (B, N+1, n) and U (B, N, m); round 1 draws around U."""

@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 
 from torchgco.base.errors import GuidanceWarning, first_line
+from torchgco.base.shapes import repeated
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import kernels_of
 from torchgco.problem.problem import Problem
@@ -73,7 +74,7 @@ def failure(trial: Callable[[Problem], None], problem: Problem, dtype: torch.dty
 
 def _sample(problem: Problem) -> None:
     """One stage of some samples of one problem."""
-    x = problem.x0.unsqueeze(1).repeat(1, TRIAL_SAMPLES, 1)
+    x = repeated(problem.x0, TRIAL_SAMPLES)
     u = x.new_zeros(1, TRIAL_SAMPLES, problem.m)
     cost = problem.cost.stage(x, u, 0) + problem.cost.terminal(x)
     after = problem.dynamics.at(0).step(x, u)

@@ -22,10 +22,9 @@ from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.separation import Separation
-from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
+from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances, segment_distance
 from torchgco.judging.judge import by_kind, doubled, in_double
 from torchgco.judging.maps import segment_distances
-from torchgco.judging.segments import segment_distance
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody

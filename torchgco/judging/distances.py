@@ -1,4 +1,4 @@
-"""Distances from boxes as the judge and the certificate measure them, apart from those of the solvers."""
+"""Distances from segments and boxes as the judge and the certificate measure them, apart from those of the solvers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 
 SHRINKAGES = 70  # each shrinks a segment by a third
+
+
+def segment_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Distance (...) of the origin from the segment between a and b (..., d)."""
+    along = b - a
+    length = along.square().sum(-1)
+    share = (-(a * along).sum(-1) / length.clamp(min=torch.finfo(a.dtype).tiny)).clamp(0.0, 1.0)
+    return (a + share.unsqueeze(-1) * along).norm(dim=-1)
 
 
 def box_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint, innermost
 from torchgco.constraints.gates import GateBalls, GateSquares
-from torchgco.judging.segments import segment_distance
+from torchgco.judging.distances import segment_distance
 from torchgco.obstacles.base import ADMITTED
 
 

@@ -18,10 +18,9 @@ from torchgco.base.shapes import check_finite, check_shape, check_tensor, comput
 from torchgco.constraints.base import CONTACT_FACTOR, Constraint
 from torchgco.constraints.gates import has_gates
 from torchgco.constraints.separation import Separation
-from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
+from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances, segment_distance
 from torchgco.judging.gates import passes
 from torchgco.judging.maps import segment_distances
-from torchgco.judging.segments import segment_distance
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.body import BoundBody

@@ -78,8 +78,8 @@ class NativeKernels:
     def chord_clearance(self, problem: Problem, X: Tensor, share: float) -> Tensor:
         parts = [c.bare for c in problem.constraints]
         others = [part for part in parts if type(part) is not BoundSpheres]
-        least = clearance_of(others, X, share)
-        return least if len(others) == len(parts) else torch.minimum(least, self.engine.chords(problem, X, 1.0 - share))
+        of_spheres = None if len(others) == len(parts) else self.engine.chords(problem, X, 1.0 - share)
+        return clearance_of(others, X, share, of_spheres)
 
     def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
         return self.engine.slack(lagrangian, X, U)
@@ -96,15 +96,15 @@ class NativeKernels:
         for name, part in state.items():
             setattr(s, name, part)
         out = self.engine.inner_solve(lagrangian, state, native_options(how), limit)
-        converged, stuck, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
-        ended = out["status"] == End.ENDED
-        failed = ~ended & (out["status"] != Status.RUNNING)
-        rows = lost.nonzero().flatten()
-        if rows.numel() > 0:
+        status = out["status"]
+        ended, converged, stuck = status == End.ENDED, out["converged"] != 0, out["refused"] != 0
+        failed = ~ended & (status != Status.RUNNING)
+        if out["lost"].any():
+            rows = out["lost"].nonzero().flatten()
             won = rows[keep_lifted(s, rows, self.lifted(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]))]
             ended[won] = s.inner[won] >= how.max_iterations
             s.regularisation[won] = 0.0
-        status = torch.where(failed, out["status"].long(), int(Status.RUNNING))
+        status = torch.where(failed, status.long(), int(Status.RUNNING))
         return PassEnd(ended, converged, stuck, status, out["alpha"], out["used"], failed)
 
     def lifted(self, lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
@@ -142,9 +142,9 @@ class NativeKernels:
 def native_options(how: Descent) -> Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
-    ladder = _numbers(*search.ladder(printed))
+    rungs = search.ladder(printed)
     return Options.complete(
-        ladder=ladder, rungs=len(ladder), back=-1 if search.back is None else search.back, accept_last=printed,
+        ladder=_numbers(*rungs), rungs=len(rungs), back=-1 if search.back is None else search.back, accept_last=printed,
         ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
         max_iterations=how.max_iterations, tolerance=0.0 if printed else how.tolerance,
         absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,

@@ -79,9 +79,9 @@ class TorchKernels:
         return torch.zeros(0, dtype=torch.int64, device=X.device)
 
 
-def clearance_of(parts: list[Any], X: Tensor, share: float) -> Tensor:
-    """Smallest distance (B,) from the lines between knots to those of the parts that keep a distance."""
-    least = X.new_full(X.shape[:1], torch.inf)
+def clearance_of(parts: list[Any], X: Tensor, share: float, least: Tensor | None = None) -> Tensor:
+    """Smallest distance (B,) from the lines between knots to those of the parts that keep a distance; or `least`."""
+    least = X.new_full(X.shape[:1], torch.inf) if least is None else least
     for part in parts:
         if isinstance(part, Obstacles | Separation):
             least = torch.minimum(least, part.chord_clearance(X, share))

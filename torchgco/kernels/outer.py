@@ -72,7 +72,7 @@ class NativeOuter:
     def run_half(self, at_once: int) -> None:
         """Passes until half of the problems have an outcome, of up to LANES all; at most `at_once` of them a call."""
         while True:
-            running = int((self.outcome == Status.RUNNING).sum())
+            running = int((self.outcome.numpy() == Status.RUNNING).sum())
             if running == 0 or (self.b > LANES and 2 * running <= self.b):
                 return
             self.run(max(1, at_once // running))

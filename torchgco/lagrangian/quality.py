@@ -92,6 +92,13 @@ def leaves_goal(problem: Problem, new: Tensor, old: Tensor) -> Tensor:
     return has_arrived(problem, old) & ~has_arrived(problem, new)
 
 
+def arrive_alike(problem: Problem, new: Tensor, old: Tensor) -> Tensor:
+    """Whether both of two states (B, N+1, n) have arrived at a stated goal, or neither, (B,) bool."""
+    if not ranks_arrival(problem):
+        return torch.ones_like(new[:, 0, 0], dtype=torch.bool)
+    return has_arrived(problem, old) == has_arrived(problem, new)
+
+
 def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float | Tensor, by_arrival: bool = True) -> Tensor:
     """Whether a trajectory should replace an old one, (B,) bool: feasible arrival at a stated goal counts first, then
     `is_better`."""

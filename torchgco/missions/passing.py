@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.constraints.gates import GateBalls, gates_of
-from torchgco.judging.segments import segment_distance
+from torchgco.judging.distances import segment_distance
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 

@@ -90,7 +90,10 @@ class RemotePlant:
                 line.settimeout(max(end - time.monotonic(), 1e-6))
                 number, states = self._read(line.recv(LARGEST))
                 if (place := waiting.pop(number, None)) is not None:  # None: it comes after its time was over
-                    answer[place] = self._fitting(states, len(rows[place]))
+                    wanted = len(rows[place])
+                    if len(states) != wanted:
+                        raise InputError("plant", f"an answer with {wanted} vehicles, as it was asked", len(states))
+                    answer[place] = states
         except OSError as error:  # nobody listens, no such host, or no answer in time
             told = "none" if isinstance(error, TimeoutError) else error
             wanted = f"an answer of a simulator at {self.host}:{self.port} within {self.timeout:g} s"
@@ -105,11 +108,6 @@ class RemotePlant:
         if version != PROTOCOL:
             raise InputError("plant", f"answers of version {PROTOCOL}", version)
         return number, np.frombuffer(data, "<f8", offset=HEAD.size).reshape(-1, ANSWERED)
-
-    def _fitting(self, states: np.ndarray, wanted: int) -> np.ndarray:
-        if len(states) != wanted:
-            raise InputError("plant", f"an answer with {wanted} vehicles, as it was asked", len(states))
-        return states
 
 
 @cache

@@ -57,7 +57,7 @@ class Structure(ctypes.Structure):
         kinds, tensors, kept = self.kinds, self.tensors, self.kept
         for name, value in values.items():
             # Most fields of a call are tensors or numbers, and each solve makes thousands of calls.
-            if type(value) is Tensor and name in tensors and value.dtype is tensors[name] and value.is_contiguous():
+            if type(value) is Tensor and value.dtype is tensors.get(name) and value.is_contiguous():
                 kept.append(value)
                 _set(self, name, value.data_ptr())
             elif type(value) in PLAIN_NUMBERS and name in kinds:

@@ -262,14 +262,13 @@ class Engine:
     def _summed(self, lagrangian: Lagrangian, best: Multipliers | None = None) -> c.Problem:
         """The problem with multipliers, penalties and guide."""
         multipliers = lagrangian.multipliers
-        rows = self._fixed(lagrangian.problem)[1]
+        own: dict[str, Any] = {"mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
         if best is not None or not multipliers.blank:
-            rows = [constraint.copy() for constraint in rows]
+            own["constraint"] = rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
             for row, lam in zip(rows, () if multipliers.blank else multipliers.lam, strict=not multipliers.blank):
                 row.lam = lam.contiguous()
             for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
                 row.best = lam
-        own = {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
         return self.packed(lagrangian.problem, **own, **guide_of(lagrangian.penalty))
 
     def _fixed(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:

@@ -40,7 +40,7 @@ def is_bounded(cost: Any) -> bool:
     """Whether no stage of a quadratic cost can be below 0, rounding included; unknown of weights that are matrices."""
     if not cost.diagonal or any(part is not None for part in (cost.q, cost.r, cost.qf, cost.H)):
         return False
-    return all(bool((weights >= 0).all()) for weights in (cost.Q, cost.R, cost.Qf))
+    return all(bool((weights.numpy() >= 0).all()) for weights in (cost.Q, cost.R, cost.Qf))
 
 
 def shared_fields(shared: Shared) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import words
+from torchgco.base.shapes import repeated
 from torchgco.eager.sampling import Sampling
 from torchgco.native import structures
 from torchgco.native.codegen.source import LANES, SAMPLER
@@ -31,7 +32,7 @@ class Sampler:
         """See `kernels.base.Kernels.sample`."""
         mean = U.clone(memory_format=torch.contiguous_format)
         rounds = _structure(problem, how)
-        rounds.of = self.engine.packed(problem, X=problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1))
+        rounds.of = self.engine.packed(problem, X=repeated(problem.x0, problem.N + 1))
         rounds.geometric = torch.tensor([int(c.geometric) for c in problem.constraints], dtype=torch.int32)
         rounds.mean = mean
         run(self.library.tgco_sample, problem.B, 1, rounds)

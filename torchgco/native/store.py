@@ -109,11 +109,11 @@ def read(key: str, suffix: str) -> bytes | None:
 
 def _sound(key: str, suffix: str) -> Iterator[tuple[Path, bytes]]:
     """Files under a key that match their checksum, and their content; the others are removed."""
-    paths: list[Path] = []
+    place, names = folder(), list[str]()
     with suppress(OSError):
-        if _is_ours(folder(), os.stat(folder())):
-            paths = sorted(folder().glob(f"{key}-*{suffix}"))
-    for path in paths:
+        if _is_ours(place, os.stat(place)):
+            names = [name for name in os.listdir(place) if name.startswith(f"{key}-") and name.endswith(suffix)]
+    for path in (place / name for name in sorted(names)):
         with suppress(OSError):
             with open(path, "rb") as file:
                 if not _is_ours(path, os.fstat(file.fileno())):
@@ -166,22 +166,32 @@ def _name(key: str, suffix: str, content: bytes) -> str:
 
 def _tidy(place: Path, kin: str) -> None:
     """Remove the least recently used files over the limits, of a kin and of all; another process may use or remove
-    them meanwhile.
+    them meanwhile. Only where there are too many is each file asked for its time.
     """
-    ages: list[tuple[float, str]] = []
+    objects: list[str] = []
+    others: list[str] = []
     with suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
-            with suppress(OSError):
-                age = time.time() - entry.stat().st_mtime
-                if _OURS.fullmatch(entry.name):  # all other files in the folder are left alone
-                    ages.append((age, entry.path))
-                elif entry.name.startswith(PART[0]) and entry.name.endswith(PART[1]) and age > _ABANDONED:
-                    os.unlink(entry.path)
-    ages.sort()
-    objects = [one for one in ages if one[1].endswith(OBJECT)]
-    others = [one for one in ages if not one[1].endswith(OBJECT)]
-    over = [one for one in others if os.path.basename(one[1]).startswith(kin)][KIN:]
-    over += [one for one in others if one not in over][FILES:] + objects[OBJECTS:]
-    for _, path in over:
+            if _OURS.fullmatch(entry.name):  # all other files in the folder are left alone
+                (objects if entry.name.endswith(OBJECT) else others).append(entry.path)
+            elif entry.name.startswith(PART[0]) and entry.name.endswith(PART[1]):
+                with suppress(OSError):
+                    if time.time() - entry.stat().st_mtime > _ABANDONED:
+                        os.unlink(entry.path)
+    over = _oldest([path for path in others if os.path.basename(path).startswith(kin)], KIN)
+    over += _oldest([path for path in others if path not in over], FILES) + _oldest(objects, OBJECTS)
+    for path in over:
         with suppress(OSError):
             os.unlink(path)
+
+
+def _oldest(paths: list[str], most: int) -> list[str]:
+    """Those beyond so many, by the time of their last use."""
+
+    def last_use(path: str) -> float:
+        try:
+            return os.stat(path).st_mtime
+        except OSError:  # gone meanwhile
+            return -math.inf
+
+    return sorted(paths, key=last_use)[: len(paths) - most] if len(paths) > most else []

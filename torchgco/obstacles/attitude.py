@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,6 +64,16 @@ def in_space(quaternion: Tensor) -> Tensor:
         (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
     )
     return torch.stack([torch.stack([entry / square for entry in row], dim=-1) for row in rows], dim=-2)
+
+
+def rotation(q: np.ndarray) -> np.ndarray:
+    """The matrix (3, 3) of a unit quaternion [w, x, y, z], from the body's axes to the world's."""
+    w, x, y, z = q
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def attitude_of(given: str | Callable[[Tensor], Tensor], d: int, dims: Dimensions) -> Attitude:

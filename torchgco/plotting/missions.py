@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
+from scipy.spatial.transform import Rotation
 
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
@@ -268,11 +269,7 @@ def outcomes_figure(trials: pd.DataFrame) -> Figure:
 
 def euler_angles(q: np.ndarray) -> np.ndarray:
     """Roll, pitch and yaw (3, T), rad, from quaternions (4, T), scalar first: R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    w, x, y, z = q / np.linalg.norm(q, axis=0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.stack((roll, pitch, yaw))
+    return Rotation.from_quat(q.T, scalar_first=True).as_euler("ZYX")[:, ::-1].T
 
 
 def check_plans(plans: np.ndarray, rows: int) -> None:

@@ -154,9 +154,10 @@ def _facts(fields: Mapping[str, Any]) -> Iterator[Hashable]:
 def _sum(numbers: Any) -> int | None:
     """A sum over the bytes of numbers; None of other things."""
     try:
-        array = np.asarray(list(numbers) if isinstance(numbers, deque) else numbers)
+        if isinstance(numbers, Tensor):
+            array = numbers.numpy()
+        else:
+            array = np.asarray(list(numbers) if isinstance(numbers, deque) else numbers)
     except (TypeError, ValueError, RuntimeError):
         return None
-    return (
-        zlib.crc32(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data) if array.dtype.kind in "biuf" else None
-    )
+    return zlib.crc32(np.ascontiguousarray(array).data) if array.dtype.kind in "biuf" else None

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
-from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
+from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
 from torchgco.base.tree import Rows, cast, field_names, is_users, take
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, joined_bounds
@@ -205,11 +205,13 @@ class Problem:
         shapes = self.known.row_shapes
         if shapes is None:
             stated = [None if is_users(part) else part.row_shape(self.N) for part in self.constraints]
-            # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
-            one = self.take(slice(0, 1)) if None in stated else self
-            X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-            parts = zip(stated, one.constraints, strict=True)
-            found = [shape or part.value(X, U).shape[1:] for shape, part in parts]
+            found: list[Any] = stated
+            if None in stated:
+                # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
+                one = self.take(slice(0, 1))
+                X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
+                parts = zip(stated, one.constraints, strict=True)
+                found = [shape or part.value(X, U).shape[1:] for shape, part in parts]
             shapes = self.known.row_shapes = tuple((knots, rows) for knots, rows in found)
         return shapes
 
@@ -222,7 +224,7 @@ class Problem:
     def at_rest(self) -> tuple[Tensor, Tensor]:
         """States (B, N+1, n) that stay at the start, and controls (B, N, m) at rest."""
         like = self.x0.new_zeros(self.B, self.N, self.m)
-        return self.x0.unsqueeze(1).repeat(1, self.N + 1, 1), self.cost.rest_controls(like)
+        return repeated(self.x0, self.N + 1), self.cost.rest_controls(like)
 
     def in_cost_units(self) -> Self:
         """The same problems with costs divided by `cost_unit`, without a constant that dwarfs the rest.

@@ -53,19 +53,20 @@ def cost_scale(
     idle, sizes = torch.full_like(curvatures[:, 0], UNLIMITED), torch.ones_like(curvatures[:, 0])
     if bounds is not None:
         half = 0.5 * bounds.range
-        idle = torch.where(torch.isfinite(half), BOUNDED * half.clamp(max=1.0), idle)
+        idle = torch.where(half < torch.inf, BOUNDED * half.clamp(max=1.0), idle)
         sizes = torch.where(half < NARROW, half, sizes)
     # Contiguous and one axis at a time: the order of summation must not depend on the batch.
-    curvature = (curvatures.abs() * sizes.square().unsqueeze(1)).contiguous().sum(-1).sum(-1) / (N * m)
-    idly = (curvatures.abs() * idle.square().unsqueeze(1)).contiguous().sum(-1).sum(-1) / m
-    least, constant = LEAST_UNIT * curvature, torch.zeros_like(total)
+    steep, constant = curvatures.abs(), torch.zeros_like(total)
+    curvature = (steep * sizes.square().unsqueeze(1)).contiguous().sum(-1).sum(-1) / (N * m)
+    idly = (steep * idle.square().unsqueeze(1)).contiguous().sum(-1).sum(-1) / m
+    least = LEAST_UNIT * curvature
     if changes is not None:
         rest = total.abs() - torch.maximum(changes, N * least)
         dwarfs = (rest > DWARFS * torch.maximum(changes, N * least)) & torch.isfinite(rest)
         constant = torch.where(dwarfs, total.sign() * rest, constant)
-    unit = (total - constant).abs() / N + least
-    size = LEAST_COST * (total - constant).abs() + idly
-    usable = torch.isfinite(unit) & (unit > 0)
+    rest = (total - constant).abs()
+    unit, size = rest / N + least, LEAST_COST * rest + idly
+    usable = (unit > 0) & (unit < torch.inf)
     size = torch.where(usable & (size > 0), size, LEAST_COST * torch.where(usable, unit * N, 1.0))
     return CostScale(torch.where(usable, unit, 1.0), constant, size)
 

@@ -67,6 +67,8 @@ class Inflated(NamedTuple):
         """Whether points (B, V, d) lie deeper than lengths (B,) >= 0, m, beneath the surface of an obstacle, (B, V)."""
         B, V = points.shape[:2]
         at_once = max(1, DISTANCES_AT_ONCE // max(1, V * self.scales.shape[1]))
+        if at_once >= B:
+            return self._deeper(points, than)
         parts = torch.arange(B, device=points.device).split(at_once)
         return torch.cat([take(self, rows)._deeper(points[rows], than[rows]) for rows in parts])
 

@@ -9,6 +9,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from torchgco.base.shapes import repeated
 from torchgco.base.tree import LastTaken
 from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import Cost
@@ -31,15 +32,11 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     Obstacles that don't hold at the last knot are left out: only those that stay bar a path. None without a goal or
     obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
     """
-    lasting = [c.inscribed if isinstance(c, Obstacles) else c for c in problem.geometric if c.holds_at(problem.N)]
-    maps = tuple(c for c in lasting if isinstance(c, BoundField))
-    parts = [c.inflated() if isinstance(c, Obstacles) else None for c in lasting if not isinstance(c, BoundField)]
-    known, at = [part for part in parts if part is not None], problem.position
-    if len(known) < len(parts) or problem.goal is None or at.stop - at.start not in (2, 3):
+    found, at = _barring(problem), problem.position
+    if found is None:
         return None
-    obstacles = _by_kind(problem.x0[:, at], [part for part in known if part.radii.shape[1] > 0], maps)
-    if obstacles is None:
-        return None
+    assert problem.goal is not None
+    obstacles = _by_kind(problem.x0[:, at], *found)
     parts = problem.cost, problem.x0, rest[:, :1]
     first = _resting_cost(*parts, at, problem.x0[:, None, at]).clamp(min=1e-12)
     some = LastTaken((*parts, first))
@@ -73,19 +70,27 @@ def has_paths(problem: Problem) -> bool:
     if problem.dynamics.position is None:
         return False
     if problem.known.paths is None:
-        one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
-        rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
-        problem.known.paths = scene_of(one, rest) is not None
+        problem.known.paths = _barring(problem.take(slice(0, 1))) is not None
     return problem.known.paths
 
 
-def _by_kind(start: Tensor, parts: Sequence[Solids], maps: tuple[BoundField, ...]) -> Inflated | None:
-    """The spheres and the boxes among obstacles of problems with starts (B, d); None where there are none at all."""
+def _barring(problem: Problem) -> tuple[list[Solids], tuple[BoundField, ...]] | None:
+    """The bodies and the maps among which the roadmap can seek a path; None where there are none, or it can't."""
+    lasting = [c.inscribed if isinstance(c, Obstacles) else c for c in problem.geometric if c.holds_at(problem.N)]
+    maps = tuple(c for c in lasting if isinstance(c, BoundField))
+    parts = [c.inflated() if isinstance(c, Obstacles) else None for c in lasting if not isinstance(c, BoundField)]
+    known, at = [part for part in parts if part is not None], problem.position
+    if len(known) < len(parts) or problem.goal is None or at.stop - at.start not in (2, 3):
+        return None
+    bodies = [part for part in known if part.radii.shape[1] > 0]
+    return (bodies, maps) if bodies or maps else None
+
+
+def _by_kind(start: Tensor, parts: Sequence[Solids], maps: tuple[BoundField, ...]) -> Inflated:
+    """The spheres and the boxes among obstacles of problems with starts (B, d)."""
     boxes = _joined([part for part in parts if isinstance(part, Cuboids)])
     spheres = _joined([part for part in parts if not isinstance(part, Cuboids)])
     if spheres is None:
-        if boxes is None and not maps:
-            return None
         zero = torch.zeros_like(start[:, :1])
         spheres = Solids(start.unsqueeze(1), zero, torch.ones_like(zero, dtype=torch.bool))  # one that is absent
     return Inflated(spheres, boxes, maps)
@@ -131,6 +136,6 @@ def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
 
 def _resting_cost(cost: Cost, x0: Tensor, u: Tensor, at: slice, points: Tensor) -> Tensor:
     """Stage cost (B, V) of resting at points (B, V, d) under u (B, 1, m); the position is at `at` in x0 (B, n)."""
-    x = x0.unsqueeze(1).repeat(1, points.shape[1], 1)
+    x = repeated(x0, points.shape[1])
     x[..., at] = points
     return cost.stage(x, u.expand(-1, points.shape[1], -1), 0)

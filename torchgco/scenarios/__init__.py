@@ -1,51 +1,31 @@
 """Named sources of obstacle layouts: random families and files."""
 
-from torchgco.scenarios.base import Scenario
-from torchgco.scenarios.crossing import Crossing
-from torchgco.scenarios.cylinders import Cylinders
-from torchgco.scenarios.files import LayoutFile
-from torchgco.scenarios.floors import Floors
-from torchgco.scenarios.gates import GateForest, Race
-from torchgco.scenarios.layouts import Layouts, concatenate
-from torchgco.scenarios.maps import MapFile
-from torchgco.scenarios.mazes import Mazes
-from torchgco.scenarios.parking import Parking
-from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
-from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
-from torchgco.scenarios.rooms import Rooms
-from torchgco.scenarios.trefoils import Trefoils
-from torchgco.scenarios.vehicle import Task, Vehicle
-from torchgco.scenarios.woods import Woods
-from torchgco.scenarios.yard import Yard
+from torchgco.scenarios.base import Scenario as Scenario
+from torchgco.scenarios.crossing import Crossing as Crossing
+from torchgco.scenarios.cylinders import Cylinders as Cylinders
+from torchgco.scenarios.files import LayoutFile as LayoutFile
+from torchgco.scenarios.floors import Floors as Floors
+from torchgco.scenarios.gates import GateForest as GateForest
+from torchgco.scenarios.gates import Race as Race
+from torchgco.scenarios.layouts import Layouts as Layouts
+from torchgco.scenarios.layouts import concatenate as concatenate
+from torchgco.scenarios.maps import MapFile as MapFile
+from torchgco.scenarios.mazes import Mazes as Mazes
+from torchgco.scenarios.parking import Parking as Parking
+from torchgco.scenarios.planar import PlanarRandom as PlanarRandom
+from torchgco.scenarios.planar import PlanarTrap as PlanarTrap
+from torchgco.scenarios.quadrotor import Forest as Forest
+from torchgco.scenarios.quadrotor import ForestMoving as ForestMoving
+from torchgco.scenarios.quadrotor import Walls as Walls
+from torchgco.scenarios.rooms import Rooms as Rooms
+from torchgco.scenarios.trefoils import Trefoils as Trefoils
+from torchgco.scenarios.vehicle import Task as Task
+from torchgco.scenarios.vehicle import Vehicle as Vehicle
+from torchgco.scenarios.woods import Woods as Woods
+from torchgco.scenarios.yard import Yard as Yard
 
 # The random families, each an option `scenario=` of the command line under its `name`.
 FAMILIES: tuple[type[Scenario], ...] = (
     Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
     Floors, GateForest, Race, Parking,
 )  # fmt: skip
-
-__all__ = [
-    "Crossing",
-    "Cylinders",
-    "Floors",
-    "Forest",
-    "ForestMoving",
-    "GateForest",
-    "LayoutFile",
-    "Layouts",
-    "MapFile",
-    "Mazes",
-    "Parking",
-    "PlanarRandom",
-    "PlanarTrap",
-    "Race",
-    "Rooms",
-    "Scenario",
-    "Task",
-    "Trefoils",
-    "Vehicle",
-    "Walls",
-    "Woods",
-    "Yard",
-    "concatenate",
-]

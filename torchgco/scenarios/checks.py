@@ -108,10 +108,7 @@ def obstacles(centers: Any, radii: Any) -> tuple[np.ndarray, np.ndarray]:
         raise InputError("layouts.centers", "shape (L, M, d), L >= 1, d = 2 or 3", f"shape {centers.shape}")
     if radii.shape != centers.shape[:2]:
         raise InputError("layouts.radii", f"shape (L, M) = {centers.shape[:2]} as in centers", radii.shape)
-    absent = np.isnan(centers).all(axis=2)
-    partial = ~absent & ~np.isfinite(centers).all(axis=2)
-    _none_of(partial, "layouts.centers", "finite rows or rows of NaN", centers)
-    _bounded(centers, "layouts.centers")
+    absent = _absent(centers, "layouts.centers")
     _none_of(np.isinf(radii) | (radii < 0), "layouts.radii", "finite radii >= 0", radii)
     _none_of(absent & ~np.isnan(radii), "layouts.radii", "NaN where the centre is NaN", radii)
     _none_of(~absent & np.isnan(radii), "layouts.radii", "a radius where the centre is finite", radii)
@@ -123,15 +120,9 @@ def velocities(value: Any, centers: np.ndarray) -> np.ndarray | None:
     """Velocities (L, M, d), finite where there is an obstacle and NaN where there is none."""
     if value is None:
         return None
-    moving = array(value, "layouts.velocities")
-    if moving.shape != centers.shape:
-        raise InputError("layouts.velocities", f"the shape {centers.shape} of centers", moving.shape)
-    absent = np.isnan(centers).all(axis=2)
-    bad = ~absent & ~np.isfinite(moving).all(axis=2)
-    _none_of(bad, "layouts.velocities", "finite velocities where the centre is finite", moving)
-    moving[absent] = np.nan
-    _bounded(moving, "layouts.velocities")
-    return moving
+    moving = _of_each(value, "layouts.velocities", centers.shape, f"the shape {centers.shape} of centers")
+    expected = "finite velocities where the centre is finite"
+    return _present(moving, np.isfinite(moving).all(axis=2), centers, "layouts.velocities", expected)
 
 
 def boxes(centers: Any, halves: Any, turns: Any, radii: Any, like: np.ndarray) -> tuple[np.ndarray | None, ...]:
@@ -148,22 +139,22 @@ def boxes(centers: Any, halves: Any, turns: Any, radii: Any, like: np.ndarray) -
     count, _, d = like.shape
     if middle.ndim != 3 or middle.shape[0] != count or middle.shape[2] != d:
         raise InputError("layouts.box_centers", f"shape ({count}, K, {d})", f"shape {middle.shape}")
-    absent = np.asarray(np.isnan(middle).all(axis=2))
-    _none_of(~absent & ~np.isfinite(middle).all(axis=2), "layouts.box_centers", "finite rows or rows of NaN", middle)
-    _bounded(middle, "layouts.box_centers")
+    absent = _absent(middle, "layouts.box_centers")
     if halves is None:
         raise InputError("layouts.box_half_sizes", "this array with box_centers", "none")
-    half = array(halves, "layouts.box_half_sizes")
-    if half.shape != middle.shape:
-        raise InputError("layouts.box_half_sizes", f"the shape {middle.shape} of box_centers", half.shape)
-    rounding = _rounding(radii, absent)
+    half = _of_each(halves, "layouts.box_half_sizes", middle.shape, f"the shape {middle.shape} of box_centers")
+    rounding = None
+    if radii is not None:
+        rounding = _of_each(radii, "layouts.box_radii", absent.shape)
+        expected = "finite radii >= 0 where the centre is finite"
+        rounding = _present(rounding, np.isfinite(rounding) & (rounding >= 0), middle, "layouts.box_radii", expected)
     rounded = np.zeros_like(absent) if rounding is None else rounding > 0
     good = np.isfinite(half).all(axis=2) & ((half > 0).all(axis=2) | rounded & (half >= 0).all(axis=2))
     expected = "finite half sides above 0 where the centre is finite; 0 too where the radius is above 0"
     _none_of(~absent & ~good, "layouts.box_half_sizes", expected, half)
     _none_of(absent & ~np.isnan(half).all(axis=2), "layouts.box_half_sizes", "NaN where the centre is NaN", half)
     _bounded(half, "layouts.box_half_sizes")
-    return middle, half, _turns(turns, absent, d), rounding
+    return middle, half, None if turns is None else _turns(turns, middle), rounding
 
 
 def sines(values: Sequence[Any], centers: np.ndarray | None) -> tuple[np.ndarray | None, ...]:
@@ -174,7 +165,7 @@ def sines(values: Sequence[Any], centers: np.ndarray | None) -> tuple[np.ndarray
         return None, None, None
     if centers is None:
         raise InputError(given[0], "none without box_centers", "some")
-    absent, found = np.isnan(centers).all(axis=2), []
+    found = []
     for name, value in zip(names, values, strict=True):
         if value is None:
             raise InputError(name, f"this array with {given[0].removeprefix('layouts.')}", "none")
@@ -183,43 +174,22 @@ def sines(values: Sequence[Any], centers: np.ndarray | None) -> tuple[np.ndarray
             raise InputError(name, f"shape ({count}, {boxes}, S, {d})", f"shape {part.shape}")
         if found and part.shape != found[0].shape:
             raise InputError(name, f"shape {found[0].shape} as box_amplitudes", f"shape {part.shape}")
-        _none_of(~absent & ~np.isfinite(part).all(axis=(2, 3)), name, "finite numbers where the centre is finite", part)
-        part[absent] = np.nan
-        _bounded(part, name)
-        found.append(part)
+        good = np.isfinite(part).all(axis=(2, 3))
+        found.append(_present(part, good, centers, name, "finite numbers where the centre is finite"))
     return tuple(found)
 
 
-def _rounding(value: Any, absent: np.ndarray) -> np.ndarray | None:
-    """Radii (L, K) of the boxes' edges, NaN where there is no box."""
-    if value is None:
-        return None
-    radii = array(value, "layouts.box_radii")
-    if radii.shape != absent.shape:
-        raise InputError("layouts.box_radii", f"shape {absent.shape}", radii.shape)
-    wrong = ~absent & ~(np.isfinite(radii) & (radii >= 0))
-    _none_of(wrong, "layouts.box_radii", "finite radii >= 0 where the centre is finite", radii)
-    _bounded(radii, "layouts.box_radii")
-    radii[absent] = np.nan
-    return radii
-
-
-def _turns(value: Any, absent: np.ndarray, dimension: int) -> np.ndarray | None:
+def _turns(value: Any, centers: np.ndarray) -> np.ndarray:
     """Angles (L, K) in the plane, unit quaternions (L, K, 4) in space, NaN where there is no box."""
-    if value is None:
-        return None
-    field, turns = "layouts.box_rotations", array(value, "layouts.box_rotations")
-    shape = absent.shape if dimension == 2 else (*absent.shape, 4)
-    if turns.shape != shape:
-        raise InputError(field, f"shape {shape}: " + ("angles" if dimension == 2 else "quaternions"), turns.shape)
-    if dimension == 2:
-        _none_of(~absent & ~np.isfinite(turns), field, "finite angles where the centre is finite", turns)
+    field, (*shape, d) = "layouts.box_rotations", centers.shape
+    if d == 2:
+        turns = _of_each(value, field, tuple(shape), f"shape {tuple(shape)}: angles")
+        good, expected = np.isfinite(turns), "finite angles where the centre is finite"
     else:
-        length = np.asarray(np.linalg.norm(turns, axis=2))
-        wrong = ~(np.abs(length - 1.0) <= UNIT_WITHIN)
-        _none_of(~absent & wrong, field, "unit quaternions [w, x, y, z] where the centre is finite", turns)
-    turns[absent] = np.nan
-    return turns
+        turns = _of_each(value, field, (*shape, 4), f"shape {(*shape, 4)}: quaternions")
+        good = np.abs(np.linalg.norm(turns, axis=2) - 1.0) <= UNIT_WITHIN
+        expected = "unit quaternions [w, x, y, z] where the centre is finite"
+    return _present(turns, good, centers, field, expected)
 
 
 def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
@@ -250,10 +220,8 @@ def gates(centers: Any, radii: Any, like: np.ndarray) -> tuple[np.ndarray | None
     middle, (count, _, d) = array(centers, "layouts.gate_centers"), like.shape
     if middle.ndim != 3 or middle.shape[0] != count or middle.shape[2] != d or middle.shape[1] < 1:
         raise InputError("layouts.gate_centers", f"shape ({count}, G, {d}), G >= 1", f"shape {middle.shape}")
-    absent = np.asarray(np.isnan(middle).all(axis=2))
-    _none_of(~absent & ~np.isfinite(middle).all(axis=2), "layouts.gate_centers", "finite rows or rows of NaN", middle)
+    absent = _absent(middle, "layouts.gate_centers")
     _none_of(absent[:, :-1] & ~absent[:, 1:], "layouts.gate_centers", "absent gates behind all others", middle)
-    _bounded(middle, "layouts.gate_centers")
     if radii is None:
         raise InputError("layouts.gate_radii", "this array with gate_centers", "none")
     sizes = array(radii, "layouts.gate_radii")
@@ -327,6 +295,31 @@ def ids(value: Any, count: int) -> np.ndarray:
         got = f"{given.dtype} of shape {given.shape}" + (f", from {given.min()}" if numeric else "")
         raise InputError("layouts.ids", f"integers >= 0 of shape ({count},)", got)
     return given.astype(np.int64)
+
+
+def _absent(centers: np.ndarray, field: str) -> np.ndarray:
+    """Which rows (L, M) of centres (L, M, d) are NaN; all others are to be finite, and not too far."""
+    absent = np.asarray(np.isnan(centers).all(axis=2))
+    _none_of(~absent & ~np.isfinite(centers).all(axis=2), field, "finite rows or rows of NaN", centers)
+    _bounded(centers, field)
+    return absent
+
+
+def _of_each(value: Any, field: str, shape: tuple[int, ...], expected: str | None = None) -> np.ndarray:
+    """Numbers of this shape."""
+    held = array(value, field)
+    if held.shape != shape:
+        raise InputError(field, expected or f"shape {shape}", held.shape)
+    return held
+
+
+def _present(values: np.ndarray, good: Any, centers: np.ndarray, field: str, expected: str) -> np.ndarray:
+    """Values with rows that are `good` (L, M) where a centre (L, M, d) is there, and NaN elsewhere."""
+    absent = np.isnan(centers).all(axis=2)
+    _none_of(~absent & ~good, field, expected, values)
+    values[absent] = np.nan
+    _bounded(values, field)
+    return values
 
 
 def _bounded(values: np.ndarray, field: str) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.status import STOPPED
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import chord_clearance
-from torchgco.lagrangian.quality import has_arrived, is_preferred, leaves_goal
+from torchgco.lagrangian.quality import arrive_alike, has_arrived, is_preferred
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -73,7 +73,7 @@ class Best:
         fits = (old.best.violation <= limit) & (new.best.violation <= limit)
         if not bool(fits.any()):
             return
-        fits &= ~leaves_goal(problem, new.best.X, old.best.X) & ~leaves_goal(problem, old.best.X, new.best.X)
+        fits &= arrive_alike(problem, new.best.X, old.best.X)
         if not bool(fits.any()):
             return
         before, now = (chord_clearance(problem, end.best.X) >= 0 for end in (old, new))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -59,7 +60,18 @@ class Refine:
 
 def inner_solver(iterations: int, share: float = 1.0) -> ILQR:
     """The inner solver of candidates, with a share of their tolerance."""
-    return ILQR(tolerance=share * CANDIDATE_TOLERANCE, max_iterations=iterations, line_search=LINE_SEARCH)
+    return _inner(share * CANDIDATE_TOLERANCE, iterations)
+
+
+# Each search asks for the same few: checking their options again takes longer than finding them.
+@lru_cache(maxsize=64)
+def _inner(tolerance: float, iterations: int) -> ILQR:
+    return ILQR(tolerance=tolerance, max_iterations=iterations, line_search=LINE_SEARCH)
+
+
+@lru_cache(maxsize=64)
+def _refining(inner: ILQR, rounds: int) -> AugmentedLagrangian:
+    return AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=rounds)
 
 
 def unwatched(done: int, total: int) -> None:
@@ -127,7 +139,10 @@ class Candidates:
 
     def parts(self) -> Iterator[Tensor]:
         """Rows of the live candidates, `CANDIDATES_AT_ONCE` at a time."""
-        return (rows for rows in self.live.nonzero().flatten().split(CANDIDATES_AT_ONCE) if rows.numel() > 0)
+        rows = self.live.nonzero().flatten()
+        if rows.numel() <= CANDIDATES_AT_ONCE:
+            return iter((rows,) if rows.numel() > 0 else ())
+        return iter(rows.split(CANDIDATES_AT_ONCE))
 
     def arrive(self) -> Tensor:
         """Whether each candidate ends near the goal, (B * count,)."""
@@ -172,8 +187,7 @@ class Candidates:
         multipliers, rows = Multipliers(lam, CANDIDATE_PENALTY * self.unit), sound.nonzero().flatten()
         if refine.top == 1 or rows.numel() == 0:
             return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
-        part, inner = self.of(rows), inner_solver(iterations, 0.1)
-        solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refine.rounds)
+        part, solver = self.of(rows), _refining(inner_solver(iterations, 0.1), refine.rounds)
         watched = None if self.watch is unwatched else lambda now: self.watch(now.finished, now.total)
         call = Call.checked(part, at_rest_after(part, self.U[rows]), warm=take(multipliers, rows), callback=watched)
         end, made = solver.improved(call)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Below, Count, NonNegative, Positive, check_options
-from torchgco.base.shapes import check_shape, tensor
+from torchgco.base.shapes import check_shape, repeated, tensor
 from torchgco.base.tree import take
 from torchgco.constraints.base import innermost
 from torchgco.constraints.bounds import ControlBounds
@@ -150,7 +150,7 @@ class Follow:
             InputError: initial offsets that don't fit the controls.
         """
         _, N, m = rest.shape
-        starts = rest.unsqueeze(1).repeat(1, 1 + len(self.initial_offsets), 1, 1)
+        starts = repeated(rest, 1 + len(self.initial_offsets))
         if self.initial_offsets:
             offsets = tensor(self.initial_offsets, "follow.initial_offsets", rest)
             check_shape(offsets, (len(self.initial_offsets), m), "follow.initial_offsets")
@@ -205,7 +205,9 @@ class Follow:
             places, stages = (part.repeat_interleave(each, dim=0) for part in (gates.places, problem.stages))
             last = places[:, -1]
             return timed(path, places, last + arrive.clamp(LEAST_SHARE, 1.0) * (stages - last), N)
-        center = path[:, -1:].repeat(1, N + 1, 1)
+        if problem.horizon is None:
+            return followed(path, self.depart, arrive, self.smoothing, N, paths.obstacles, paths.R)
+        center = repeated(path[:, -1], N + 1)
         for horizon in problem.stages.unique().tolist():
             rows = (problem.stages == horizon).nonzero().flatten()
             some = (rows.unsqueeze(-1) * each + torch.arange(each, device=path.device)).flatten()
@@ -311,4 +313,4 @@ def attraction(
     radius = tube * R
     # Near its surface the tube is as stiff as a spring of 4 weight radius^2.
     weight = spring / (4.0 * radius.square()).clamp(min=1e-12)
-    return GuideRegion(center, radius.unsqueeze(-1).repeat(1, center.shape[1]), weight, position)
+    return GuideRegion(center, repeated(radius, center.shape[1]), weight, position)

@@ -116,6 +116,9 @@ def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
     """The problems with fewer obstacles, which share kernels and the scale of the cost: neither depends on these."""
     other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None, interior=None))
     object.__setattr__(other, "cost_scale", cost_scale(problem))
+    known = vars(problem).get("start_is_clear")
+    if known is not None and bool(known.all()):  # then it is clear of fewer, too
+        object.__setattr__(other, "start_is_clear", known)
     return other
 
 
@@ -173,11 +176,11 @@ def _beside(p: Tensor, solids: Solids) -> Tensor:
     reach = solids.extent + solids.radii.unsqueeze(-1)
     present = (~solids.absent).to(p.dtype)
     margin = (reach.amin(-1) * present).sum(-1) / present.sum(-1).clamp(min=1.0)
-    near = ~solids.absent.unsqueeze(1)
+    limit, far = reach + margin.view(-1, 1, 1), solids.absent.unsqueeze(1)
     for a in range(p.shape[-1]):
         away = (p[:, :, None, a] - solids.centers[:, None, :, a]).abs()
-        near = near & ~(away > (reach[..., a] + margin.unsqueeze(-1)).unsqueeze(1))  # NaN counts as near
-    return near.any(1)
+        far = far | (away > limit[:, None, :, a])  # NaN counts as near
+    return ~far.all(1)
 
 
 def _gathered(lam: Tensor, at: Tensor | None) -> Tensor:

@@ -141,6 +141,8 @@ class Restarts(Solver):
         if self._finishes:
             end = least_violated(session.call, end, solver.violation_tolerance)
         solution = session.finished(end, solver.violation_tolerance, solver.slots)
+        if search.record is None:
+            return solution
         return replace(solution, search=search.finish_record(*session.scales))
 
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
@@ -166,7 +168,9 @@ class Restarts(Solver):
             sampler, unsampled = suited_guide(guidance.sampler, problem)
             solves = (one for one in self.passes.steps if isinstance(one, Solve) and one.until == "caught")
             after = next((solve.single_contact_after for solve in solves), None)
-            guidance = None if sampler is None else replace(guidance, sampler=sampler).in_search(after)
+            if sampler is not None and sampler is not guidance.sampler:
+                guidance = replace(guidance, sampler=sampler)
+            guidance = None if sampler is None else guidance.in_search(after)
             losses += [] if unsampled is None else [unsampled]
         elif guidance is not None:
             guidance = guidance.suited(problem)

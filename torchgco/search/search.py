@@ -103,10 +103,9 @@ class Search:
         held = best.cost.clone(), best.violation.clone()
         self.record.standings.append(Standing(self.call.rows, *held, away, self.best.arrived()))
 
-    def finish_record(self, unit: Tensor, constant: Tensor) -> SearchRecord | None:
+    def finish_record(self, unit: Tensor, constant: Tensor) -> SearchRecord:
         """The record, at the end of the search, with costs times a unit, plus a constant, both by place."""
-        if self.record is None:
-            return None
+        assert self.record is not None
         rows = (self.caught.status == STOPPED).nonzero().flatten()
         self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
         return self.record.in_costs(unit, constant)
@@ -117,16 +116,17 @@ class Search:
         "caught": all of them; "unarrived": no attempt has arrived yet; "far": none ends close to the goal either;
         "close": the best one does, but has not arrived; "unproposed": not arrived, and there was never a proposal.
         """
-        stopped = self.caught.status == STOPPED
-        if when != "caught":
-            stopped = stopped & ~self.best.arrived()
+        rows = (self.caught.status == STOPPED).nonzero().flatten()
+        if when == "caught" or rows.numel() == 0:
+            return rows
+        rows = rows[~self.best.arrived()[rows]]
         if when == "far":
-            stopped = stopped & ~self.best.arrived(ATTRACTED_WITHIN)
+            rows = rows[~self.best.arrived(ATTRACTED_WITHIN)[rows]]
         elif when == "close":
-            stopped = stopped & self.best.arrived(ATTRACTED_WITHIN)
+            rows = rows[self.best.arrived(ATTRACTED_WITHIN)[rows]]
         elif when == "unproposed":
-            stopped = stopped & ~self.proposed
-        return stopped.nonzero().flatten()
+            rows = rows[~self.proposed[rows]]
+        return rows
 
     def part(self, rows: Tensor) -> Part:
         """The problems in `rows`, to compare candidates for them outside of a round."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from torchgco.base.shapes import repeated
 from torchgco.guidance.suitability import check_form, failure
 from torchgco.kernels import kernels_of
 from torchgco.lagrangian.expansion import linearise
@@ -40,7 +41,7 @@ def suited_paths(passes: Sequence[Row], problem: Problem) -> tuple[Sequence[Row 
 
 def _expand(problem: Problem) -> None:
     """Evaluate the parts of an iLQR iteration, for one problem that stays at its start."""
-    X = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1)
+    X = repeated(problem.x0, problem.N + 1)
     U = X.new_zeros(1, problem.N, problem.m)
     check_form("dynamics", problem.along.step(X[:, :-1], U), X[:, :-1])
     lagrangian = Lagrangian(problem, Multipliers.zero(problem, 1.0), None, True)

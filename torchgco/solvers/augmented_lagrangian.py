@@ -170,7 +170,7 @@ class OuterLoop:
             regularisation=torch.zeros_like(cost),
             inner=none, outer=none.clone(), iterations=none.clone(), rung=none.clone(), guided=none.clone(),
             replaced=torch.zeros_like(none, dtype=torch.bool), last_cost=worst.clone(), last_violation=worst.clone(),
-            mark=worst.unsqueeze(-1).repeat(1, 2), waited=none.clone(),
+            mark=torch.stack((worst, worst), dim=-1), waited=none.clone(),
             best=copied(Iterate(X, U, multipliers, cost, worst)),
         )  # fmt: skip
         status = start_status(problem, X, merit, problem.start_is_clear)

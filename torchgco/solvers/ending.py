@@ -29,7 +29,7 @@ HIDES = 0.1
 def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
     """The statuses (B,) of problems that can't start, with rollouts X (B, N+1, n); RUNNING for the others."""
     # NaN compares as clear of every obstacle, so finiteness decides first.
-    finite = torch.isfinite(merit) & torch.isfinite(X).flatten(1).all(-1)
+    finite = torch.maximum(X.flatten(1).abs().amax(-1), merit.abs()) < torch.inf  # which NaN isn't either
     status = torch.where(finite, int(Status.RUNNING), int(Status.NON_FINITE))
     if start_is_clear is not None:
         status = torch.where(finite & ~start_is_clear, int(Status.INVALID_START), status)

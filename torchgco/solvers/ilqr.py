@@ -91,9 +91,8 @@ def descend(
     found = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
     status = start_status(problem, X, merit, start_is_clear)
     running, going = found, status == Status.RUNNING
-    while bool(going.any()):
-        if not bool(going.all()):
-            stay = going.nonzero().flatten()
+    while (stay := going.nonzero().flatten()).numel() > 0:
+        if stay.numel() < going.numel():
             running, lagrangian = take(running, stay), lagrangian.take(stay)
         kernels = kernels_of(lagrangian.problem)
         end = kernels.descend(lagrangian, running, inner.descent, inner.max_iterations)

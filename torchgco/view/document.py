@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.version import VERSION
+from torchgco.judging.worst import kind_of
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
-from torchgco.view.flights import Flight, constraint_name
+from torchgco.view.flights import Flight
 from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
 from torchgco.view.vehicles import Look, Shape, shape_of
@@ -61,7 +62,7 @@ class Document:
         """The page of a batch of problems, whose vehicle has a `radius`, m, where there are no obstacles."""
         shape, at = shape_of(problem), problem.position
         radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=radius)
-        names = [constraint_name(part) for part in problem.constraints]
+        names = [kind_of(part) for part in problem.constraints]
         size = {"radius": radius if shape is None else shape.reach, "shape": shape}
         return cls(dimension=at.stop - at.start, constraints=names, **size, **given)  # type: ignore[arg-type]
 
@@ -198,9 +199,9 @@ class SearchPart:
             guidance on.
     """
 
-    passes: Sequence[str]
-    rounds: Sequence[tuple[str, Sequence[Line]]]
-    guides: Sequence[tuple[str, np.ndarray, np.ndarray]] = ()
+    passes: list[str] = field(default_factory=list)
+    rounds: list[tuple[str, Sequence[Line]]] = field(default_factory=list)
+    guides: list[tuple[str, np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def packed(self, packing: Packing) -> dict[str, Any]:
         rounds = [{"name": name, "lines": [_line(packing, line) for line in lines]} for name, lines in self.rounds]
@@ -208,7 +209,7 @@ class SearchPart:
             {"name": name, "balls": packing.put(balls), "sample": packing.put(sample, steps=True)}
             for name, balls, sample in self.guides
         ]
-        return {"passes": list(self.passes), "rounds": rounds, "guides": guides}
+        return {"passes": self.passes, "rounds": rounds, "guides": guides}
 
 
 def _line(packing: Packing, line: Line) -> dict[str, Any]:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Constraint
 from torchgco.judging.contact import contacts
+from torchgco.judging.worst import kind_of
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.silhouettes import body_of
 from torchgco.problem.problem import Problem
@@ -76,16 +76,8 @@ class Flight:
         return held
 
 
-@dataclass(frozen=True)
-class Knots:
-    """What holds at the knots of B trajectories: violation and worst constraint, (B, N+1) each."""
-
-    violation: np.ndarray
-    worst: np.ndarray
-
-
-def violated(problem: Problem, X: Tensor, U: Tensor, admitted: float) -> Knots:
-    """The largest violation of every knot above `admitted`, and of which constraint (its place); 0 and -1 elsewhere."""
+def violated(problem: Problem, X: Tensor, U: Tensor, admitted: float) -> tuple[np.ndarray, np.ndarray]:
+    """The largest violation (B, N+1) of each knot above `admitted`, and of which constraint; 0 and -1 elsewhere."""
     most = X.new_full((problem.B, problem.N + 1), admitted)
     worst = torch.full_like(most, -1, dtype=torch.int64)
     for place, part in enumerate(problem.constraints):
@@ -97,13 +89,7 @@ def violated(problem: Problem, X: Tensor, U: Tensor, admitted: float) -> Knots:
         more = largest > most[:, knots]
         most[:, knots] = torch.where(more, largest, most[:, knots])
         worst[:, knots] = torch.where(more, place, worst[:, knots])
-    return Knots(torch.where(worst < 0, 0.0, most).cpu().numpy(), worst.cpu().numpy())
-
-
-def constraint_name(part: Constraint) -> str:
-    """The user's name of a constraint, else its kind, as `worst_rows` has it."""
-    given = getattr(part, "name", None)
-    return given if isinstance(given, str) and given != "constraint" else type(part).__name__.removeprefix("Bound")
+    return torch.where(worst < 0, 0.0, most).cpu().numpy(), worst.cpu().numpy()
 
 
 def worst_row(problem: Problem, violation: np.ndarray, worst: np.ndarray) -> Rows:
@@ -113,7 +99,7 @@ def worst_row(problem: Problem, violation: np.ndarray, worst: np.ndarray) -> Row
         return []
     part = problem.constraints[worst[k]]
     unit = " m" if isinstance(part, Obstacles) else ""
-    return [("worst", f"{constraint_name(part)}, knot {k}: {violation[k]:.2g}{unit}")]
+    return [("worst", f"{kind_of(part)}, knot {k}: {violation[k]:.2g}{unit}")]
 
 
 def whole(X: np.ndarray) -> np.ndarray:
@@ -140,13 +126,14 @@ def flights_of(
         admitted: the violation up to which nothing is marked.
         touching: (B,) bool: where contact is looked for.
     """
-    knots, found, dt = violated(problem, X, U, admitted), [], getattr(problem.dynamics, "dt", None) or 1.0
+    (violation, worst), found = violated(problem, X, U, admitted), []
+    dt = getattr(problem.dynamics, "dt", None) or 1.0
     states, body = X.detach().cpu().double().numpy(), body_of(problem)
     for b in range(problem.B):
         kept = whole(states[b])
         path, at = kept[:, problem.position], slice(0, len(kept))
         places = path[:0]
-        bad, which = knots.violation[b, at], knots.worst[b, at]
+        bad, which = violation[b, at], worst[b, at]
         if touching[b] and len(path):
             part = problem.take(torch.tensor([b], device=X.device))
             places = contacts(part.obstacles, path, dt, kept)

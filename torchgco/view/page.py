@@ -23,7 +23,8 @@ POLICY = "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsaf
 
 def page(document: Document) -> str:
     """The text of the file. It asks the network for nothing: its own policy forbids it, too."""
-    scripts = [_text(name, _compressed(path.read_bytes()), "built") for name, path in BUILT.items()]
+    built = {name: base64.b64encode(zlib.compress(path.read_bytes(), 9)) for name, path in BUILT.items()}
+    scripts = [_text(name, held.decode(), "built") for name, held in built.items()]
     scripts += [_text(name, _inert((STATIC / name).read_text()), "module") for name in MODULES]
     data = [_text("head", document.head(), "data")]
     data += [_text(f"part-{i}", part, "data") for i, part in enumerate(document.parts)]
@@ -49,7 +50,3 @@ def _text(name: str, text: str, kind: str) -> str:
 def _inert(text: str) -> str:
     """Text that can't end the script element that it stands in."""
     return re.sub(r"<(/script|!--)", r"<\\\1", text, flags=re.IGNORECASE)
-
-
-def _compressed(raw: bytes) -> str:
-    return base64.b64encode(zlib.compress(raw, 9)).decode()

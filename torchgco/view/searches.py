@@ -23,12 +23,9 @@ def search_of(solution: Solution, problem: Problem, b: int) -> SearchPart | None
     for one in record.comparisons:
         for i in (one.rows == b).nonzero().flatten().tolist():
             lines = [*_caught(record, problem, b), *_paths(one, i), *_candidates(one, problem, i)]
-            rounds.append((f"pass {one.number}, {_candidates_in(one, i)} candidates", lines))
+            count = int((one.fate[i] != int(Fate.ABSENT)).sum())
+            rounds.append((f"pass {one.number}, {count} candidates", lines))
     return SearchPart(passes, rounds)
-
-
-def _candidates_in(one: Comparison, i: int) -> int:
-    return int((one.fate[i] != int(Fate.ABSENT)).sum())
 
 
 def _array(values: Tensor) -> np.ndarray:

@@ -10,10 +10,11 @@ Without one it is drawn as the search for paths sees it (`Obstacles.inflated`), 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchgco.maps.distance import Unknown
@@ -22,7 +23,6 @@ from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.obstacles.box_geometry import Cuboids
-from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.view.packing import Packing
 
@@ -70,32 +70,20 @@ def once(rows: np.ndarray) -> np.ndarray:
     return rows[:1] if len(rows) > 1 and bool((rows == rows[0]).all()) else rows
 
 
-def _here(part: Obstacles, b: int) -> np.ndarray:
-    return (~part.absent[b]).nonzero().flatten().cpu().numpy()
-
-
-def _rows(values: Tensor, b: int, here: np.ndarray) -> np.ndarray:
-    return values[b].detach().cpu().double().numpy()[here]
+def _rows(values: Tensor, b: int, here: Tensor) -> np.ndarray:
+    return values[b][here].detach().cpu().double().numpy()
 
 
 def _spheres(part: BoundSpheres, b: int) -> Shapes:
-    here = _here(part, b)
-    center, radius = _rows(part.centers, b, here), _rows(part.inflated_radii, b, here)
-    moves = part.velocities is not None and bool(part.velocities[b].any())
-    velocity = _rows(part.velocities, b, here) if moves and part.velocities is not None else None
+    still = _solids(part, Solids(part.centers, part.inflated_radii, part.absent), b)
     stop = None if part.stops is None else float(part.stops[b]) * part.dt
-    return Shapes(center, np.zeros((1, center.shape[1])), radius - float(part.vehicle_radius[b]), None, velocity, stop)
-
-
-def _boxes(part: BoundBoxes, b: int) -> Shapes:
-    here = _here(part, b)
-    radius = (_rows(part.inflated_radii, b, here) - float(part.vehicle_radius[b])).clip(min=0.0)
-    axes = _rows(part.axes, b, here)
-    return Shapes(_rows(part.centers, b, here), _rows(part.half_sizes, b, here), radius, turns(axes))
+    if part.velocities is None or not bool(part.velocities[b].any()):
+        return replace(still, until=stop)
+    return replace(still, velocity=_rows(part.velocities, b, ~part.absent[b]), until=stop)
 
 
 def _solids(part: Obstacles, solids: Solids, b: int) -> Shapes:
-    here = (~solids.absent[b]).nonzero().flatten().cpu().numpy()
+    here = ~solids.absent[b]
     center = _rows(solids.centers, b, here)
     radius = (_rows(solids.radii, b, here) - float(part.vehicle_radius[b])).clip(min=0.0)
     if not isinstance(solids, Cuboids):
@@ -128,7 +116,7 @@ def _cells(grid: OccupancyGrid, cells: np.ndarray, unknown: Unknown | None = Non
 
 
 # What the page draws for obstacles of each kind, once bound to a problem, and the place of a problem in its batch.
-SHAPES: dict[type[Obstacles], ShapesOf] = {BoundSpheres: _spheres, BoundBoxes: _boxes, BoundField: _map}
+SHAPES: dict[type[Obstacles], ShapesOf] = {BoundSpheres: _spheres, BoundField: _map}
 
 
 def shapes_of(part: Obstacles, b: int) -> Shapes | None:
@@ -141,28 +129,12 @@ def shapes_of(part: Obstacles, b: int) -> Shapes | None:
 
 
 def turns(axes: np.ndarray) -> np.ndarray | None:
-    """Angles (M,), or unit quaternions (M, 4), of sides along the rows of axes (M, d, d); None where all are straight.
-
-    The quaternion is read off the largest of its squared components, which no small divisor spoils (Shepperd, 1978).
-    """
+    """Angles (M,), or unit quaternions (M, 4), of sides along the rows of axes (M, d, d); None: all are straight."""
     if bool((np.abs(axes - np.eye(axes.shape[-1])) < 1e-9).all()):
         return None
     if axes.shape[-1] == 2:
         return np.arctan2(axes[:, 0, 1], axes[:, 0, 0])
-    R = axes.transpose(0, 2, 1)  # columns: where the axes of space are turned to
-    diagonal = np.stack([R[:, i, i] for i in range(3)], axis=-1)
-    trace = diagonal.sum(axis=-1)
-    squares = np.concatenate((1.0 + trace[:, None], 1.0 + 2.0 * diagonal - trace[:, None]), axis=-1)  # 4 q_i^2
-    odd = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)  # 4 q_0 q_i
-    even = R + R.transpose(0, 2, 1)  # 4 q_i q_j off the diagonal
-    products = np.empty((len(R), 4, 4))
-    products[:, 0, 0], products[:, 0, 1:], products[:, 1:, 0] = squares[:, 0], odd, odd
-    products[:, 1:, 1:] = even
-    for i in range(3):
-        products[:, i + 1, i + 1] = squares[:, i + 1]
-    largest = squares.argmax(axis=-1)
-    found = products[np.arange(len(R)), largest]
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    return Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat(scalar_first=True)
 
 
 def merged(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

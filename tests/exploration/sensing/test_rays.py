@@ -12,6 +12,7 @@ from torchgco import Boxes, Capsules, ControlBounds, Problem, QuadraticCost, Qua
 from torchgco.base.errors import InputError
 from torchgco.constraints import FunctionConstraint
 from torchgco.exploration.sensing import World
+from torchgco.exploration.sensing.world import Motion
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.obstacles.base import Obstacles
 
@@ -43,7 +44,7 @@ def directions(rng: np.random.Generator, count: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(4))
 def test_rays_meet_what_a_march_meets(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    world = World(bodies(rng), np.zeros((12, 3)))
+    world = World(bodies(rng), Motion.steady(np.zeros((12, 3))))
     origin = rng.uniform(-3, 3, 3)
     rays = directions(rng, 80)
     slow = np.array([march(origin, d, 6.0, lambda p: inside(p, world.boxes), STEP) for d in rays])
@@ -61,7 +62,7 @@ def test_rays_meet_occupied_cells() -> None:
     rng = np.random.default_rng(7)
     occupied = (rng.uniform(size=(14, 11, 9)) < 0.06).astype(np.uint8)
     corner, size = np.array([-2.0, -1.0, -0.7]), 0.31
-    world = World(np.zeros((0, 16)), np.zeros((0, 3)), occupied, tuple(corner), size)
+    world = World(np.zeros((0, 16)), Motion.steady(np.zeros((0, 3))), occupied, tuple(corner), size)
     hits = 0
     for origin in (np.array([0.1, 0.2, 0.3]), np.array([-4.0, -3.0, 2.5]), np.array([0.3, 1.0, 5.0])):
         rays = directions(rng, 80)
@@ -78,7 +79,7 @@ def test_rays_meet_occupied_cells() -> None:
 
 def test_inside_of_a_body_all_distances_are_0_and_beyond_the_range_infinite() -> None:
     sphere = np.concatenate([[1.0, 0, 0], np.eye(3).ravel(), np.zeros(3), [0.5]])
-    world, rays = World(sphere[None], np.zeros((1, 3))), np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    world, rays = World(sphere[None], Motion.steady(np.zeros((1, 3)))), np.array([[1.0, 0, 0], [0, 1.0, 0]])
     assert np.array_equal(world.cast([1.2, 0, 0], rays, 5.0), [0.0, 0.0])
     assert np.allclose(world.cast([-1.0, 0, 0], rays, 5.0), [1.5, np.inf])
     assert np.array_equal(world.cast([-1.0, 0, 0], rays, 1.4), [np.inf, np.inf])
@@ -86,7 +87,7 @@ def test_inside_of_a_body_all_distances_are_0_and_beyond_the_range_infinite() ->
 
 def test_moving_bodies_are_where_they_are_at_the_time() -> None:
     sphere = np.concatenate([[1.0, 0, 0], np.eye(3).ravel(), np.zeros(3), [0.5]])
-    world = World(sphere[None], np.array([[1.0, 0, 0]]))
+    world = World(sphere[None], Motion.steady(np.array([[1.0, 0, 0]])))
     ahead = np.array([[1.0, 0, 0]])
     assert np.allclose(world.at(2.0).cast([0, 0, 0], ahead, 9.0), [2.5])
     assert np.allclose(world.at(0.0).cast([0, 0, 0], ahead, 9.0), [0.5])

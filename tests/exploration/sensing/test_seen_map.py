@@ -23,6 +23,7 @@ from torchgco.exploration.sensing.grid import (
     UNKNOWN,
 )
 from torchgco.exploration.sensing.search import Search
+from torchgco.exploration.sensing.world import Motion
 
 CORNER, SIZE, SHAPE = np.array([-2.0, -1.5, -1.0]), 0.25, (17, 13, 9)
 SPAN = np.array(SHAPE) * SIZE
@@ -36,7 +37,7 @@ def drawn(rng: np.random.Generator, free: float = 0.8) -> SeenMap:
     """A map with cells of all three states."""
     seen = empty()
     seen.state[:] = rng.choice([FREE, OCCUPIED, UNKNOWN], SHAPE, p=[free, 0.6 * (1 - free), 0.4 * (1 - free)])
-    seen.measure(np.zeros(3), np.array(SHAPE))
+    seen.measure()
     return seen
 
 
@@ -111,7 +112,7 @@ def test_distances_around_changes_alone_are_those_of_the_whole(share: float) -> 
         before = part.state.copy()
         part.state[:] = whole.state[:] = np.where(rng.uniform(size=SHAPE) < share, new, before)
         part.remeasure(np.flatnonzero(part.state != before).astype(np.int32))
-        whole.measure(np.zeros(3), np.array(SHAPE))
+        whole.measure()
         assert np.array_equal(part.from_occupied, whole.from_occupied)
     assert (part.from_occupied == 0).sum() > 5
 
@@ -204,7 +205,7 @@ def test_where_no_path_leads_to_the_goal_it_ends_at_the_nearest_cell() -> None:
     seen = empty()
     seen.state[:] = FREE
     seen.state[9] = OCCUPIED  # a wall from side to side
-    seen.measure(np.zeros(3), np.array(SHAPE))
+    seen.measure()
     path, arrives = whole(Search(seen, radius=0.1), CORNER + 0.6, CORNER + SPAN - 0.6)
     assert not arrives and seen.cell(path[-1])[0] == 8
 
@@ -231,7 +232,7 @@ def test_a_seen_world_is_free_where_it_is_free() -> None:
     rng = np.random.default_rng(8)
     rows = [np.concatenate([rng.uniform([-1, -1, -0.5], [2, 1.5, 1.0]), np.eye(3).ravel(), [0, 0, 0.4], [0.25]])
             for _ in range(5)]  # fmt: skip
-    world, seen = World(np.array(rows), np.zeros((5, 3))), empty()
+    world, seen = World(np.array(rows), Motion.steady(np.zeros((5, 3)))), empty()
     for step, x in enumerate(np.linspace(-1.8, 2.0, 12)):
         p = np.array([x, -1.3, 0.0])
         scan = Lidar(rays=(240, 60), noise=0.0).scan(world, p, [1, 0, 0, 0], 0.0, (0, 0, step))

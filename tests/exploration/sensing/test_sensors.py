@@ -6,6 +6,7 @@ import pytest
 from torchgco.base.errors import InputError
 from torchgco.exploration.sensing import Depth, Lidar, World
 from torchgco.exploration.sensing.sensors import turned
+from torchgco.exploration.sensing.world import Motion
 
 NOWHERE, LEVEL = np.zeros(3), np.array([1.0, 0, 0, 0])
 
@@ -18,7 +19,7 @@ def shell(radius: float) -> World:
             center, half = np.zeros(3), np.full(3, radius + 2.0)
             center[axis], half[axis] = side * (radius + 1.0), 1.0
             rows.append(np.concatenate([center, np.eye(3).ravel(), half, [0.0]]))
-    return World(np.array(rows), np.zeros((6, 3)))
+    return World(np.array(rows), Motion.steady(np.zeros((6, 3))))
 
 
 def test_a_lidar_without_noise_measures_the_walls() -> None:

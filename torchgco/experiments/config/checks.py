@@ -42,7 +42,7 @@ def _hydra_word(word: str) -> str:
         return f"{word.partition('=')[0]}={_hydra_path(key, value)}"
     group = key.split("@")[0]
     if equals and re.fullmatch(r"[\w/]+", group) and (options := options_of(group)):
-        if value.lower() == "null" and _default_options().get(key, "") is None:
+        if value.lower() == "null" and _default_options(_read("config")).get(key, "") is None:
             return f"~{key}"
         if value.lower() in NO_CHOICES or re.fullmatch(r"[-+]?[\d.]+|\{.*\}", value):
             raise InputError(group, f"one of {', '.join(options)}", value or "nothing")
@@ -76,9 +76,13 @@ def check_once(words: Iterable[str]) -> None:
         given[key] = word
 
 
-def _default_options() -> dict[str, str | None]:
+def _read(name: str) -> Any:
+    """A file of conf/ as plain dicts and lists."""
+    return OmegaConf.to_container(OmegaConf.load(config_dir() / f"{name}.yaml"))
+
+
+def _default_options(base: Any) -> dict[str, str | None]:
     """The option of every group in the defaults list of config.yaml; None where the group is left out by default."""
-    base: Any = OmegaConf.to_container(OmegaConf.load(config_dir() / "config.yaml"))
     return {key: option for entry in base["defaults"] if isinstance(entry, dict) for key, option in entry.items()}
 
 
@@ -88,14 +92,13 @@ def check(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: a group or key that is missing or unknown, a malformed seed, name or list of baselines.
     """
-    conf = config_dir()
-    base: Any = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))
-    chosen = _default_options().items()
+    base = _read("config")
+    chosen = _default_options(base).items()
     groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
     own = [key for key in base if key not in ("defaults", "hydra")]
     needed = [*own, *(key for key, option in groups.items() if option is not None)]
     _keys(config, "", needed, [*own, *groups, VEHICLE_GROUP])
-    device: Any = OmegaConf.load(conf / "device" / f"{groups['device']}.yaml")
+    device = _read(f"device/{groups['device']}")
     for name, known in (("study", base["study"]), ("device", device), ("model", MODEL)):
         _keys(config[name], name, list(known), list(known))
     for name in ("scenario", "solver"):

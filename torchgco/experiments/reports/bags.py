@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from torchgco.base.errors import InputError
 from torchgco.obstacles.attitude import QUATERNION
@@ -170,5 +171,4 @@ def _turning(columns: Mapping[str, np.ndarray], t: np.ndarray) -> np.ndarray:
 
 def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors v (T, 3) turned by unit quaternions (T, 4)."""
-    across = 2.0 * np.cross(q[:, 1:], v)
-    return v + q[:, :1] * across + np.cross(q[:, 1:], across)
+    return Rotation.from_quat(q, scalar_first=True).apply(v)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from torchgco.base.errors import InputError
 from torchgco.base.version import VERSION
@@ -65,17 +65,10 @@ def _logged(path: Path, trust: bool) -> tuple[Tensor, Tensor, float]:
     """States, commands and the time step of the flights in a file."""
     parts = [part for _, part in read_table(path, trust).groupby(["solver", "mission"], sort=False)]
     dt = float(parts[0]["t"].iloc[1] - parts[0]["t"].iloc[0])
-    x, u = (_together(parts, letter, first, count) for letter, first, count in (("x", 0, 17), ("u", 1, 4)))
+    named = [f"x{i}" for i in range(17)], [f"u{i}" for i in range(1, 5)]
+    held = ([torch.from_numpy(part[names].to_numpy(float)) for part in parts] for names in named)
+    x, u = (pad_sequence(flights, batch_first=True, padding_value=torch.nan) for flights in held)
     return x, u[:, :-1], dt
-
-
-def _together(parts: Sequence, letter: str, first: int, count: int) -> Tensor:
-    """Columns of several flights (B, K, count), NaN after the end of each."""
-    held = [part[[f"{letter}{i}" for i in range(first, first + count)]].to_numpy(float) for part in parts]
-    whole = np.full((len(held), max(map(len, held)), count), np.nan)
-    for row, own in zip(whole, held, strict=True):
-        row[: len(own)] = own
-    return torch.from_numpy(whole)
 
 
 def document(found: Identified, source: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import LAYOUTS, MISSION, PLANS_FILE, TIME_STEPS, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
-from torchgco.experiments.statistics.mission_tables import mission_lines
+from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.missions.contact import Contact
 from torchgco.missions.passing import Passing
 from torchgco.missions.planning_problem import airframe_of
@@ -85,19 +84,23 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
 
     if len(shown := several(trials)):
         add("outcomes", lambda: draw.outcomes_figure(shown))
-    flown = _Flown.read(folder)
+    if not all((folder / name).is_file() for name in (PLANS_FILE, TIME_STEPS)):  # of many missions
+        return held
+    with np.load(folder / PLANS_FILE, allow_pickle=False) as flown:
+        plans = dict(zip(flown["solver"].tolist(), flown["plan"], strict=True))
+    tables = [pd.read_parquet(folder / name) for name in (MISSION, TIME_STEPS)]
     layouts = Layouts.load(folder / LAYOUTS)
-    for i, number in enumerate(layouts.ids.tolist() if flown else []):
-        assert flown is not None
+    for i, number in enumerate(layouts.ids.tolist()):
         course, period = _course(setup, layouts.take([i]))
-        rows, fine = flown.of(number)
+        rows, fine = (_by_solver(table[table["mission"] == number]) for table in tables)
         if not rows:  # a start in contact
             continue
+        fine = {name: fine[name] for name in rows}  # of solvers that never flew there is the start alone
         add(f"{number}-compute", partial(draw.compute_figure, rows, period))
         if len(course.reaches):
             add(f"{number}-distance", partial(draw.distance_figure, fine, course))
         for name, frame in rows.items():
-            plan, label = flown.plans[name][i][: len(frame)], f"{number}-{name}"
+            plan, label = plans[name][i][: len(frame)], f"{number}-{name}"
             steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
             add(f"{label}-snapshots", partial(draw.snapshots_figure, frame, plan, course, steps, period))
             add(f"{label}-commands", partial(draw.commands_figure, fine[name], airframe_of(setup.vehicle.dynamics)))
@@ -108,34 +111,8 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
     return held
 
 
-@dataclass(frozen=True)
-class _Flown:
-    """What is kept of few missions.
-
-    Args:
-        steps: rows of mission.parquet.
-        fine: rows of time_steps.parquet.
-        plans: planned positions (L, K, N+1, 3) by solver.
-    """
-
-    steps: pd.DataFrame
-    fine: pd.DataFrame
-    plans: dict[str, np.ndarray]
-
-    @classmethod
-    def read(cls, folder: Path) -> _Flown | None:
-        """None where a study has many missions."""
-        if not all((folder / name).is_file() for name in (PLANS_FILE, TIME_STEPS)):
-            return None
-        with np.load(folder / PLANS_FILE, allow_pickle=False) as held:
-            plans = dict(zip(held["solver"].tolist(), held["plan"], strict=True))
-        return cls(pd.read_parquet(folder / MISSION), pd.read_parquet(folder / TIME_STEPS), plans)
-
-    def of(self, number: int) -> tuple[dict[str, pd.DataFrame], dict[str, pd.DataFrame]]:
-        """The rows of one layout per control step, and those per time step, by solver; none that never flew."""
-        tables = (table[table["mission"] == number] for table in (self.steps, self.fine))
-        rows, fine = ({str(name): held for name, held in table.groupby("solver", sort=False)} for table in tables)
-        return rows, {name: fine[name] for name in rows}
+def _by_solver(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    return {str(name): rows for name, rows in table.groupby("solver", sort=False)}
 
 
 def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:

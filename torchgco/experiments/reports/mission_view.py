@@ -71,16 +71,15 @@ class _Log:
     @classmethod
     def read(cls, study: Study) -> _Log:
         steps = dict(iter(study.log.groupby(["solver", "mission"], sort=False)))
-        if not (study.folder / PLANS_FILE).is_file():
-            return cls(steps, study.rows, {}, {})  # type: ignore[arg-type]
-        held, numbers = study.flown(PLANS_FILE, "plan"), study.layouts.ids.tolist()
-        kept = {(name, i): plan for name, plans in held.items() for i, plan in zip(numbers, plans, strict=True)}
-        if study.manifest.configuration["mission"].get("sensor", "full") == "full":
-            return cls(steps, study.rows, kept, {})  # type: ignore[arg-type]
-        try:
-            return cls(steps, study.rows, kept, {name: study.mission(name) for name in held})  # type: ignore[arg-type]
-        except InputError as error:  # an option that another version knew
-            return cls(steps, study.rows, kept, {}, f"no map: {error}")  # type: ignore[arg-type]
+        held = study.flown(PLANS_FILE, "plan") if (study.folder / PLANS_FILE).is_file() else {}
+        numbers, loops, missing = study.layouts.ids.tolist(), dict[str, Mission](), ""
+        plans = {(name, i): plan for name, plans in held.items() for i, plan in zip(numbers, plans, strict=True)}
+        if study.manifest.configuration["mission"].get("sensor", "full") != "full":
+            try:
+                loops = {name: study.mission(name) for name in held}
+            except InputError as error:  # an option that another version knew
+                missing = f"no map: {error}"
+        return cls(steps, study.rows, plans, loops, missing)  # type: ignore[arg-type]
 
     def flight(self, study: Study, problem: Problem, solver: str, number: int, notes: list[str]) -> Flight | None:
         """The flight of a mission, the problem of which is given; None without a finite state."""
@@ -98,12 +97,12 @@ class _Log:
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:
             with limited(math.inf if study.trust else LARGEST_FILE), page_bar(len(x), SLOW_MAP, "period", "map") as bar:
-                replay = replayed(loop, problem, x, study.seed, number, bar.update)
+                seen, sought = replayed(loop, problem, x, study.seed, number, bar.update)
         except (NativeError, MemoryError) as error:  # a map of any size can be asked for
             notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]
             return replace(flight, plan=plan[: len(flight.path)])
         safe = steps["safe"].to_numpy() == 1
-        return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(replay.seen, replay.sought, safe))
+        return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(seen, sought, safe))
 
 
 def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:

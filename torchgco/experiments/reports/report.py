@@ -32,10 +32,9 @@ from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
-from torchgco.plotting.rates import rates_figure
+from torchgco.plotting.rates import rates_figure, sweep_figure
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
-from torchgco.plotting.sweeps import sweep_figure
 from torchgco.scenarios.layouts import Layouts
 
 Drawings = dict[str, Callable[[], Figure]]

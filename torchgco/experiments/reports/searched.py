@@ -3,19 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Self
 
+import numpy as np
 import torch
+from torch import Tensor
 
+from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
 from torchgco.experiments.reports.finished import Study
+from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers import AugmentedLagrangian
+from torchgco.solvers.contracts import Advice, Guidance
 from torchgco.view.document import SearchPart
-from torchgco.view.guides import Watched
 from torchgco.view.searches import search_of
+
+
+class Guided(NamedTuple):
+    """The guide region of a problem after one outer iteration."""
+
+    number: int  # the problem's id
+    outer: int  # the outer iteration
+    balls: np.ndarray  # (K, d + 1): centres and radii, m, at the guided knots
+    sample: np.ndarray  # (N+1, d): the trajectory that the balls lie along, m
+
+
+@dataclass(frozen=True)
+class Watched:
+    """Another guidance, whose advice is passed on as it is and noted in `seen`.
+
+    Args:
+        guidance: that advises.
+        seen: what it advised, in the order of the calls.
+    """
+
+    guidance: Guidance
+    seen: list[Guided] = field(default_factory=list)
+
+    def suited(self, problem: Problem) -> Self | None:
+        suited = self.guidance.suited(problem)
+        return None if suited is None else replace(self, guidance=suited)
+
+    def start(self, problem: Problem, X: Tensor) -> GuideRegion | None:
+        return self.guidance.start(problem, X)
+
+    def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
+        advice = self.guidance.update(problem, X, U, penalty, key)
+        region = advice.penalty
+        if isinstance(region, GuideRegion):
+            for row in region.is_active.nonzero().flatten().tolist():
+                center, radius = (part[row].detach().cpu().double().numpy() for part in (region.center, region.radius))
+                here = np.isfinite(radius)
+                balls = np.column_stack((center[here], radius[here]))
+                self.seen.append(Guided(int(key.ids[row]), int(key.outer[row]), balls, center))
+        return advice
 
 
 def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
@@ -27,7 +71,7 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
     Raises:
         InputError: missions with a sensor, whose search is that for a path on the map.
     """
-    found: dict[int, list[SearchPart]] = {number: [] for number in numbers}
+    found: dict[int, SearchPart] = {}
     for name in study.manifest.solvers:
         solver, seen = study.solver(name).recording(), []
         if isinstance(solver, AugmentedLagrangian):
@@ -38,12 +82,14 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
         for some in _alike(study, numbers):
             problem, solution = _solved(study, some, name, solver)
             for b, number in enumerate(some):
-                part = search_of(solution, problem, b) or SearchPart([], [])
+                part = search_of(solution, problem, b) or SearchPart()
                 own = [one for one in seen if one.number == number]
-                guides = [(f"outer iteration {one.outer}", one.balls, one.sample) for one in own]
-                if part.passes or part.rounds or guides:
-                    found[number].append(_named(replace(part, guides=guides), name))
-    return {number: _joined(parts) for number, parts in found.items() if parts}
+                if part.passes or part.rounds or own:
+                    whole = found.setdefault(number, SearchPart())
+                    whole.passes.extend(f"{name}: {text}" for text in part.passes)
+                    whole.rounds.extend((f"{name}: {text}", lines) for text, lines in part.rounds)
+                    whole.guides.extend((f"outer iteration {one.outer}, {name}", one.balls, one.sample) for one in own)
+    return found
 
 
 def _alike(study: Study, numbers: Sequence[int]) -> list[list[int]]:
@@ -65,19 +111,3 @@ def _solved(study: Study, numbers: Sequence[int], name: str, solver: Any) -> tup
         raise InputError("--search", expected, "missions with a sensor")
     planner = replace(mission.planner, solver=solver)
     return replace(mission, planner=planner).first_plans(task.problem, study.seed, ids)
-
-
-def _named(part: SearchPart, solver: str) -> SearchPart:
-    return SearchPart(
-        [f"{solver}: {text}" for text in part.passes],
-        [(f"{solver}: {text}", lines) for text, lines in part.rounds],
-        [(f"{text}, {solver}", balls, sample) for text, balls, sample in part.guides],
-    )
-
-
-def _joined(parts: Sequence[SearchPart]) -> SearchPart:
-    return SearchPart(
-        [text for part in parts for text in part.passes],
-        [one for part in parts for one in part.rounds],
-        [one for part in parts for one in part.guides],
-    )

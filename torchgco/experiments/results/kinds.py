@@ -3,34 +3,81 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import pandas as pd
 
 from torchgco.experiments.results.files import write
-from torchgco.experiments.statistics.mission_statistics import summarise_missions
-from torchgco.experiments.statistics.mission_tables import format_missions, printed_missions
+from torchgco.experiments.statistics.missions import MISSIONS_AT_ONCE, summarise_missions
 from torchgco.experiments.statistics.paired import compare
-from torchgco.experiments.statistics.statistics import TASK, are_missions, summarise, task_columns
-from torchgco.experiments.statistics.tables import csv_text, format_frame, format_table, printed
+from torchgco.experiments.statistics.statistics import OUTCOMES, TASK, are_missions, summarise, task_columns
+from torchgco.experiments.statistics.tables import (
+    PAIR_CELLS,
+    RATES_TEXT,
+    Kind,
+    cost_ratio,
+    csv_text,
+    format_frame,
+    number,
+    rate,
+)
+from torchgco.missions.outcome import Outcome
 
 KIND = "kind"  # first column of summary.csv and paired.csv
 
 
-class Kind(NamedTuple):
-    """A kind of trials: its name, its statistics, and the texts and tables made of these and of comparisons."""
+# Head, form and columns of the summary.
+TRAJECTORY_EFFORT = (
+    ("n", "{:d}", "n"), ("invalid", "{:d}", "invalid"), ("viol. ok", "{:.0%}", "violation_ok"),
+    ("violation", "{:.2g}", "violation_median"), ("cost reached", "{:.1f}", "cost_median_reached"),
+    ("cost all", "{:.1f}", "cost_median"), ("cost ratio", "{:.3f} ({:.3f})", "cost_ratio_median", "cost_ratio_p90"),
+    ("iter.", "{:.0f} ({:.0f})", "iterations_median", "iterations_p90"),
+    ("outer", "{:.3g} ({:.3g})", "outer_iterations_median", "outer_iterations_p90"),
+    ("guided", "{:.3g} ({:.3g})", "guided_median", "guided_p90"),
+    ("seconds", "{:.2g} ({:.2g})", "seconds_median", "seconds_p90"),
+)  # fmt: skip
+MISSION_EFFORT = (
+    ("flight time", "{:.2f} s", "flight_time"), ("clearance", "{:.3f} m", "clearance"),
+    ("energy", "{:.0f} J", "energy"), ("at once", "{:.0f}", MISSIONS_AT_ONCE),
+    ("planner", "{:.4f} s", "planner_seconds_median"), ("99 %", "{:.4f} s", "planner_seconds_p99"),
+    ("tracker", "{:.4f} s", "tracker_seconds_median"), ("missed", "{:.1f}", "missed_deadlines"),
+    ("kept plans", "{:.1f}", "shifted_plans"),
+)  # fmt: skip
+EFFORT_TEXT = "effort: median (90 % quantile); costs: where the goal was reached, everywhere, over the best known one"
+DIVIDED = (
+    "\nplanner, 99 %, tracker: the time of a batch divided by its missions (at once), which is no latency;\n"
+    "deadlines are missed only by missions that fly alone"
+)
 
-    name: str
-    summarise: Callable[[pd.DataFrame], pd.DataFrame]
-    text: Callable[[pd.DataFrame, pd.DataFrame], str]
-    printed: Callable[[pd.DataFrame, pd.DataFrame], list[pd.DataFrame]]
+
+def _missed(row: pd.Series) -> str:
+    """Missed deadlines; of a batch none, as its divided times don't decide them."""
+    return "-" if row[MISSIONS_AT_ONCE] > 1 else number("{:.1f}", "missed_deadlines")(row)
 
 
-TRAJECTORIES = Kind("trajectory", summarise, format_table, printed)
-MISSIONS = Kind("mission", summarise_missions, format_missions, printed_missions)
+TRAJECTORIES = Kind(
+    "trajectory",
+    summarise,
+    rates={name: rate(name) for name in OUTCOMES},
+    effort={head: number(form, *names) for head, form, *names in TRAJECTORY_EFFORT},
+    paper=("n", "cost ratio", "iter.", "seconds"),
+    compared={**PAIR_CELLS, "cost ratio": cost_ratio},
+    statuses=True,
+    notes=f"{RATES_TEXT}\n{EFFORT_TEXT}",
+)
+MISSIONS = Kind(
+    "mission",
+    summarise_missions,
+    of="missions in ",
+    rates={"n": number("{:d}", "n"), **{name: rate(name.lower()) for name in Outcome.__members__}},
+    effort={head: number(form, name) for head, form, name in MISSION_EFFORT} | {"missed": _missed},
+    paper=[head for head, *_ in MISSION_EFFORT],
+    compared=PAIR_CELLS,
+    notes=RATES_TEXT,
+    effort_note=lambda task: DIVIDED if (task[MISSIONS_AT_ONCE] > 1).any() else "",
+)
 
 
 @dataclass(frozen=True)
@@ -38,7 +85,7 @@ class Part:
     """The trials of one kind with their statistics.
 
     Args:
-        summary: see `Kind.summarise`.
+        summary: as its kind summarises.
         paired: see `compare`; of missions by `reached` alone.
     """
 
@@ -99,7 +146,7 @@ def format_report(parts: Sequence[Part], form: str) -> str:
         csv: the summary with all its columns.
         json: all columns of both tables, under "summary" and "paired"; null where a number is undefined.
         markdown, latex: the columns that a paper prints, of both tables, for each kind.
-        table: as `format_table` and `format_missions`.
+        table: as `Kind.text`.
     """
     if form == "table":
         return "\n\n".join(part.kind.text(part.summary, part.paired) for part in parts)

@@ -48,7 +48,9 @@ def held(folder: Path, job: int | None = None, jobs: int | None = None) -> Itera
     own = claim.whole() if job is None else claim.share(folder / f"{LOCK}-{job}-of-{jobs}")
     try:
         with suppress(OSError):  # only for the lines of others
-            Path(f"{_path(own)}{HOLDER}").write_text(json.dumps(_me()))
+            since = datetime.now().astimezone().isoformat(" ", "seconds")
+            me = {"pid": os.getpid(), "host": platform.node(), "since": since}
+            Path(f"{_path(own)}{HOLDER}").write_text(json.dumps(me))
         yield
     finally:
         _release(own)
@@ -137,10 +139,6 @@ def _release(lock: BaseFileLock) -> None:
 
 def _path(lock: BaseFileLock) -> Path:
     return Path(str(lock.lock_file).removesuffix(MARK))
-
-
-def _me() -> dict[str, str | int]:
-    return {"pid": os.getpid(), "host": platform.node(), "since": datetime.now().astimezone().isoformat(" ", "seconds")}
 
 
 def _holder(path: Path) -> str:

@@ -35,7 +35,9 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     of_kind = [(task, kind) for found, kind in zip(tasks, missions, strict=True) for task in found]
     for task, kind in dict.fromkeys(of_kind):
         members = [i for i, found in enumerate(tasks) if task in found and missions[i] == kind]
-        tables = [_rows_of(runs[i].trials, task, len(tasks[i])) for i in members]
+        of_task = lambda trials, task=task: trials[(trials[TASK] == list(task)).all(axis=1)]
+        # Nearly always a run has flown a single task.
+        tables = [runs[i].trials if len(tasks[i]) == 1 else of_task(runs[i].trials) for i in members]
         cells = _swept([runs[i] for i in members], tables)
         chosen |= {(i, task): held for i, held in zip(members, cells, strict=True)}
     columns = list(dict.fromkeys(key for held in chosen.values() for key in held))
@@ -52,11 +54,6 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
         }
         frames.append(pd.DataFrame(held, index=range(len(cells))).take(of_row).set_axis(run.trials.index))
     return frames
-
-
-def _rows_of(trials: pd.DataFrame, task: tuple[Any, ...], tasks: int) -> pd.DataFrame:
-    """The rows of one of the tasks that a run flew; nearly always there is only one."""
-    return trials if tasks == 1 else trials[(trials[TASK] == list(task)).all(axis=1)]
 
 
 def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str, Any]]:

@@ -3,50 +3,136 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
-from torchgco.experiments.statistics.statistics import OUTCOMES, STATUS, TASK, task_columns
+from torchgco.experiments.statistics.statistics import STATUS, TASK, task_columns
 
 OUTPUTS = ("table", "csv", "markdown", "latex", "json")
 # Where a spreadsheet finds a formula: where a cell begins, and where it would begin with another separator than the
 # comma, which is read where the comma is that of decimals. The wide signs count in some languages.
 FORMULA = re.compile(r"(^|[;\n\t])([^\S\n\t]*[=+\-@＝＋－＠])")
 RATES_TEXT = "rates: attained of defined, share, [95 % Wilson interval]; -: undefined"
-EFFORTS = "effort: median (90 % quantile); costs: where the goal was reached, everywhere, over the best known one"
+Cell = Callable[[pd.Series], str]  # of a row of a summary, or of comparisons
+Columns = dict[str, Cell]  # by their heads
 
 
-def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
-    """The report for a terminal, some 120 columns wide: rates, effort, statuses and comparisons of each task.
-
-    Args:
-        summary, paired: as `summarise` and `compare` return them; `paired` may have no rows.
-
-    A rate reads "30/32 94 % [80, 98]". Two lines at the end tell what the numbers in brackets and parentheses are.
-    """
-    blocks = per_task(summary, paired, "", (_rates, _effort, _statuses))
-    return "\n\n".join([*blocks, f"{RATES_TEXT}\n{EFFORTS}"])
-
-
-def per_task(
-    summary: pd.DataFrame, paired: pd.DataFrame, what: str, tables: Sequence[Callable[..., str]], costs: bool = True
-) -> list[str]:
-    """The blocks of text of all tasks: `what` and the task, its tables, and comparisons where there are any.
+@dataclass(frozen=True)
+class Kind:
+    """A kind of trials: its name, its statistics, and what texts and papers show of these.
 
     Args:
-        tables: functions of the task's summary and its swept variables.
-        costs: as of `paired_lines`.
+        rates, effort: columns of its summary.
+        paper: those of `effort` that a paper prints.
+        compared: columns of comparisons.
+        notes: what is said below all tables.
+        of: said before the name of a task.
+        statuses: whether statuses are counted in a table of their own.
+        effort_note: what is said below the effort of a task, from its summary.
     """
-    blocks = []
-    for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
-        seeds, swept = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split())), swept_of(task)
-        blocks += [f"{what}{scenario} ({model}), seed {seeds}", *(table(task, swept) for table in tables)]
-        rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
-        if (rows["n"] > 0).any():
-            blocks.append(paired_lines(rows, swept, costs))
-    return blocks
+
+    name: str
+    summarise: Callable[[pd.DataFrame], pd.DataFrame]
+    rates: Columns
+    effort: Columns
+    paper: Sequence[str]
+    compared: Columns
+    notes: str
+    of: str = ""
+    statuses: bool = False
+    effort_note: Callable[[pd.DataFrame], str] = lambda task: ""
+
+    def text(self, summary: pd.DataFrame, paired: pd.DataFrame) -> str:
+        """The report for a terminal, some 120 columns wide: rates, effort, statuses and comparisons of each task.
+
+        Args:
+            summary, paired: as `summarise` and `compare` return them; `paired` may have no rows.
+
+        A rate reads "30/32 94 % [80, 98]". Lines at the end tell what the numbers in brackets and parentheses are.
+        """
+        blocks = []
+        for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
+            seeds, swept = dict.fromkeys(seed for held in task["seed"] for seed in held.split()), swept_of(task)
+            blocks.append(f"{self.of}{scenario} ({model}), seed {', '.join(seeds)}")
+            blocks.append(_lines(task, swept, solver() | self.rates))
+            blocks.append(_lines(task, swept, solver() | self.effort) + self.effort_note(task))
+            if self.statuses:
+                blocks.append(_lines(task, swept, solver() | _statuses(task)))
+            rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model) & (paired["n"] > 0)]
+            blocks += [_lines(rows, swept, self.compared)] if len(rows) else []
+        return "\n\n".join([*blocks, self.notes])
+
+    def printed(self, summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
+        """The tables that a paper prints: rates and effort, and comparisons where there are any."""
+        effort = {head: self.effort[head] for head in self.paper}
+        tables = [_printed(summary, solver() | self.rates | effort), _printed(paired[paired["n"] > 0], self.compared)]
+        return [table for table in tables if len(table)]
+
+
+def solver() -> dict[str, Cell]:
+    """The column that names the solver of a row."""
+    return {"solver": lambda row: row["solver"]}
+
+
+def number(form: str, *names: str) -> Cell:
+    """Numbers of a row, written in one form; "-" where the first is undefined."""
+    return lambda row: "-" if pd.isna(row[names[0]]) else form.format(*(row[name] for name in names))
+
+
+def rate(name: str) -> Cell:
+    """Attained of defined, and the share with its interval in percent."""
+
+    def cell(row: pd.Series) -> str:
+        if not row[f"{name}_n"]:
+            return "-"
+        share, low, high = (100 * row[f"{name}_{part}"] for part in ("rate", "low", "high"))
+        return f"{row[f'{name}_count']}/{row[f'{name}_n']} {share:.0f} % [{low:.0f}, {high:.0f}]"
+
+    return cell
+
+
+def cost_ratio(row: pd.Series) -> str:
+    """The ratio of costs of two solvers with its interval, which is the same for every outcome."""
+    if row["outcome"] != "reached" or not row["cost_n"]:
+        return "-"
+    ends = "" if pd.isna(row["cost_low"]) else f" [{row['cost_low']:.3f}, {row['cost_high']:.3f}]"
+    return f"{row['cost_ratio']:.3f}{ends}"
+
+
+COUNTS = {"n": "n", "both": "both", "first": "only_a", "second": "only_b", "neither": "neither"}
+PAIR_CELLS: Columns = {
+    "paired": lambda row: f"{row['solver_a']} - {row['solver_b']}",
+    "outcome": lambda row: row["outcome"],
+    **{head: number("{}", name) for head, name in COUNTS.items()},
+    "difference": lambda row: f"{100 * row['difference']:+.0f} points",
+    "McNemar p": number("{:.2g}", "p_value"),
+    "left out": lambda row: str(row["undefined"] + row["unmatched"]),
+}
+
+
+def _statuses(task: pd.DataFrame) -> Columns:
+    """How many trials ended with each status that occurs."""
+    names = [str(name) for name in task.columns if str(name).startswith(STATUS) and task[name].sum() > 0]
+    return {name.removeprefix(STATUS): number("{}", name) for name in names}
+
+
+def _lines(rows: pd.DataFrame, swept: Sequence[str], columns: Columns) -> str:
+    """A line for each row: the values of swept variables, and its cells under their heads; the first flush left."""
+    text = [[*cells(row, swept), *(cell(row) for cell in columns.values())] for _, row in rows.iterrows()]
+    return aligned([[*headers(swept), *columns], *text], len(swept) + 1)
+
+
+def _printed(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
+    """A row for each row, with its task and swept variables before its cells."""
+    swept = swept_of(rows)
+    held = [
+        [row["scenario"], row["model"], *cells(row, swept), *(cell(row) for cell in columns.values())]
+        for _, row in rows.iterrows()
+    ]
+    return pd.DataFrame(held, columns=[*TASK, *headers(swept), *columns])
 
 
 def format_frame(table: pd.DataFrame, form: str) -> str:
@@ -71,12 +157,9 @@ def csv_text(table: pd.DataFrame) -> str:
     Names come from configurations and files of others: an apostrophe stands before what a spreadsheet would compute.
     Numbers, also those held as text, stay what they are.
     """
-    texts = {name: table[name].astype(object).map(_inert) for name in table.columns if _holds_text(table[name])}
+    holding = table.select_dtypes(exclude=["number", "bool", "boolean"])
+    texts = {name: holding[name].astype(object).map(_inert) for name in holding.columns}
     return table.assign(**texts).rename(columns=_inert).to_csv(index=False)
-
-
-def _holds_text(column: pd.Series) -> bool:
-    return not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column))
 
 
 def _inert(cell: Any) -> Any:
@@ -116,116 +199,3 @@ def cells(row: pd.Series, swept: Sequence[str]) -> list[str]:
     """The values of the swept variables in a row; whole numbers that pandas holds as floats without a point."""
     values = (row[name] for name in swept)
     return ["-" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value) for value in values]
-
-
-def per_solver(
-    task: pd.DataFrame, swept: Sequence[str], heads: Iterable[str], values: Callable[[pd.Series], Sequence[str]]
-) -> str:
-    """A line for each row of a task's summary: swept variables, solver, and its values under their heads."""
-    rows = [[*cells(row, swept), row["solver"], *values(row)] for _, row in task.iterrows()]
-    return aligned([[*headers(swept), "solver", *heads], *rows], len(swept) + 1)
-
-
-def _rates(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    return per_solver(task, swept, OUTCOMES, lambda row: [rate(row, name) for name in OUTCOMES])
-
-
-def rate(row: pd.Series, name: str) -> str:
-    """Attained of defined, and the share with its interval in percent."""
-    if not row[f"{name}_n"]:
-        return "-"
-    share, low, high = (100 * row[f"{name}_{part}"] for part in ("rate", "low", "high"))
-    return f"{row[f'{name}_count']}/{row[f'{name}_n']} {share:.0f} % [{low:.0f}, {high:.0f}]"
-
-
-# Header in the terminal, column of the summary, column in parentheses, and how the numbers are written.
-EFFORT_COLUMNS = (
-    ("n", "n", None, "d"),
-    ("invalid", "invalid", None, "d"),
-    ("viol. ok", "violation_ok", None, ".0%"),
-    ("violation", "violation_median", None, ".2g"),
-    ("cost reached", "cost_median_reached", None, ".1f"),
-    ("cost all", "cost_median", None, ".1f"),
-    ("cost ratio", "cost_ratio_median", "cost_ratio_p90", ".3f"),
-    ("iter.", "iterations_median", "iterations_p90", ".0f"),
-    ("outer", "outer_iterations_median", "outer_iterations_p90", ".3g"),
-    ("guided", "guided_median", "guided_p90", ".3g"),
-    ("seconds", "seconds_median", "seconds_p90", ".2g"),
-)
-PAPER_COLUMNS = ("n", "cost ratio", "iter.", "seconds")  # of them, in a paper's table
-
-
-def _measured(row: pd.Series, _: str, median: str, p90: str | None, form: str) -> str:
-    """A cell of one of EFFORT_COLUMNS."""
-    cells = ["-" if pd.isna(row[name]) else f"{row[name]:{form}}" for name in (median, p90) if name is not None]
-    return cells[0] if len(cells) == 1 or cells[0] == "-" else f"{cells[0]} ({cells[1]})"
-
-
-def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    heads = [header for header, *_ in EFFORT_COLUMNS]
-    return per_solver(task, swept, heads, lambda row: [_measured(row, *how) for how in EFFORT_COLUMNS])
-
-
-def _statuses(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    """How many trials ended with each status that occurs."""
-    names = [name for name in task.columns if str(name).startswith(STATUS) and task[name].sum() > 0]
-    heads = [name.removeprefix(STATUS) for name in names]
-    return per_solver(task, swept, heads, lambda row: [str(row[name]) for name in names])
-
-
-COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neither": "neither"}
-PAIRED = ("paired", "outcome", *COUNTS.values(), "difference", "McNemar p", "left out", "cost ratio")
-
-
-def paired_lines(rows: pd.DataFrame, swept: Sequence[str], costs: bool = True) -> str:
-    """Comparisons for a terminal, with the swept variables `swept`; none without a trial that counts.
-
-    Args:
-        costs: False: without the ratio of costs.
-    """
-    width = len(PAIRED) if costs else len(PAIRED) - 1
-    lines = [[*headers(swept), *PAIRED[:width]]]
-    for _, row in rows[rows["n"] > 0].iterrows():
-        lines.append([*cells(row, swept), *_pair(row)[:width]])
-    return aligned(lines, len(swept) + 1)
-
-
-def _pair(row: pd.Series) -> list[str]:
-    difference = f"{100 * row['difference']:+.0f} points" if row["n"] else "-"
-    p_value = f"{row['p_value']:.2g}" if row["n"] else "-"
-    ratio = "-"
-    if row["outcome"] == "reached" and row["cost_n"]:  # the same for every outcome
-        ends = "" if pd.isna(row["cost_low"]) else f" [{row['cost_low']:.3f}, {row['cost_high']:.3f}]"
-        ratio = f"{row['cost_ratio']:.3f}{ends}"
-    pair, left_out = f"{row['solver_a']} - {row['solver_b']}", row["undefined"] + row["unmatched"]
-    counts = [str(row[name]) for name in COUNTS]
-    return [pair, row["outcome"], *counts, difference, p_value, str(left_out), ratio]
-
-
-def printed(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
-    """The tables that a paper prints: rates and effort, and comparisons where there are any."""
-    columns = [how for how in EFFORT_COLUMNS if how[0] in PAPER_COLUMNS]
-    heads = [*OUTCOMES, *(header for header, *_ in columns)]
-    rates = printed_rows(
-        summary, heads,
-        lambda row: [*(rate(row, name) for name in OUTCOMES), *(_measured(row, *how) for how in columns)],
-    )  # fmt: skip
-    return [rates, *([printed_pairs(paired)] if (paired["n"] > 0).any() else [])]
-
-
-def printed_rows(summary: pd.DataFrame, heads: Sequence[str], values: Callable[[pd.Series], list[Any]]) -> pd.DataFrame:
-    """A row for each row of a summary: its task, swept variables and solver, and values under their heads."""
-    swept = swept_of(summary)
-    rows = [
-        [row["scenario"], row["model"], *cells(row, swept), row["solver"], *values(row)]
-        for _, row in summary.iterrows()
-    ]
-    return pd.DataFrame(rows, columns=[*TASK, *headers(swept), "solver", *heads])
-
-
-def printed_pairs(paired: pd.DataFrame) -> pd.DataFrame:
-    """The comparisons that a paper prints: those with a trial that both flew and that defines the outcome."""
-    paired = paired[paired["n"] > 0]
-    swept = swept_of(paired)
-    rows = [[row["scenario"], row["model"], *cells(row, swept), *_pair(row)] for _, row in paired.iterrows()]
-    return pd.DataFrame(rows, columns=[*TASK, *headers(swept), *PAIRED])

@@ -47,9 +47,10 @@ class SeenMap:
         self._beside, self._counts = np.zeros(self.shape, np.uint8), np.zeros(self.shape, np.uint32)
         self._touched, self._changed = (np.empty(self.state.size + 1, np.int32) for _ in range(2))
         self._size = np.array(self.shape, np.int64)
-        self._work, self._scratch = np.empty(0, np.uint8), np.empty(0)
+        self._work = np.empty(2 * int(np.prod(self._size + 2 * self.reach)), np.uint8)
+        self._scratch = np.empty(0)
         self._layers = np.empty(self.shape[0] + 1, np.int64)
-        self.measure(np.zeros(3, np.int64), self._size)
+        self.measure()
 
     def add(self, scan: Scan, reach: float, before: float = 0.0) -> np.ndarray:
         """Add a scan. Returns the flat indices of the cells whose state changed, int32.
@@ -81,26 +82,17 @@ class SeenMap:
     def remeasure(self, changed: np.ndarray) -> None:
         """Update the distances around cells that have changed, given by flat indices, int32."""
         if len(changed):
-            self._prepare(np.zeros(3, np.int64), self._size)
             call(
                 "tgco_distances_around", self._size, self.resolution, self.state, self.reach, len(changed), changed,
                 self._touched, self._work, self.from_occupied,
             )  # fmt: skip
 
-    def measure(self, first: np.ndarray, last: np.ndarray) -> None:
-        """Compute the distances of the cells from `first` up to before `last`, (3,)."""
-        first, last = (np.ascontiguousarray(part, np.int64) for part in (first, last))
-        self._prepare(first, last)
+    def measure(self) -> None:
+        """Compute the distances of all cells."""
         call(
-            "tgco_distances", self._size, self.resolution, self.state, SEEN_OCCUPIED, 1, self.reach, first, last,
-            self._work, self.from_occupied,
+            "tgco_distances", self._size, self.resolution, self.state, SEEN_OCCUPIED, 1, self.reach,
+            np.zeros(3, np.int64), self._size, self._work, self.from_occupied,
         )  # fmt: skip
-
-    def _prepare(self, first: np.ndarray, last: np.ndarray) -> None:
-        """Memory for a window."""
-        need = 2 * int(np.prod(last - first + 2 * self.reach))
-        if len(self._work) < need:
-            self._work = np.empty(need, np.uint8)
 
     def cell(self, point: Sequence[float] | np.ndarray) -> np.ndarray:
         """The cell (3,) int64 that holds a point, or the nearest of the grid."""

@@ -11,6 +11,7 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, Count, Meters, NonNegative, Share, Within, check_options
 from torchgco.exploration.sensing.world import World
+from torchgco.obstacles.attitude import rotation
 
 SCAN_STREAM = 2  # of a mission's draws; 1 is the disturbance's
 Angle = Annotated[float, Within(1, 360, "degrees")]
@@ -191,12 +192,5 @@ def _keep_tuples(sensor: Lidar | Depth) -> None:
 
 
 def turned(q: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) of a unit quaternion [w, x, y, z]: from the vehicle's frame to space."""
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """The rotation (3, 3) of a quaternion of any length above 0, from the vehicle's frame to space."""
+    return rotation(q / np.linalg.norm(q))

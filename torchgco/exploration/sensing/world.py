@@ -24,10 +24,6 @@ from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
 
-def _no_cells() -> np.ndarray:
-    return np.zeros((0, 0, 0), np.uint8)
-
-
 @dataclass(frozen=True)
 class Motion:
     """How M bodies move away from where they are placed: at constant velocity, and along S sines.
@@ -98,19 +94,17 @@ class World:
     Args:
         boxes: (M, 16) float64: centre (3), directions of the sides as rows (9), half their lengths (3), m, and the
             radius by which they are rounded, m. A sphere has sides of length 0, a capsule one side above 0.
-        velocities: (M, 3), m/s.
+        motion: of the boxes away from where they are placed.
         occupied: (X, Y, Z) uint8, 1 where a cell is occupied.
         corner: (3,), m, where cell (0, 0, 0) begins.
         resolution: side of a cell, m.
-        swings: how the boxes swing around where they are placed, with their velocities; None: none does.
     """
 
     boxes: np.ndarray
-    velocities: np.ndarray
-    occupied: np.ndarray = field(default_factory=_no_cells)
+    motion: Motion
+    occupied: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0), np.uint8))
     corner: tuple[float, float, float] = (0.0, 0.0, 0.0)
     resolution: float = 1.0
-    swings: Motion | None = None
 
     @classmethod
     def of(cls, problem: Problem, b: int) -> Self:
@@ -125,17 +119,11 @@ class World:
             raise InputError("constraints", "one map at most, for a sensor", len(maps))
         parts = [_bodies(part) for part in one.constraints if isinstance(part, Obstacles) and part not in maps]
         boxes = np.concatenate([np.zeros((0, 16)), *(part[0] for part in parts)])
-        motion = Motion.joined([part[1] for part in parts])
-        world = cls(boxes, motion.velocities, swings=motion)
+        world = cls(boxes, Motion.joined([part[1] for part in parts]))
         if not maps:
             return world
         occupied, corner, resolution = _cells(maps[0])
         return replace(world, occupied=occupied, corner=corner, resolution=resolution)
-
-    @property
-    def motion(self) -> Motion:
-        """How the boxes move away from where they are placed."""
-        return Motion.steady(self.velocities) if self.swings is None else self.swings
 
     @property
     def moving(self) -> bool:
@@ -148,7 +136,7 @@ class World:
             return self
         boxes = self.boxes.copy()
         boxes[:, :3] += self.motion.off(np.array([t]))[0]
-        return replace(self, boxes=boxes, velocities=np.zeros((len(boxes), 3)), swings=None)
+        return replace(self, boxes=boxes, motion=Motion.steady(np.zeros((len(boxes), 3))))
 
     def cast(self, origin: Sequence[float] | np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
         """Distances (R,), m, to the first body along unit vectors (R, 3) from a point (3,), m.
@@ -199,19 +187,15 @@ def _bodies(part: Obstacles) -> tuple[np.ndarray, Motion]:
         here = ~part.absent[0].numpy()
         sines = (values[0].numpy()[here] for values in (part.amplitudes, part.rates, part.phases))
         return boxes, Motion(np.zeros((len(boxes), 3)), *sines)
-    there = ~part.absent[0].numpy()
-    vehicle = float(part.vehicle_radius[0])
-    if isinstance(part, BoundSpheres):
-        centers, radii = part.centers[0].numpy(), part.inflated_radii[0].numpy() - vehicle
-        axes, half = np.tile(np.eye(3).ravel(), (len(centers), 1)), np.zeros_like(centers)
-        velocities = np.zeros_like(centers) if part.velocities is None else part.velocities[0].numpy()
-    elif isinstance(part, BoundBoxes):
-        centers, radii = part.centers[0].numpy(), part.inflated_radii[0].numpy() - vehicle
+    if not isinstance(part, BoundSpheres | BoundBoxes):
+        raise InputError("scenario", "spheres, boxes, capsules or a map for a sensor", type(part).__name__)
+    there, centers = ~part.absent[0].numpy(), part.centers[0].numpy()
+    radii, velocities = part.inflated_radii[0].numpy() - float(part.vehicle_radius[0]), np.zeros_like(centers)
+    if isinstance(part, BoundBoxes):
         axes, half = part.axes[0].numpy().reshape(-1, 9), part.half_sizes[0].numpy()
-        velocities = np.zeros_like(centers)
     else:
-        kinds = "spheres, boxes, capsules or a map for a sensor"
-        raise InputError("scenario", kinds, type(part).__name__)
+        axes, half = np.tile(np.eye(3).ravel(), (len(centers), 1)), np.zeros_like(centers)
+        velocities = velocities if part.velocities is None else part.velocities[0].numpy()
     radii = np.where(radii < 1e-12, 0.0, radii)  # what rounding leaves of a sharp box
     boxes = np.concatenate([centers, axes, half, radii[:, None]], axis=1)[there]
     return boxes, Motion.steady(velocities[there])

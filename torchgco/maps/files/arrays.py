@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.files import read_arrays
-from torchgco.maps.files.heights import above_ground
+from torchgco.maps.files.images import above_ground
 from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Source, finite_points, made
 from torchgco.maps.grid import OccupancyGrid
 

@@ -181,21 +181,16 @@ def _shape(source: Source, geometry: Element | None, frame: Frame) -> Shape | No
 
 def _pose(source: Source, element: Element) -> Frame:
     """x, y, z, m, and the angles of Rz Ry Rx, rad; the parent's frame where there is no pose."""
+    from scipy.spatial.transform import Rotation
+
     pose = element.find("pose")
     if pose is None or not (pose.text or "").strip():
         return Frame(np.eye(3), np.zeros(3))
     if pose.get("relative_to") or pose.get("frame"):
         source.refuse("poses relative to what is around them", f"one relative to {shown(dict(pose.attrib))}")
     x, y, z, *angles = _numbers(source, element, "pose", 6)
-    if (pose.get("degrees") or "").strip().lower() in ("1", "true"):
-        angles = [math.radians(angle) for angle in angles]
-    (cr, cp, cy), (sr, sp, sy) = ([f(angle) for angle in angles] for f in (math.cos, math.sin))
-    R = np.array([
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ])  # fmt: skip
-    return Frame(R, np.array([x, y, z]))
+    degrees = (pose.get("degrees") or "").strip().lower() in ("1", "true")
+    return Frame(Rotation.from_euler("xyz", angles, degrees).as_matrix(), np.array([x, y, z]))
 
 
 def _numbers(source: Source, element: Element, name: str, count: int) -> list[float]:

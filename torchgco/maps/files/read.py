@@ -15,12 +15,11 @@ from torchgco.maps.files.arrays import read_npy, read_npz
 from torchgco.maps.files.gazebo import read_world
 from torchgco.maps.files.images import read_image
 from torchgco.maps.files.las import read_las
-from torchgco.maps.files.layer import checked_layer, flat
 from torchgco.maps.files.map_server import beside, read_described, read_map_server
 from torchgco.maps.files.meshes import read_mesh
 from torchgco.maps.files.movingai import read_movingai
 from torchgco.maps.files.octomap import read_octomap
-from torchgco.maps.files.part import Box, checked_box, part
+from torchgco.maps.files.part import Box, checked_box, checked_layer, flat, part
 from torchgco.maps.files.pcd import read_pcd
 from torchgco.maps.files.ply import read_ply
 from torchgco.maps.files.source import FARTHEST_AT, LEAST_CELL, Source

@@ -14,6 +14,7 @@ from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.simulators.each import EachPlant, imported
 from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, files_named, mjcf
+from torchgco.obstacles.attitude import rotation
 
 LONGEST_STEP = 0.005  # s, of a time step of MuJoCo in a model that we write
 SIDEWAYS = 1e-6  # share of a thrust that an actuator may push across the body's z axis
@@ -119,9 +120,9 @@ class _Quadrotor:
             q, w = _product(q, (QUARTER_ROUND[0], 0.0, 0.0, -QUARTER_ROUND[3])), np.array((-w[1], w[0], w[2]))
         q = q / np.linalg.norm(q)
         lib.mj_resetData(model, data)  # also what MuJoCo would start its next step from: a step has the state alone
-        arm = _rotation(q) @ self.center
+        arm = rotation(q) @ self.center
         data.qpos[:3], data.qpos[3:] = x[:3] - arm, q
-        data.qvel[:3], data.qvel[3:] = x[3:6] - _rotation(q) @ np.cross(w, self.center), w
+        data.qvel[:3], data.qvel[3:] = x[3:6] - rotation(q) @ np.cross(w, self.center), w
         data.ctrl[order] = thrusts / self.gains
         if model.na:
             data.act[order] = x[13:] / self.gains
@@ -131,7 +132,7 @@ class _Quadrotor:
 
     def _state(self, data: Any) -> np.ndarray:
         q, w = data.qpos[3:] / np.linalg.norm(data.qpos[3:]), data.qvel[3:].copy()
-        R = _rotation(q)
+        R = rotation(q)
         p, v = data.qpos[:3] + R @ self.center, data.qvel[:3] + R @ np.cross(w, self.center)
         held = data.act if self.model.na else np.clip(data.ctrl, self.low, self.high)
         if self.turned:
@@ -201,16 +202,6 @@ def _product(a: Any, b: Any) -> np.ndarray:
     return np.concatenate(
         ([a[0] * b[0] - np.dot(a[1:], b[1:])], a[0] * np.array(b[1:]) + b[0] * np.array(a[1:]) + np.cross(a[1:], b[1:]))
     )
-
-
-def _rotation(q: np.ndarray) -> np.ndarray:
-    """The matrix (3, 3) of a unit quaternion, from the body's axes to the world's."""
-    w, (x, y, z) = q[0], q[1:]
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
 
 
 def _mujoco() -> Any:

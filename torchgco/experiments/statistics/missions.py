@@ -1,7 +1,10 @@
-"""Outcomes of missions with their intervals, and what the missions took."""
+"""Outcomes of missions with their intervals, what the missions took, and a line for each where few fly."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pandas as pd
 
 from torchgco.experiments.statistics.statistics import grouped, numbers_of, rate_columns, summarise, task_columns
@@ -43,3 +46,33 @@ def _of_missions(group: pd.DataFrame) -> dict[str, object]:
     row |= {name: pd.Series(numbers_of(reached[name])).median() for name in MEDIANS}
     row |= {name: float(numbers_of(group[name]).mean()) for name in MEANS}
     return row | {MISSIONS_AT_ONCE: int(group["batch_size"].max())}
+
+
+def mission_lines(trials: pd.DataFrame) -> str:
+    """A line per mission."""
+    lines = []
+    for row in trials.itertuples():
+        times = (
+            f"planner {1000 * row.planner_seconds_median:.0f} ms (99 %: {1000 * row.planner_seconds_p99:.0f} ms) and "
+            f"tracker {1000 * row.tracker_seconds_median:.0f} ms"
+        )
+        if row.outer_iterations == 0:
+            times = "no plan made"
+        elif row.batch_size > 1:
+            times += f" per mission of a batch of {row.batch_size}"
+        else:
+            ending = "" if row.missed_deadlines == 1 else "s"
+            times += f" per control period, {row.missed_deadlines} missed deadline{ending} of {row.outer_iterations}"
+        lines.append(
+            f"{row.scenario} {row.layout}, {row.solver}: {row.outcome} after {row.flight_time:.2f} s, clearance "
+            f"{row.clearance:.3f} m, {_gates(row)}{times}. {Outcome[str(row.outcome)].sentence}"
+        )
+    return "\n".join(lines)
+
+
+def _gates(row: Any) -> str:
+    """How a race went; nothing of missions without gates."""
+    passed = getattr(row, "gates_passed", np.nan)
+    if not np.isfinite(passed):
+        return ""
+    return f"{passed:.0f} gates passed, at most {row.gate_distance:.3f} m from their middles, "
