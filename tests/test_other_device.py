@@ -46,7 +46,7 @@ from torchgco.maps.distance import DistanceField
 from torchgco.missions import RotorPlant
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
-from torchgco.search.reach import longest_step
+from torchgco.search.reach import Step, limit_of
 
 N, R = 3, 0.06
 DOUBLE: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
@@ -134,9 +134,9 @@ def test_local_solves_are_judged_and_certified(kind: str) -> None:
 def test_the_longest_step_is_found() -> None:
     def work(problem: Problem, U0: Tensor) -> list[Tensor]:
         with computing_on(problem.x0.device):
-            found = longest_step(problem)
-        assert found is not None
-        return [found]
+            found = limit_of(problem)
+        assert isinstance(found, Step)
+        return [found.step]
 
     on_both(work, "states")
 

@@ -18,80 +18,59 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from torchgco import kernels as kernels
-from torchgco import presets as presets
-from torchgco import sensitivity
-from torchgco.api import compare as compare
-from torchgco.api import plot as plot
-from torchgco.api import show as show
-from torchgco.api import solve as solve
-from torchgco.base.errors import ContactWarning as ContactWarning
-from torchgco.base.errors import GuidanceWarning as GuidanceWarning
-from torchgco.base.errors import HorizonWarning as HorizonWarning
-from torchgco.base.errors import InputError as InputError
-from torchgco.base.errors import ScaleWarning as ScaleWarning
-from torchgco.base.errors import StartWarning as StartWarning
-from torchgco.base.errors import TraceWarning as TraceWarning
-from torchgco.base.status import Status as Status
+from torchgco import presets, sensitivity
+from torchgco.api import compare, plot, show, solve
+from torchgco.base.errors import (
+    ContactWarning,
+    GuidanceWarning,
+    HorizonWarning,
+    InputError,
+    ScaleWarning,
+    StartWarning,
+    TraceWarning,
+)
+from torchgco.base.status import Status
 from torchgco.base.version import VERSION
-from torchgco.baselines import Hold as Hold
-from torchgco.baselines import IteratedMPPI as IteratedMPPI
-from torchgco.compiled import MPC as MPC
-from torchgco.compiled import Answer as Answer
-from torchgco.compiled import Compiled as Compiled
-from torchgco.compiled import MPPIController as MPPIController
-from torchgco.compiled import compile as compile
-from torchgco.constraints import Cone as Cone
-from torchgco.constraints import Constraint as Constraint
-from torchgco.constraints import ControlBounds as ControlBounds
-from torchgco.constraints import FunctionConstraint as FunctionConstraint
-from torchgco.constraints import Gates as Gates
-from torchgco.constraints import NormBounds as NormBounds
-from torchgco.constraints import RateBounds as RateBounds
-from torchgco.constraints import Separation as Separation
-from torchgco.constraints import StateBounds as StateBounds
-from torchgco.costs import Cost as Cost
-from torchgco.costs import FunctionCost as FunctionCost
-from torchgco.costs import QuadraticCost as QuadraticCost
-from torchgco.dynamics import Airframe as Airframe
-from torchgco.dynamics import Bicycle as Bicycle
-from torchgco.dynamics import Dynamics as Dynamics
-from torchgco.dynamics import FunctionDynamics as FunctionDynamics
-from torchgco.dynamics import Planar as Planar
-from torchgco.dynamics import QuadrotorPlanning as QuadrotorPlanning
-from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
-from torchgco.dynamics import QuadrotorThrusts as QuadrotorThrusts
-from torchgco.dynamics import RotorTracking as RotorTracking
-from torchgco.dynamics import Unicycle as Unicycle
-from torchgco.guidance import GCO as GCO
-from torchgco.guidance import MPPI as MPPI
-from torchgco.judging.certificate import Certificate as Certificate
-from torchgco.judging.certificate import certify as certify
-from torchgco.judging.judge import judge as judge
-from torchgco.maps import DistanceField as DistanceField
-from torchgco.maps import Field as Field
-from torchgco.maps import OccupancyGrid as OccupancyGrid
-from torchgco.maps import PointCloud as PointCloud
-from torchgco.missions.constraints import FirstStepRates as FirstStepRates
-from torchgco.obstacles import Body as Body
-from torchgco.obstacles import Boxes as Boxes
-from torchgco.obstacles import Capsules as Capsules
-from torchgco.obstacles import OscillatingBoxes as OscillatingBoxes
-from torchgco.obstacles import Spheres as Spheres
-from torchgco.problem.free_time import FreeTime as FreeTime
-from torchgco.problem.goal import Goal as Goal
-from torchgco.problem.problem import Problem as Problem
-from torchgco.roadmap import Roadmap as Roadmap
-from torchgco.scenarios import Layouts as Layouts
-from torchgco.search import MultiStart as MultiStart
-from torchgco.search import PathProposals as PathProposals
-from torchgco.search import Restarts as Restarts
-from torchgco.solution import Solution as Solution
-from torchgco.solvers import ILQR as ILQR
-from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
-from torchgco.solvers import InteriorPoint as InteriorPoint
-from torchgco.solvers import LineSearch as LineSearch
-from torchgco.solvers import Polish as Polish
-from torchgco.solvers import plan_batch as plan_batch
+from torchgco.baselines import Hold, IteratedMPPI
+from torchgco.compiled import MPC, Answer, Compiled, MPPIController, compile
+from torchgco.constraints import (
+    Cone,
+    Constraint,
+    ControlBounds,
+    FunctionConstraint,
+    Gates,
+    NormBounds,
+    RateBounds,
+    Separation,
+    StateBounds,
+)
+from torchgco.costs import Cost, FunctionCost, QuadraticCost
+from torchgco.dynamics import (
+    Airframe,
+    Bicycle,
+    Dynamics,
+    FunctionDynamics,
+    Planar,
+    QuadrotorPlanning,
+    QuadrotorPlant,
+    QuadrotorThrusts,
+    RotorTracking,
+    Unicycle,
+)
+from torchgco.guidance import GCO, MPPI
+from torchgco.judging.certificate import Certificate, certify
+from torchgco.judging.judge import judge
+from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
+from torchgco.missions.constraints import FirstStepRates
+from torchgco.obstacles import Body, Boxes, Capsules, OscillatingBoxes, Spheres
+from torchgco.problem.free_time import FreeTime
+from torchgco.problem.goal import Goal
+from torchgco.problem.problem import Problem
+from torchgco.roadmap import Roadmap
+from torchgco.scenarios import Layouts
+from torchgco.search import MultiStart, PathProposals, Restarts
+from torchgco.solution import Solution
+from torchgco.solvers import ILQR, AugmentedLagrangian, InteriorPoint, LineSearch, Polish, plan_batch
 
 if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage as HtmlPage

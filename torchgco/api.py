@@ -106,7 +106,7 @@ def solve(
         watcher.close()
     if found.account is not None:
         found = replace(found, account=found.account.asked(asked, name))
-    found = _warned_of_contact(problem, found)
+    _warn_of_contact(problem, found)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
@@ -188,11 +188,9 @@ def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
 
 def _checked(warm: Any) -> Solution | None:
     """The guess of a warm start without gradients: it takes no part in derivatives."""
-    if warm is None:
-        return None
-    if not isinstance(warm, Solution):
+    if not isinstance(warm, Solution | None):
         raise InputError("warm", "a Solution, or None", type(warm).__name__)
-    return warm.detach()
+    return warm and warm.detach()
 
 
 def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor | None) -> tuple[Problem, Tensor]:
@@ -215,8 +213,8 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
     return problem, _guess(problem, traced)
 
 
-def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
-    """The solution, with a ContactWarning at the caller's caller where trajectories touch obstacles between knots.
+def _warn_of_contact(problem: Problem, solution: Solution) -> None:
+    """A ContactWarning at the caller's caller where trajectories touch obstacles between knots.
 
     Only trajectories with a status of CLAIMS count; obstacles of a kind that the judge doesn't know are left out.
     """
@@ -230,7 +228,6 @@ def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
             ContactWarning,
             stacklevel=3,
         )
-    return solution
 
 
 def _warn_of_scale(problem: Problem, solution: Solution) -> None:

@@ -20,7 +20,7 @@ from torchgco.base.gradients import without_gradients
 from torchgco.base.options import Count, Positive, check_value
 from torchgco.base.shapes import MISTAKES, check_device, check_shape
 from torchgco.base.status import Status
-from torchgco.base.tree import take
+from torchgco.base.tree import moved, take
 from torchgco.explaining.account import Account
 from torchgco.explaining.explain import Explanation, explanation
 from torchgco.explaining.record import Comparison as Comparison
@@ -196,11 +196,8 @@ class Solution:
         if account is not None:
             with suppress(InputError):  # dynamics without a time step
                 account = Account(name=account.name, t=account.times().to(where))
-        moved = {f.name: getattr(self, f.name).to(where) for f in fields(self) if f.name in _TENSORS}
-        multipliers = Multipliers(tuple(lam.to(where) for lam in self.multipliers.lam), self.multipliers.mu.to(where))
-        horizon = None if self.horizon is None else self.horizon.to(where)
-        more = {name: part.to(where) for name in ("times", "needed") if (part := getattr(self, name)) is not None}
-        return Solution(multipliers=multipliers, horizon=horizon, account=account, **moved, **more)
+        bare = replace(self, trace=None, search=None, account=None)
+        return replace(moved(bare, where), account=account)
 
     def to_dict(self) -> dict[str, Any]:
         """X, U and the numbers of each problem as NumPy arrays, by name; `status` as names, t where it is known."""
@@ -208,8 +205,8 @@ class Solution:
         held["status"] = [status.name for status in self.statuses]
         if self.horizon is not None:
             held["horizon"] = self.horizon.cpu().numpy()
-        with suppress(InputError):
-            held["t"] = self.t.cpu().numpy()
+        with suppress(InputError):  # dynamics without a time step
+            held["t"] = self.t.detach().cpu().numpy()
         return held
 
     def of_first_states(self, n: int, horizon: Tensor | None = None) -> Solution:
@@ -322,12 +319,8 @@ class Solution:
 
     def save(self, path: str | Path) -> None:
         """Write an npz: all of it or, if interrupted, nothing."""
-        arrays = {f.name: getattr(self, f.name).detach().cpu().numpy() for f in fields(self) if f.name in _TENSORS}
-        arrays["mu"] = self.multipliers.mu.cpu().numpy()
-        if self.horizon is not None:
-            arrays["horizon"] = self.horizon.cpu().numpy()
-        with suppress(InputError):  # dynamics without a time step
-            arrays["t"] = self.t.detach().cpu().numpy()
+        arrays = self.to_dict()
+        arrays["status"], arrays["mu"] = self.status.cpu().numpy(), self.multipliers.mu.cpu().numpy()
         if self.times is not None:
             arrays["times"] = self.times.detach().cpu().numpy()
         if self.account is not None and self.account.kernels is not None:

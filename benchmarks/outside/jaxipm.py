@@ -115,7 +115,7 @@ def by_torchgco(scenario: Scenario, places: Tensor) -> list[pd.DataFrame]:
     some = scenario.at(places)
     problem, (X0, U0) = scenario.problem(some), scenario.guess(some)
     solvers = {
-        INTERIOR: lambda p, X, U: OURS.solve_from(p, X, U),
+        INTERIOR: lambda p, X, U: OURS.solve(p, U, X0=X),
         DEFAULT: lambda p, X, U: torchgco.solve(p),
     }
     flights = []

@@ -82,7 +82,8 @@ def test_pools_follow_their_rules() -> None:
 def test_two_instances_are_solved_to_the_published_tolerance(name: str) -> None:
     scenario = NAMED[name]
     some = scenario.at(scenario.places(2))
-    found = OURS.solve_from(scenario.problem(some), *scenario.guess(some))
+    X0, U0 = scenario.guess(some)
+    found = OURS.solve(scenario.problem(some), U0, X0=X0)
     cost, worst = scenario.counted(some, found.U.numpy())
     assert found.statuses == [Status.CONVERGED] * 2 and worst.max() <= TOLERANCE
     np.testing.assert_allclose(cost[0], KNOWN[scenario.name], rtol=1e-6)

@@ -103,9 +103,9 @@ def test_warm_starts_free_starts_and_guesses_of_states_are_taken() -> None:
     assert bool((native.X[:, 0, 0] > 0.1).all())
     torch.testing.assert_close(eager.X[:, 0], native.X[:, 0], rtol=0, atol=1e-6)
     X0 = torch.linspace(0.0, 1.0, 13, dtype=D).view(1, -1, 1).repeat(3, 1, 2)
-    native = rest.solve_from(problem.renewed(), X0, torch.zeros(3, 12, 1, dtype=D))
+    native = rest.solve(problem.renewed(), torch.zeros(3, 12, 1, dtype=D), X0=X0)
     with by_pytorch():
-        assert_same(native, rest.solve_from(problem.renewed(), X0, torch.zeros(3, 12, 1, dtype=D)))
+        assert_same(native, rest.solve(problem.renewed(), torch.zeros(3, 12, 1, dtype=D), X0=X0))
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ def test_both_make_the_same_graph(name: str) -> None:
 
 
 def searches(obstacles: Inflated, margin: float) -> tuple[NativeSearch, TorchSearch]:
-    library = library_for(obstacles.middles)
+    library = library_for(obstacles.spheres.centers)
     assert library is not None
     return NativeSearch(library, obstacles, margin), TorchSearch(obstacles, margin)
 

@@ -213,7 +213,7 @@ def test_numpy_finds_the_same_blocks_ways_and_taut_paths(d: int, merged: bool) -
         kernels.use_native(native)
         lattice = lattice_of([replace(field, field=replace(field.field))], [], ends)
         blocks = blocks_of(lattice, 0.15, 2**12, 0.01, merged)
-        made.append((lattice.map.everywhere, blocks, Ways(blocks, ends, price, R)))
+        made.append((lattice.map.everywhere, blocks, Ways(blocks, ends, price, R, 0.0)))
     kernels.use_native(True)
     (clear, blocks, ways), (other_clear, other, other_ways) = made
     np.testing.assert_allclose(clear, other_clear, rtol=1e-6, atol=1e-7)

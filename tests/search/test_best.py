@@ -13,8 +13,8 @@ from tests.search.rows import restarts
 from torchgco import GCO, ILQR, AugmentedLagrangian, Goal, LineSearch, Problem, QuadraticCost, Solution
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.lagrangian.state import SolveEnd
-from torchgco.search.attempts import Best
-from torchgco.search.passes import ATTEMPT_SEED_STEP
+from torchgco.search.best import Best
+from torchgco.search.steps import ATTEMPT_SEED_STEP
 from torchgco.solvers.contracts import Advice, Call
 
 

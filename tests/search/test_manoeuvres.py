@@ -24,7 +24,7 @@ from torchgco import (
     judge,
     solve,
 )
-from torchgco.search.manoeuvres import car, timed
+from torchgco.search.manoeuvres import car, driven_in_time
 from torchgco.search.poses import END_POSE_ARCS, Poses, clear_at
 
 WHEELBASE, STEERING = 1.2, 0.6
@@ -98,7 +98,7 @@ def test_a_path_of_poses_can_be_driven_and_is_clear() -> None:
 
 def test_a_path_is_driven_from_rest_to_rest_between_changes_of_direction() -> None:
     path = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0], [3, 0, 0]])
-    poses, speed = timed(path, 120, 0.75, 12.0)
+    poses, speed = driven_in_time(path, 120, 0.75, 12.0)
     assert np.allclose(poses[[0, 60, 90, 120], 0], [0, 4, 3, 3]) and np.allclose(speed[[0, 60, 90, 120]], 0.0)
     slopes = (poses[2:, 0] - poses[:-2, 0]) / 0.2
     inner = np.delete(np.arange(1, 120), [59, 89])  # there the acceleration jumps

@@ -123,7 +123,7 @@ def test_a_way_through_obstacles_that_were_left_out_is_sought_again() -> None:
     call = Call.checked(many, U0)
     near = Nearby.of(call)
     assert near is not None and near.call.problem.obstacles[0].centers.shape[1] < FAR
-    found = near.solution(quick_gco(few).solve(near.call.problem, U0, seed=3))
+    found = near.whole(quick_gco(few).solve(near.call.problem, U0, seed=3))
     assert near.wrong(found).numel() == 0
     X = found.X.clone()
     X[1, 12, :2] = many.obstacles[0].centers[1, -1]  # over one of the far ones

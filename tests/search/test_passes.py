@@ -46,7 +46,7 @@ from torchgco.search import (
     Tighten,
     Tube,
 )
-from torchgco.search.table import TABLE_COLUMNS
+from torchgco.search.restarts import TABLE_COLUMNS
 from torchgco.solvers.interior import InteriorPoint
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")

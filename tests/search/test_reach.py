@@ -21,7 +21,7 @@ from torchgco import (
     Unicycle,
 )
 from torchgco.dynamics import Dynamics
-from torchgco.search.reach import longest_step, short_horizons, strongest_push
+from torchgco.search.reach import Push, Step, limit_of, short_horizons
 
 FREE = float("inf")
 POINT = FunctionDynamics(lambda x, u: u, 2, 2, 0.1, "euler", slice(0, 2))
@@ -88,15 +88,15 @@ def test_a_longest_step_inside_the_bounds_is_climbed_to() -> None:
     goal = Goal([10.0, 0.0], 0.05)
     for N, fits in ((34, True), (33, False)):  # 9.95 m, 0.3 m a stage
         problem = task(model, [bounds], N, [[0.0] * 5], goal)
-        assert float(longest_step(problem)[0]) < 0.2999  # type: ignore
+        assert float(limit_of(problem)[0][0]) < 0.2999  # type: ignore
         said = short_horizons(problem)
         assert (said is None) == fits and (said is None or "N = 34 would do" in said)
 
 
 def test_a_limit_is_seen_where_there_is_one_alone() -> None:
     def longest(model: Dynamics, parts: list) -> float | None:
-        found = longest_step(task(model, parts, 5, [[0.0] * model.n], None))
-        return None if found is None else float(found[0])
+        found = limit_of(task(model, parts, 5, [[0.0] * model.n], None))
+        return float(found.step[0]) if isinstance(found, Step) else None
 
     turns = ControlBounds([-2.0, -1.5], [2.0, 1.5])
     speeds = StateBounds([-FREE, -FREE, -FREE, -1.0], [FREE, FREE, FREE, 1.5])
@@ -133,13 +133,13 @@ def test_where_acceleration_alone_is_limited_the_least_time_counts() -> None:
             assert said.startswith(f"{len(who)} of 2 horizons") and f"problem {', '.join(map(str, who))})" in said
             assert "from rest to rest it takes N = 35 at full acceleration" in said  # 2 sqrt(3) s
     both = ControlBounds([-2.0, -2.0], [2.0, 2.0])
-    assert float(strongest_push(task(model, [both], 9, starts, None))[0]) == pytest.approx(8**0.5, rel=1e-6)  # type: ignore
+    assert float(limit_of(task(model, [both], 9, starts, None)).push[0]) == pytest.approx(8**0.5, rel=1e-6)  # type: ignore
 
 
 def test_what_limits_the_acceleration_is_seen_in_the_equations() -> None:
     def strongest(model: Dynamics, parts: list, climbs: int = 40) -> float | None:
-        found = strongest_push(task(model, parts, 5, [[0.0] * model.n], None), climbs)
-        return None if found is None else float(found[0])
+        found = limit_of(task(model, parts, 5, [[0.0] * model.n], None), climbs)
+        return float(found.push[0]) if isinstance(found, Push) else None
 
     bounds = ControlBounds([-2.0, -1.5], [2.0, 1.5])
     drag, wind, free = (FunctionDynamics(f, 4, 2, 0.1, "rk4", slice(0, 2)) for f in (dragged, blown, pushed))

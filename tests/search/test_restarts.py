@@ -39,8 +39,8 @@ from torchgco.base.status import STOPPED
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.search import Follow, FromSamples
-from torchgco.search.passes import ATTEMPT_SEED_STEP
 from torchgco.search.proposals import Round
+from torchgco.search.steps import ATTEMPT_SEED_STEP
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Call
 
@@ -141,7 +141,7 @@ def test_a_trajectory_that_ends_close_to_the_goal_is_finally_attracted_to_it(
     solution = SOLVER.solve(problem, U0)
     pulled = [s for s in solves if s.penalty is not None]
     assert len(pulled) == attracted
-    monkeypatch.setattr("torchgco.search.attempts.ATTRACTED_WITHIN", 0.0)
+    monkeypatch.setattr("torchgco.search.search.ATTRACTED_WITHIN", 0.0)
     plain = SOLVER.solve(problem, U0)
     away, optimal = ((s.X[:, -1, :2] - torch.tensor([10.0, 0.0])).norm(dim=-1) for s in (solution, plain))
     assert bool(away[SHORT] < 0.9 < optimal[SHORT]) == attracted

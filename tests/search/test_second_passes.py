@@ -43,9 +43,9 @@ def noted(passes: Sequence[PathProposals], problem: Problem) -> tuple[Proposal, 
     """The proposals, and of each time that paths were followed, of how many paths and problems, and whether closer."""
     times, along = [], PathProposals._along
 
-    def note(self: PathProposals, problem: Problem, rest: Tensor, paths: Paths, follow: Follow, *words) -> Proposal:
+    def note(self: PathProposals, part: Part, rows: Tensor, problem, paths: Paths, follow: Follow, *words) -> Proposal:
         times.append((paths.corners.shape[1], problem.B, follow.smoothing < FIRST.follow[0].smoothing))
-        return along(self, problem, rest, paths, follow, *words)
+        return along(self, part, rows, problem, paths, follow, *words)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PathProposals, "_along", note)

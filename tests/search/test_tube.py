@@ -27,7 +27,9 @@ from torchgco.dynamics import Dynamics
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps import OccupancyGrid
+from torchgco.roadmap.clear import clear_path
 from torchgco.roadmap.geometry import length
+from torchgco.roadmap.mapped import in_each
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 from torchgco.search import Solve, Tube, pursue, solved_candidates, tube
@@ -159,7 +161,7 @@ def test_one_path_keeps_clear_of_the_map() -> None:
     scene = scene_of(problem.in_cost_units(), rest(problem))
     assert scene is not None
     taut, there = Roadmap().paths(scene)
-    clear, found = Roadmap().clear_path(scene)
+    clear, found = in_each(scene, 1, 0.0, clear_path)
     assert bool(there) and bool(found) and clear.shape == taut.shape
     torch.testing.assert_close(clear[0, 0, [0, -1]], torch.stack((scene.start[0], scene.goal[0])))
     field = problem.geometric[0]
@@ -173,9 +175,6 @@ def test_one_path_keeps_clear_of_the_map() -> None:
 
     assert nearest(clear[0, 0]) > nearest(taut[0, 0]) + 0.05
     assert 1.0 < float(length(clear[:, 0]) / length(taut[:, 0])) < 1.4
-    discs = planar_batch(B=2)[0]
-    scene = scene_of(discs.in_cost_units(), rest(discs))
-    assert scene is not None and Roadmap().clear_path(scene)[1].tolist() == [False, False]
 
 
 @MODELS

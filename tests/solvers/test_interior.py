@@ -39,7 +39,6 @@ from torchgco.native.interior import InteriorEngine
 from torchgco.solvers import interior
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 
 pytestmark = [
@@ -103,7 +102,7 @@ def solved(problem: Problem, U0: Tensor | None = None, X0: Tensor | None = None,
     solver, U0 = InteriorPoint(**options), zeros(problem) if U0 is None else U0
     if X0 is None:
         return solver.solve(problem, U0)
-    session = Session(Call.checked(problem, U0), RAW)
+    session = Session(Call.checked(problem, U0), own_units=True)
     return session.finished(solver.solved(session.call, X0), solver.violation_tolerance)
 
 

@@ -38,11 +38,11 @@ def test_the_optimum_depends_on_them(name: str) -> None:
     assert not torch.equal(cold.U, other.U) and bool((other.violation <= 1e-5).all())
 
 
-def test_they_are_those_of_the_problem_in_any_batch_and_of_solve_from() -> None:
+def test_they_are_those_of_the_problem_in_any_batch_and_of_the_solver() -> None:
     X0, U0 = turns(0.5), SWINGS.x0.new_zeros(2, SWINGS.N, 1)
     solver = presets.interior_point(SWINGS)
     whole = solve(SWINGS, U0, solver, X0=X0)
-    assert torch.equal(whole.U, solver.solve_from(SWINGS, X0, U0).U)
+    assert torch.equal(whole.U, solver.solve(SWINGS, U0, X0=X0).U)
     for name in ("interior_point", "gco"):
         both = solve(SWINGS, solver=name, X0=X0)
         for b in range(2):

@@ -136,17 +136,17 @@ def apart(tree: Any) -> Any:
     return tree
 
 
-def on_cpu(tree: Any) -> Any:
-    """Every tensor in nested tuples and dataclasses on the CPU; parts without others are the same objects."""
+def moved(tree: Any, device: torch.device) -> Any:
+    """Every tensor in nested tuples and dataclasses on a device; parts that are there are the same objects."""
     if isinstance(tree, Tensor):
-        return tree.cpu()
+        return tree.to(device)
     if isinstance(tree, tuple):
-        leaves = [on_cpu(leaf) for leaf in tree]
+        leaves = [moved(leaf, device) for leaf in tree]
         if all(new is old for new, old in zip(leaves, tree, strict=True)):
             return tree
         return type(tree)(*leaves) if hasattr(tree, "_fields") else tuple(leaves)
     if is_dataclass(tree) and not isinstance(tree, type):
-        parts = {name: on_cpu(value) for name, value in vars(tree).items()}
+        parts = {name: moved(value, device) for name, value in vars(tree).items()}
         if all(value is vars(tree)[name] for name, value in parts.items()):
             return tree
         copy = object.__new__(type(tree))  # parts are checked and bound already

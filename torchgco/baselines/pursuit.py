@@ -28,7 +28,6 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.interior import InteriorPoint, guessed
-from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 
 Array = NDArray[np.float64]
@@ -80,7 +79,7 @@ class PathPursuit(Solver):
 
     def run(self, call: Call) -> Solution:
         """Find a path for each problem, pursue it, and solve."""
-        session, admitted = Session(call, RAW), self.solver.admitted(call.problem)
+        session, admitted = Session(call, own_units=True), self.solver.admitted(call.problem)
         held = session.call
         U, found = self.guess(held.problem, held.U0)
         held = replace(held, U0=U)

@@ -23,7 +23,7 @@ from torchgco.base.tree import put
 from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
 from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.explaining.account import Account
-from torchgco.kernels import cost_unit, current, interior_of
+from torchgco.kernels import cost_scale, cost_unit, current, interior_of
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
@@ -34,7 +34,6 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
-from torchgco.solvers.ending import constant_cost, least_cost
 from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
 
 SOLVERS = "gco", "interior_point"
@@ -183,11 +182,11 @@ class Compiled:
                 self._kept = Kept(kernels, form, **self._options(form))
 
     def _options(self, problem: Problem) -> dict[str, Any]:
-        interior = self.interior
+        interior, scale = self.interior, cost_scale(problem)
         return FILTER | {
             "push": interior.warm_barrier, "warm": 1, "max_iterations": interior.max_iterations,
             "tolerance": interior.tolerance, "violation": interior.violation_tolerance, "seconds": math.inf,
-            "constant": constant_cost(problem), "least_cost": least_cost(problem),
+            "constant": scale.constant, "least_cost": scale.size,
         }  # fmt: skip
 
     def __call__(

@@ -118,15 +118,20 @@ class MPPI:
         """Diagonal of Sigma, (B|1, 1, m)."""
         if self.covariance is None:
             return self._from_bounds(problem)
-        sigma = tensor(self.covariance, "mppi.covariance", problem.x0)
-        sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
-        check_shape(sigma, (problem.m,), "mppi.covariance")
-        if not bool(((sigma > 0) & torch.isfinite(sigma)).all()):
-            raise InputError("mppi.covariance", "finite variances above 0", sigma.tolist())
-        return sigma.view(1, 1, -1)
+        return diagonal(self.covariance, problem, "mppi.covariance").view(1, 1, -1)
 
     def _from_bounds(self, problem: Problem) -> Tensor:
         if problem.control_bounds is None:
             return problem.x0.new_ones(1, 1, problem.m)
         deviation = self.spread * problem.control_bounds.range
         return torch.where(torch.isfinite(deviation), deviation.square(), 1.0).unsqueeze(1)
+
+
+def diagonal(covariance: Any, problem: Problem, name: str) -> Tensor:
+    """The variance of each control, (m,), of a diagonal covariance or one number; InputError where it isn't one."""
+    sigma = tensor(covariance, name, problem.x0)
+    sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
+    check_shape(sigma, (problem.m,), name)
+    if not bool(((sigma > 0) & torch.isfinite(sigma)).all()):
+        raise InputError(name, "finite variances above 0", sigma.tolist())
+    return sigma

@@ -16,6 +16,7 @@ from torchgco.kernels.choice import kernels_of
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.obstacles.base import TOUCH
 from torchgco.problem.problem import Problem
+from torchgco.problem.scale import CostScale
 
 
 def open_loop(problem: Problem, U: Tensor) -> Tensor:
@@ -63,10 +64,15 @@ def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) ->
 
 
 def cost_unit(problem: Problem) -> Tensor:
-    """`problem.cost_unit` (B,), computed without autodiff where compiled code can; the problem keeps its scale."""
+    """`problem.cost_unit` (B,), computed as `cost_scale`."""
+    return cost_scale(problem).unit
+
+
+def cost_scale(problem: Problem) -> CostScale:
+    """`problem.cost_scale`, computed without autodiff where compiled code can; the problem keeps it."""
     if "cost_scale" not in vars(problem):
         kernels_of(problem).scale(problem)
-    return problem.cost_unit
+    return problem.cost_scale
 
 
 def is_convex(problem: Problem) -> bool:

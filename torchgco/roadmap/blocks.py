@@ -243,7 +243,7 @@ def _tensor(values: Any) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))
 
 
-def tightened(
+def tightened_by_c(
     lattice: Lattice, path: Array, least: float, reach: float, parts: int, rounds: int, little: float
 ) -> Array | None:
     """A path (P, d) drawn taut; None where C can't serve. See `mapped.tightened`."""

@@ -12,14 +12,14 @@ from scipy.ndimage import gaussian_filter1d
 from torchgco.maps.ways import length
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.mapped import CLOSE_UNITS, Price, even, in_one, one_of_each_class, ways_of
+from torchgco.roadmap.mapped import CLOSE_UNITS, Price, Ways, even, in_one, one_of_each_class, ways_of
 from torchgco.roadmap.search import HOPS
 
 ROOMY = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide
 AVERAGED = 0.8  # units: the standard deviation over which the corners of a path with few of them are averaged
 
 
-def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
+def clear_ways(scene: Scene, b: int, count: int) -> list[Array]:
     """Ways (P, d), m, of the problem at place b, from block to block; in the plane one of each homotopy class.
 
     Of up to `count` classes, the cheapest first, and of as many more that are the cheapest where only the last of the
@@ -32,11 +32,12 @@ def clear_ways(scene: Scene, b: int, overlap: float, count: int) -> list[Array]:
             return []
         if lattice.d == 3:
             return [ways.path(int(ways.total.argmin()))]
-        wide, near = one_of_each_class(ways), one_of_each_class(ways.nearer(CLOSE_UNITS * unit))
+        closer = Ways(ways.blocks, ends, price, CLOSE_UNITS * unit, ways.free_above)
+        wide, near = one_of_each_class(ways), one_of_each_class(closer)
         kinds = dict.fromkeys([*list(wide)[:count], *list(near)[:count]])
         return [ways.path(wide[kind]) for kind in kinds if kind in wide]
 
-    return in_one(scene, b, overlap, search)
+    return in_one(scene, b, 0.0, search)
 
 
 def clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:

@@ -42,11 +42,6 @@ class Inflated(NamedTuple):
         return torch.cat((self.sizes, *maps), dim=1)
 
     @property
-    def middles(self) -> Tensor:
-        """The centres of all obstacles, boxes last, (B, M', d), m."""
-        return torch.cat([part.centers for part in self.kinds], dim=1)
-
-    @property
     def largest(self) -> Tensor:
         """The largest size, (B, 1), m."""
         return self.scales.amax(-1, keepdim=True)

@@ -32,7 +32,8 @@ def classes(paths: Tensor, obstacles: Inflated) -> Tensor:
 
 def _wind_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
     """(B, K, K): the angles that two paths sweep around each obstacle are the same, up to full turns."""
-    seen = paths.unsqueeze(2) - obstacles.middles[:, None, :, None]  # (B, K, M, P, 2)
+    middles = torch.cat([part.centers for part in obstacles.kinds], dim=1)
+    seen = paths.unsqueeze(2) - middles[:, None, :, None]  # (B, K, M, P, 2)
     a, b = seen[..., :-1, :], seen[..., 1:, :]
     cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     swept = torch.atan2(cross, (a * b).sum(-1)).sum(-1)

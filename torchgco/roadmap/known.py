@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -50,21 +51,14 @@ class Course:
     def among(self, rows: Tensor) -> Course:
         """The same of those problems that are in `rows`."""
         at = torch.isin(self.rows, rows).nonzero().flatten()
-        return self if at.numel() == self.rows.numel() else self.take(at)
-
-    def take(self, at: Tensor) -> Course:
-        """The same of the problems in places `at`."""
-        some = object.__new__(Course)
-        some.scene, some.rows, some.factor = self.scene, self.rows[at], self.factor
+        if at.numel() == self.rows.numel():
+            return self
+        some = copy(self)
+        some.rows = self.rows[at]
         some.search = replace(self.search, obstacles=take(self.search.obstacles, at))
         some.graph, some.price, some.found = take((self.graph, self.price, self.found), at)
         some.paths = [path[at] for path in self.paths]
         return some
-
-    @property
-    def size(self) -> int:
-        """Bytes of the graphs."""
-        return sum(part.nbytes for part in self.graph)
 
 
 class Points(NamedTuple):
@@ -90,7 +84,7 @@ class Known:
 
     def keep(self, key: Hashable, courses: list[Course]) -> None:
         """Keep courses, as long as there is room."""
-        if self._fits(sum(course.size for course in courses)):
+        if self._fits(sum(part.nbytes for course in courses for part in course.graph)):
             self._courses[key] = courses
 
     def beside(self, key: Hashable, rows: Tensor, obstacles: Inflated, scene: Scene) -> tuple[Tensor, Tensor] | None:

@@ -19,10 +19,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchgco.base.shapes import computing_on
-from torchgco.base.tree import on_cpu, take
+from torchgco.base.tree import moved, take
 from torchgco.maps.ways import length
-from torchgco.roadmap import blocks as searched
-from torchgco.roadmap.blocks import Blocks, blocks_of
+from torchgco.roadmap.blocks import Blocks, blocks_of, tightened_by_c
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.lattice import Array, Lattice, lattice_of, sampled
 from torchgco.roadmap.search import DIVERSITY, HOPS
@@ -46,6 +45,8 @@ LEAST_SEGMENTS = 10  # segments, at least, of a path that keeps off others, whic
 PATH_STEPS = 0.5  # units between points at which it is looked for what is near a path
 MAPPED_ROUNDING = 1e-9  # m
 REGION_SEED = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
+
+CPU = torch.device("cpu")
 
 Price = Callable[[Array], Array]  # per metre at points (V, d)
 Search = Callable[[Lattice, Array, Price, float, float], list[Array]]  # with the vehicle's radius and the unit, m
@@ -72,14 +73,14 @@ def in_each(scene: Scene, count: int, overlap: float, search: Search) -> tuple[T
 def in_one(scene: Scene, b: int, overlap: float, search: Search) -> list[Array]:
     """What a search of the problem at place b finds."""
     row = torch.tensor([b], device=scene.start.device)
-    obstacles = on_cpu(take(scene.obstacles, row)).reduced(overlap)
+    obstacles = moved(take(scene.obstacles, row), CPU).reduced(overlap)
 
     def price(points: Array) -> Array:
         with computing_on(scene.start.device):
             return scene.traversal_cost(scene.start.new_tensor(points)[None], row)[0].double().cpu().numpy()
 
     ends = torch.stack((scene.start[b], scene.goal[b])).double().cpu().numpy()
-    with computing_on(torch.device("cpu")):  # the search is of NumPy's arrays, wherever the problem lies
+    with computing_on(CPU):  # the search is of NumPy's arrays, wherever the problem lies
         if obstacles.maps:
             lattice, radius = lattice_of(obstacles.maps, obstacles.kinds, ends), obstacles.maps[0].vehicle_radius
         else:
@@ -92,9 +93,9 @@ def sweep_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
     """Whether paths (B, K, P, 2) wind around every blocked region of the maps by the same angle, (B, K, K)."""
     same = torch.ones(*paths.shape[:2], paths.shape[1], dtype=torch.bool, device=paths.device)
     for b, some in enumerate(paths.double().cpu().numpy()):
-        own = on_cpu(take(obstacles, torch.tensor([b], device=paths.device)))
+        own = moved(take(obstacles, torch.tensor([b], device=paths.device)), CPU)
         for field in own.maps:
-            with computing_on(torch.device("cpu")):
+            with computing_on(CPU):
                 lattice = lattice_of([field], [], some[0, [0, -1]])
                 angles = [swept(lattice, path) for path in some]
             sums = torch.tensor(angles, device=paths.device)
@@ -109,12 +110,17 @@ class Ways:
         ends: start and goal, (2, d), m.
         price: per metre.
         margin: m; closer to obstacles than this a way costs up to double.
+        least: clearance, m, above which a block is free.
+
+    Attributes:
+        least: clearance, m, of what begins or ends at start and goal.
     """
 
-    def __init__(self, blocks: Blocks, ends: Array, price: Price, margin: float, least: float = 0.0) -> None:
+    def __init__(self, blocks: Blocks, ends: Array, price: Price, margin: float, least: float) -> None:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
-        self.parts = blocks, ends, price, least
-        self.least = least_at(blocks.lattice, ends)
+        self.free_above = least
+        # An end may be nearer to the map than the constraint admits.
+        self.least = min(0.0, *blocks.lattice.at(ends)) - MAPPED_ROUNDING
         close = 1.0 + (np.clip(1.0 - blocks.clearance / margin, 0.0, 1.0) if margin > 0.0 else 0.0)  # 0: no obstacles
         rate = _smoothed(price, self.points, blocks.counts)
         usable = (blocks.clearance > least) & np.isfinite(rate)
@@ -126,11 +132,6 @@ class Ways:
             apart = np.linalg.norm(self.points[seeds] - end, axis=1)
             self.seeds.append((seeds, apart * self.weight[seeds]))
             self.costs[i], self.before[i] = blocks.costs(self.weight, *self.seeds[i])
-
-    def nearer(self, margin: float) -> Ways:
-        """The same, but only nearer to obstacles than another margin, m, costs more."""
-        blocks, ends, price, least = self.parts
-        return Ways(blocks, ends, price, margin, least)
 
     @property
     def total(self) -> Array:
@@ -363,11 +364,6 @@ def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
 # Taut strings -----------------------------------------------------------------------------------------------------
 
 
-def least_at(lattice: Lattice, ends: Array) -> float:
-    """The clearance of what begins or ends there: an end may be nearer to the map than the constraint admits."""
-    return min(0.0, *lattice.at(ends)) - MAPPED_ROUNDING
-
-
 def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf) -> Array:
     """A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn.
 
@@ -376,7 +372,7 @@ def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf
         reach: the longest segment, m: with one, corners are left out once.
     """
     rounds = TAUT_ROUNDS if reach == np.inf else 0
-    taut = searched.tightened(lattice, path, least, reach, POINTS, rounds, LITTLE)
+    taut = tightened_by_c(lattice, path, least, reach, POINTS, rounds, LITTLE)
     if taut is not None:
         return taut
     path = _shortcut(lattice, path, least, reach)

@@ -17,12 +17,10 @@ from torch import Tensor
 
 from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.tree import take
-from torchgco.roadmap import native as roadmap
-from torchgco.roadmap.clear import clear_path, clear_ways
+from torchgco.roadmap import native
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
-from torchgco.roadmap.lattice import Array
-from torchgco.roadmap.mapped import in_each, paths_in_maps
+from torchgco.roadmap.mapped import paths_in_maps
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import DIVERSITY, HOPS, TorchSearch
 
@@ -74,8 +72,8 @@ class Roadmap:
         """
         if scene.obstacles.maps:
             return paths_in_maps(scene if rows is None else scene.take(rows), count, self.max_overlap)
-        library = roadmap.library_for(scene.start, scene.obstacles.boxes is not None)
-        most = PROBLEMS_AT_ONCE if library is None else roadmap.SEARCHES_AT_ONCE
+        library = native.library_for(scene.start, scene.obstacles.boxes is not None)
+        most = PROBLEMS_AT_ONCE if library is None else native.SEARCHES_AT_ONCE
         B, d = scene.start.shape
         rows = torch.arange(B, device=scene.start.device) if rows is None else rows
         place, found = torch.full((B,), -1, device=rows.device), torch.zeros_like(rows, dtype=torch.bool)
@@ -95,20 +93,6 @@ class Roadmap:
                 corners[lost], found[lost] = paths_in_maps(scene.take(rows[lost]), count, self.max_overlap)
         return corners, found
 
-    def clear_path(self, scene: Scene) -> tuple[Tensor, Tensor]:
-        """One more path of each problem, weighted by clearance, where there are maps: as `paths` with one.
-
-        Elsewhere none: edges of the graph keep to the middle between neighbours.
-        """
-        if scene.obstacles.maps:
-            return in_each(scene, 1, self.max_overlap, clear_path)
-        straight = torch.stack((scene.start, scene.goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1)
-        return straight, torch.zeros_like(scene.start[:, 0], dtype=torch.bool)
-
-    def clear_ways(self, scene: Scene, b: int, count: int) -> list[Array]:
-        """The same of the problem at place b, with all their points (P, d), m: one of each homotopy class."""
-        return clear_ways(scene, b, self.max_overlap, count) if scene.obstacles.maps else []
-
     def repeats(self, other: Roadmap, scene: Scene) -> bool:
         """Whether another search finds the same paths: those among maps need no points all over the scene."""
         return bool(scene.obstacles.maps) and self.max_overlap == other.max_overlap
@@ -119,13 +103,11 @@ class Roadmap:
         """Courses with `count` paths, or more, of the problems in `rows`, which are of one group."""
         if rows.numel() == 0:
             return []
-        courses = known.courses((self, group), rows)
-        fresh = courses is None
-        if courses is None:
-            courses = self._begun(scene, rows, group, library, known)
+        before = known.courses((self, group), rows)
+        courses = before or self._begun(scene, rows, group, library, known)
         for course in courses:
             course.go_on(count)
-        if fresh:
+        if before is None:
             known.keep((self, group), courses)
         return courses
 

@@ -50,6 +50,11 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost, centers)
 
 
+def has_maps(problem: Problem) -> bool:
+    """Whether there are maps among the obstacles."""
+    return any(isinstance(part.inscribed, BoundField) for part in problem.obstacles)
+
+
 def around_body(problem: Problem, scene: Scene) -> Scene | None:
     """The same scene as the ball meets it that holds the body; None without a body, and among maps."""
     bodies = [part for part in problem.obstacles if isinstance(part, BoundBody)]

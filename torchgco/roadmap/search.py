@@ -64,7 +64,8 @@ class TorchSearch:
             neighbours, hubs: edges of a point to its nearest of all points and of the spread points.
             beside: `points.of_boxes`, where it is known.
         """
-        given = torch.cat((torch.stack((start, goal), dim=1), self._spread(start, goal, cube)), dim=1)
+        low, high = (end.unsqueeze(1) for end in self.obstacles.region(start, goal))
+        given = torch.cat((torch.stack((start, goal), dim=1), low + cube * (high - low)), dim=1)
         kept, taken = self._beside(start, goal, nodes, beside)
         points, free = torch.cat((given, kept), dim=1), torch.cat((self._is_free(given), taken), dim=1)
         free[:, :2] = True
@@ -138,11 +139,6 @@ class TorchSearch:
         """Prices (B, V) times a factor at points that are nearer to a path than the largest radius."""
         apart = squares_from_segments(points, path[:, :-1], path[:, 1:]).amin(1)
         return torch.where(apart < _signed_square(self.obstacles.largest), factor * price, price)
-
-    def _spread(self, start: Tensor, goal: Tensor, cube: Tensor) -> Tensor:
-        """Points (B, spread, d) all over the box that start, goal and obstacles fill."""
-        low, high = (end.unsqueeze(1) for end in self.obstacles.region(start, goal))
-        return low + cube * (high - low)
 
     def _beside(self, start: Tensor, goal: Tensor, nodes: int, beside: Beside) -> tuple[Tensor, Tensor]:
         """Free points around the obstacles and between them (B, nodes, d), and which places are taken (B, nodes)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -111,9 +111,18 @@ class Candidates:
 
     def pick(self, order: Tensor) -> Candidates:
         """The candidates at the places `order` (B, c) among those of their problem."""
-        rows = self.rows(order).flatten()
-        X, U, R, unit, live, number = (t[rows] for t in (self.X, self.U, self.R, self.unit, self.live, self.number))
-        return replace(self, X=X, U=U, R=R, unit=unit, live=live, number=number, count=order.shape[1])
+        return self._at(self.rows(order).flatten(), count=order.shape[1])
+
+    def of_problems(self, places: Tensor) -> Candidates:
+        """All candidates of the problems at `places` (b,), without the iterations so far."""
+        rows = (places.unsqueeze(1) * self.count + torch.arange(self.count, device=places.device)).flatten()
+        problem = self.problem.take(places)
+        none = torch.zeros_like(self.iterations[places])
+        return self._at(rows, problem=problem, iterations=none, selected=LastTaken(problem))
+
+    def _at(self, rows: Tensor, **changes: Any) -> Candidates:
+        each = {name: getattr(self, name)[rows] for name in ("X", "U", "R", "unit", "live", "number")}
+        return replace(self, **each, **changes)
 
     def rows(self, order: Tensor) -> Tensor:
         """Rows (B, c) of the candidates at the places `order` (B, c)."""

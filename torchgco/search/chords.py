@@ -13,16 +13,17 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, check_options
+from torchgco.base.options import Count
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.quality import leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
-from torchgco.search.attempts import Search
-from torchgco.search.converge import continued, mapped
-from torchgco.search.row import Row
+from torchgco.roadmap.scene import has_maps
+from torchgco.search.converge import continued
+from torchgco.search.search import Search
+from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
 
 EXTRA = 1.1  # times the missing clearance: by how much obstacles grow in a round
@@ -51,14 +52,9 @@ class ClearChords(Row):
 
     rounds: Count = 4
 
+    label: ClassVar[str] = "chords"
     kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
-
-    def __post_init__(self) -> None:
-        check_options(self, "chords")
-
-    @property
-    def problems(self) -> str:
-        return "touching an obstacle between two knots"
+    problems: ClassVar[str] = "touching an obstacle between two knots"
 
     @property
     def does(self) -> str:
@@ -70,7 +66,7 @@ class ClearChords(Row):
 
         def once(rows: Tensor, call: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
             best.next_attempt()
-            if mapped(call.problem):  # along whose one row per knot AL-iLQR takes many short steps
+            if has_maps(call.problem):  # along whose one row per knot AL-iLQR takes many short steps
                 return self._continued(search, rows, call, old, least)
             serves, now = self._relaxed(search, rows, call, least)
             left = (~serves).nonzero().flatten()  # a relaxed solve may leave through a wall that is thin
@@ -80,7 +76,7 @@ class ClearChords(Row):
             return serves, now
 
         limit = search.solver.violation_tolerance
-        rounds = self.rounds * (IN_MAPS if mapped(search.call.problem) else 1)
+        rounds = self.rounds * (IN_MAPS if has_maps(search.call.problem) else 1)
         best.restore(*cleared(search.call, best.end.best, rounds, limit, once))
 
     def _continued(

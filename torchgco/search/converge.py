@@ -8,17 +8,15 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status, is_over
 from torchgco.base.tree import put
 from torchgco.kernels import chord_clearance, is_convex
 from torchgco.lagrangian.quality import is_preferred, leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
-from torchgco.maps.field import BoundField
 from torchgco.problem.problem import Problem
-from torchgco.search.attempts import Search
 from torchgco.search.nearby import Nearby
-from torchgco.search.row import Row
+from torchgco.search.search import Search
+from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
@@ -41,22 +39,18 @@ class Converge(Row):
 
     among: Literal["free", "all"] = "all"
 
+    label: ClassVar[str] = "converge"
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "converge")
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem = search.call.problem
-        if problem.B == 0 or not self.worth(problem):
+        if not self.worth(problem):
             return
         if self.among == "all":
             self._tighten(search)
         elif self.begins(problem) and not search.begun:
             search.begin(search.interior.solved(search.call, escapes=True))
-            if search.record is not None:
-                search.record.passes[-1][2].extend(search.call.rows.tolist())
             self._from_rest(search)
             rows = _unsolved(search)
             search.best.improve(rows, search.call.take(rows))
@@ -89,9 +83,8 @@ class Converge(Row):
         held = call.problem.cost.total(X, U)
         rows = (open_ & torch.isfinite(held) & ~(best.cost <= held)).nonzero().flatten()
         if rows.numel() > 0:
-            keep_tight(
-                search, rows, search.interior.solved(replace(call.take(rows), U0=U[rows], callback=None), X[rows])
-            )
+            call = replace(call.take(rows), U0=U[rows], callback=None)
+            keep_tight(search, rows, search.interior.solved(call, X[rows]))
 
     @staticmethod
     def worth(problem: Problem) -> bool:
@@ -104,18 +97,13 @@ class Converge(Row):
         return not problem.geometric and cls.worth(problem)
 
     def _tighten(self, search: Search) -> None:
-        best, rows = search.best, _unsolved(search)
-        self._continue(search, rows)
-        whole = replace(search.call, callback=None)
+        best, rows, whole = search.best, _unsolved(search), replace(search.call, callback=None)  # not worth a report
+        if rows.numel() > 0:
+            self._keep(search, rows, continued(search.interior, whole.take(rows), best.of(rows).best))
         lost = best.end.best.violation[rows] > search.solver.violation_tolerance
         lost = rows[lost & ~is_over(best.end.status[rows])]
         if lost.numel() > 0:
             self._keep(search, lost, search.interior.solved(whole.take(lost)))
-
-    def _continue(self, search: Search, rows: Tensor) -> None:
-        if rows.numel() > 0:
-            call = replace(search.call.take(rows), callback=None)  # a few iterations: not worth a report
-            self._keep(search, rows, continued(search.interior, call, search.best.of(rows).best))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.
@@ -130,11 +118,6 @@ class Converge(Row):
         clear = ~(chord_clearance(problem, new.X) < chord_clearance(problem, old.X).clamp(max=0.0))
         clear |= old.violation > limit
         search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
-
-
-def mapped(problem: Problem) -> bool:
-    """Whether there are maps among the obstacles."""
-    return any(isinstance(part.inscribed, BoundField) for part in problem.obstacles)
 
 
 def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
@@ -171,7 +154,7 @@ def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor) -> SolveEnd:
     if near is None:
         return solver.solved(call, X)
     found = solver.solved(near.call, X)
-    wrong, end = near.wrong(found.best), near.end(found)
+    wrong, end = near.wrong(found.best), replace(found, best=near.whole(found.best), last=near.whole(found.last))
     if wrong.numel() > 0:
         put(end, wrong, solver.solved(call.take(wrong), X[wrong]))
     return end

@@ -16,17 +16,17 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Natural, NonNegative, check_options
+from torchgco.base.options import Natural, NonNegative
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
-from torchgco.search.attempts import Search
-from torchgco.search.converge import mapped
+from torchgco.roadmap.scene import has_maps
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.pursue import pursue
-from torchgco.search.row import Row
+from torchgco.search.search import Search
+from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
 
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little
@@ -51,11 +51,9 @@ class Direct(Row):
     gap: NonNegative = 0.02
     most: Natural = 5
 
+    label: ClassVar[str] = "direct"
     seeks_paths: ClassVar[bool] = True
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "direct")
 
     @property
     def problems(self) -> str:
@@ -94,7 +92,7 @@ class Direct(Row):
         """Whether the interior point is cheap for these problems: among few obstacles in the plane."""
         at = problem.position
         bodies = sum(part.absent.shape[1] for part in problem.geometric if isinstance(part, Obstacles))
-        return at.stop - at.start == 2 and bodies <= self.most and not mapped(problem)
+        return at.stop - at.start == 2 and bodies <= self.most and not has_maps(problem)
 
     def _compared(self, search: Search, rows: Tensor, call: Call, end: SolveEnd, bound: Tensor) -> Tensor:
         """Keep results of `rows` that hardly exceed a bound (b,) on costs; places (b',) of the others, which wait."""
@@ -117,9 +115,11 @@ class Join(Row):
 
     seeks_paths: ClassVar[bool] = True
     last: ClassVar[bool] = True
-    problems: ClassVar[str] = "with results that wait"  # type: ignore[misc]
-    does: ClassVar[str] = "the cheaper counts"  # type: ignore[misc]
+    problems: ClassVar[str] = "with results that wait"
+    does: ClassVar[str] = "the cheaper counts"
 
     def run(self, search: Search) -> None:
         """Compare; see the class."""
-        search.join()
+        for rows, end in search.waiting:
+            search.best.keep(rows, end)
+        search.waiting.clear()

@@ -12,16 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.base.tree import LastTaken
 from torchgco.kernels import chord_clearance
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.scene import scales, scene_of
-from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
 from torchgco.search.chords import EXTRA
 from torchgco.search.poses import ARC_LENGTH, Poses, clear_at
+from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solved
 from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
 
@@ -103,18 +102,7 @@ def manoeuvre(search: Search) -> None:
         if again.numel() == 0 or search.call.late:
             return
         grown = grown[again] - EXTRA * lacks[again]
-        rows, made = rows[again], _of_problems(made, again)
-
-
-def _of_problems(candidates: Candidates, rows: Tensor) -> Candidates:
-    """The candidates of the problems in `rows` alone."""
-    c = candidates
-    each = (rows.unsqueeze(1) * c.count + torch.arange(c.count, device=rows.device)).flatten()
-    problem = c.problem.take(rows)
-    return replace(
-        c, problem=problem, X=c.X[each], U=c.U[each], R=c.R[each], unit=c.unit[each], live=c.live[each],
-        number=c.number[each], iterations=torch.zeros_like(c.iterations[rows]), selected=LastTaken(problem),
-    )  # fmt: skip
+        rows, made = rows[again], made.of_problems(again)
 
 
 def _made(search: Search, rows: Tensor) -> tuple[Tensor, Candidates] | None:
@@ -158,14 +146,14 @@ def _driven(problem: Problem) -> Tensor | None:
     K = int(problem.stages[0])
     X = problem.x0.repeat(len(PATH_PACES), problem.N + 1, 1)
     for x, share in zip(X, PATH_PACES, strict=True):
-        poses, speeds = timed(path, K, share, K * float(problem.dynamics.dt))
+        poses, speeds = driven_in_time(path, K, share, K * float(problem.dynamics.dt))
         x[: K + 1, at], x[: K + 1, heading] = x.new_tensor(poses[:, :2]), x.new_tensor(poses[:, 2])
         x[1 : K + 1, vehicle.speed] = x.new_tensor(speeds[1:])
         x[K + 1 :] = x[K]
     return X
 
 
-def timed(path: Array, K: int, share: float, duration: float) -> tuple[Array, Array]:
+def driven_in_time(path: Array, K: int, share: float, duration: float) -> tuple[Array, Array]:
     """Poses (K + 1, 3) and speeds (K + 1,) at the knots of a drive along poses (P, 3) in a share of the duration, s.
 
     From one change of direction to the next the vehicle drives from rest to rest, in a time that grows with the root of

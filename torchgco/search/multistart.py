@@ -6,14 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
-from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
-from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Count, check_options
-from torchgco.base.shapes import check_shape, tensor
-from torchgco.problem.problem import Problem
-from torchgco.search.attempts import Best
+from torchgco.guidance.mppi import diagonal
+from torchgco.search.best import Best
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Solver
@@ -59,8 +56,8 @@ class MultiStart(Solver):
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call; guesses are keyed by (seed, id, start), and the warm start serves the first."""
-        solver, sigma = self.local, self._sigma(call.problem)
-        session = Session(call, solver.inner.rules)
+        solver, sigma = self.local, diagonal(self.covariance, call.problem, "multistart.covariance")
+        session = Session(call, solver.inner.as_printed)
         scaled = session.call
         guidance = None if solver.guidance is None else solver.guidance.suited(scaled.problem)
         best = Best(scaled, solver.outer_loop(scaled, guidance), solver)
@@ -72,13 +69,5 @@ class MultiStart(Solver):
             part = scaled.take(rows)
             key = DrawKey(call.seed, part.ids, torch.full_like(rows, start))
             noise = sigma.sqrt() * smooth_normal(key, self.noise_knots, part.U0)
-            best.improve(rows, replace(part, U0=part.U0 + noise, warm=None), guidance)
+            best.improve(rows, replace(part, U0=part.U0 + noise, warm=None), guidance=guidance)
         return session.finished(best.end, solver.violation_tolerance, solver.slots)
-
-    def _sigma(self, problem: Problem) -> Tensor:
-        sigma = tensor(self.covariance, "multistart.covariance", problem.x0)
-        sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
-        check_shape(sigma, (problem.m,), "multistart.covariance")
-        if not bool(((sigma > 0) & torch.isfinite(sigma)).all()):
-            raise InputError("multistart.covariance", "finite variances above 0", sigma.tolist())
-        return sigma

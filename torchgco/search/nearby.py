@@ -10,22 +10,24 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from torchgco.base.tree import put
 from torchgco.constraints.base import Constraint
-from torchgco.kernels import chord_clearance, cost_unit, measured
-from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.constraints.gates import gates_of
+from torchgco.kernels import chord_clearance, cost_scale, measured
+from torchgco.lagrangian.state import Iterate
 from torchgco.obstacles.base import Obstacles, Solids, places_of
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.scene import gates_of
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
+
+T = TypeVar("T", Solution, Iterate)
 
 DETOUR = math.sqrt(2.0)  # ways this many times as long as the straight one stay within half of its length from it
 WITHOUT_OBSTACLES = InteriorPoint(tolerance=1e-4, max_iterations=100)  # of trajectories without obstacles
@@ -79,18 +81,10 @@ class Nearby:
             return None
         return cls(call, [None if part is None else places_of(part | ~worth.unsqueeze(-1)) for part in kept])
 
-    def solution(self, found: Solution) -> Solution:
-        """The solution with multipliers, all zero, of the obstacles that were left out."""
-        return replace(found, multipliers=self._whole(found.multipliers))
-
-    def end(self, found: SolveEnd) -> SolveEnd:
-        """The same of a solve without its verdict."""
-        best, last = (replace(part, multipliers=self._whole(part.multipliers)) for part in (found.best, found.last))
-        return replace(found, best=best, last=last)
-
-    def _whole(self, multipliers: Multipliers) -> Multipliers:
-        shapes = self.given.problem.row_shapes
-        return replace(multipliers, lam=tuple(map(_scattered, multipliers.lam, self.places, shapes)))
+    def whole(self, found: T) -> T:
+        """What was found with multipliers, all zero, of the obstacles that were left out, too."""
+        lam = tuple(map(_scattered, found.multipliers.lam, self.places, self.given.problem.row_shapes))
+        return replace(found, multipliers=replace(found.multipliers, lam=lam))
 
     def wrong(self, found: Solution | Iterate) -> Tensor:
         """The problems (b,) whose trajectories are worse with the obstacles that were left out."""
@@ -105,7 +99,7 @@ def among_nearby(call: Call, solve: Callable[[Call], Solution]) -> Solution:
     near = Nearby.of(call)
     if near is None:
         return solve(call)
-    found = near.solution(solve(near.call))
+    found = near.whole(solve(near.call))
     rows = near.wrong(found)
     return found if rows.numel() == 0 else merged(found, rows, solve(call.take(rows)))
 
@@ -120,9 +114,8 @@ def without_obstacles(problem: Problem) -> Problem | None:
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
     """The problems with fewer obstacles, which share kernels and the scale of the cost: neither depends on these."""
-    cost_unit(problem)
     other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None, interior=None))
-    object.__setattr__(other, "cost_scale", problem.cost_scale)
+    object.__setattr__(other, "cost_scale", cost_scale(problem))
     known = vars(problem).get("start_is_clear")
     if known is not None and bool(known.all()):  # then it is clear of fewer, too
         object.__setattr__(other, "start_is_clear", known)

@@ -10,16 +10,16 @@ removing it would use up a whole attempt, or must first be refined.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
+from functools import cached_property
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Count, Natural, Positive, check_options
+from torchgco.base.options import Count, Natural, Positive
 from torchgco.base.tree import put, take
 from torchgco.kernels import cost_unit, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -35,7 +35,7 @@ from torchgco.search.candidates import CANDIDATE_PENALTY, Candidates, Refine, Wa
 from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.record import comparison
-from torchgco.search.row import Row
+from torchgco.search.table import Row
 from torchgco.solution import SearchRecord
 from torchgco.solvers.contracts import Call
 
@@ -64,12 +64,6 @@ class Proposal(NamedTuple):
         count = torch.zeros(problem.B, dtype=torch.int64, device=rest.device)
         cost = torch.full_like(problem.x0[:, 0], torch.inf)
         return cls(rest.clone(), count.bool(), Multipliers.zero(problem, torch.nan), count, cost)
-
-
-class Rounds(Protocol):
-    """A search that keeps the round of proposals from step to step."""
-
-    def propose(self, proposals: PathProposals) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -105,10 +99,11 @@ class PathProposals(Row):
     max_penetration: Positive = 0.1
     max_gap: Positive | None = None
 
+    label: ClassVar[str] = "proposals"
     seeks_paths: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_options(self, "proposals")
+        super().__post_init__()
         for name in ("roadmaps", "follow"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if not self.follow:
@@ -138,9 +133,13 @@ class PathProposals(Row):
         ways = "; then ".join(str(follow) for follow in self.follow)
         return f"{paths}: {ways}; {relaxed}{refined}; accepted up to {self.max_penetration:g} R deep{least}"
 
-    def run(self, search: Rounds) -> None:
+    def run(self, search: Any) -> None:
         """Propose; see the class."""
-        search.propose(self)
+        if not self.continues:
+            search.begin_round(self.when, self.at_once)
+        if search.round is not None:
+            rows, begun = search.round
+            search.best.worked[rows[begun.improve(self)]] = True
 
     def fitting(self, m: int) -> Self:
         """Without initial offsets that have another number of controls than m."""
@@ -179,33 +178,23 @@ class PathProposals(Row):
         """As `improve`, for the problems in `rows`."""
         if rows.numel() == 0:
             return
-        every = rows.numel() == whole.problem.B
-        problem, rest = (whole.problem, whole.rest) if every else (whole.problem.take(rows), whole.rest[rows])
+        problem = whole.problem.take(rows)
         paths = whole.seek(rows, self.roadmaps, self.num_paths) if self.roadmaps else take(whole.paths, rows)
         if not self.continues:
             whole.paths = paths
-        note = None if whole.record is None else partial(whole.note, rows, paths, self.refine)
         for follow in self.follow:
-            paced = follow.pace is not None or limits_states(problem)
-            free = take(whole.free(follow.iterations), rows) if paced else None
-            new, old = self._along(problem, rest, paths, follow, free, watch, note), take(whole.proposal, rows)
+            new, old = self._along(whole, rows, problem, paths, follow, watch), take(whole.proposal, rows)
             better = (~old.found | (new.found & (new.cost < old.cost))).nonzero().flatten()
             put(whole.proposal, rows[better], take(new, better))
             whole.proposal.iterations[rows] = old.iterations + new.iterations
 
     def _along(
-        self,
-        problem: Problem,
-        rest: Tensor,
-        paths: Paths,
-        follow: Follow,
-        free: Free | None,
-        watch: Watch,
-        note: Callable[..., None] | None,
+        self, whole: Part, rows: Tensor, problem: Problem, paths: Paths, follow: Follow, watch: Watch
     ) -> Proposal:
-        """Proposals along paths that are known, followed in one way; `note` is called with the steps."""
-        K = paths.corners.shape[1]
-        starts = follow.starts(problem, rest).repeat_interleave(len(follow.paces), dim=1)
+        """Proposals for `problem`, some rows of the whole, along paths that are known, followed in one way."""
+        paced = follow.pace is not None or limits_states(problem)
+        free, K = take(whole.free(follow.iterations), rows) if paced else None, paths.corners.shape[1]
+        starts = follow.starts(problem, whole.rest[rows]).repeat_interleave(len(follow.paces), dim=1)
         live = paths.live.repeat_interleave(starts.shape[1], dim=1)
         candidates = Candidates.begin(problem, starts.repeat(1, K, 1, 1), paths.R, paths.unit, live, watch)
         tracked = follow.track(candidates, paths, free)
@@ -218,8 +207,8 @@ class PathProposals(Row):
         multipliers = replace(multipliers, mu=torch.where(some, multipliers.mu, torch.nan))
         needed = self.refine.needed or follow.obstacles == 0.0
         found = some & (cost.isfinite() if needed else picked[best])
-        if note is not None:
-            note(tracked, relaxed, sound, refined, found)
+        if whole.record is not None:
+            whole.note(rows, paths, self.refine, tracked, relaxed, sound, refined, found)
         return Proposal(refined.candidates.U[best], found, multipliers, refined.candidates.iterations, cost)
 
     def relax(self, candidates: Candidates) -> tuple[Candidates, Tensor]:
@@ -278,8 +267,7 @@ class Part:
     def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
         """Record a comparison for the problems in `rows`; see `record.comparison`."""
         assert self.record is not None
-        number, _, noted = self.record.passes[-1]
-        noted.extend(self.places[rows].tolist())
+        number = self.record.passes[-1][0]
         self.record.comparisons.append(comparison(number, self.places[rows], paths, refine, *steps))
 
     def free(self, iterations: int) -> Free:
@@ -336,16 +324,13 @@ class Round:
         return whole._replace(multipliers=whole.multipliers.scaled(self.unit), cost=whole.cost * self.unit)
 
 
-def propose(passes: Sequence[PathProposals], problem: Problem, watch: Watch = unwatched) -> Proposal:
+def propose(passes: Sequence[PathProposals], problem: Problem) -> Proposal:
     """Proposals for every problem, from the vehicle at rest, by some passes.
-
-    `watch` is called with how many candidates of the current step are solved, and of how many; an exception that it
-    raises ends the search.
 
     Raises:
         InputError: initial offsets that don't fit the controls.
     """
-    found = Round(problem, passes[0].at_once, watch)
+    found = Round(problem, passes[0].at_once)
     for proposals in passes:
         found.improve(proposals)
     return found.result()

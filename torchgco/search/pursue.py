@@ -16,16 +16,16 @@ from torch import Tensor
 from torchgco.kernels import open_loop
 from torchgco.maps.ways import length
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.clear import evenly, smoothed
+from torchgco.roadmap.clear import clear_ways, evenly, smoothed
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.mapped import even
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.search import HOPS
-from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates
 from torchgco.search.following import Paths
 from torchgco.search.proposals import Part
-from torchgco.search.solved_candidates import BOTH, in_order, solved
+from torchgco.search.search import Search
+from torchgco.search.solved_candidates import solve_cheapest
 from torchgco.search.steering import Steered, Tracks, driven, speed_limit, steered
 
 PURSUED_AT_ONCE = 16  # problems: bounds the memory
@@ -41,7 +41,7 @@ SOLVED_WAYS = 4  # candidates that are solved, the cheapest as driven
 FINE = 0.25  # R between the points of a way
 ROUNDED = 2.0  # R: the standard deviation over which its corners are averaged
 LOOK_AHEAD = 2.4  # R that the vehicle looks ahead
-DOES = (
+PURSUIT_TEXT = (
     f"what drives along its heading is steered along ways that keep clear, of {WAYS} to {2 * WAYS} classes, "
     f"{WAY_PACES} paces, forwards and backwards; interior point from the {SOLVED_WAYS} cheapest"
 )
@@ -50,25 +50,17 @@ EACH = 2 * WAY_PACES  # candidates of a way: forwards and backwards at each pace
 
 def pursue(search: Search, rows: Tensor) -> None:
     """Solve the problems in `rows` from trajectories that are driven along ways through their maps."""
-    problem = search.call.problem.take(rows)
-    rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-    part = Part(problem.in_cost_units(), rest, search.call.rows[rows], search.record)
+    part = search.part(rows)
     if part.scene is None or part.scene.gates is not None:  # to which these ways don't lead
         return
-    found = [_driven(part, b) for b in range(problem.B)]
+    found = [_driven(part, b) for b in range(rows.numel())]
     if not any(ways for ways, _ in found):
         return
     search.best.worked[rows] = True
     paths, candidates = _candidates(part, found)
-    chosen = candidates.pick(in_order(candidates)[:, :SOLVED_WAYS])
-    search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
-    ends = solved(search, rows, chosen)
+    solve_cheapest(search, rows, part, paths, candidates, SOLVED_WAYS)
     for place, (ways, _) in enumerate(found):
         search.steered[rows[place]] |= bool(ways) and not part.scene.obstacles.maps
-    if search.record is not None:
-        every = torch.arange(problem.B, device=rows.device)
-        good = ends.cost[ends.best].isfinite()
-        part.note(every, paths, BOTH, candidates, chosen, chosen.live, ends, good)
 
 
 def _driven(part: Part, b: int) -> tuple[list[Array], Array]:
@@ -94,7 +86,7 @@ def _ways(part: Part, b: int) -> list[Array]:
     """Ways of the problem at place b: those that keep clear of a map, or paths between bodies, one of each class."""
     assert part.scene is not None
     if part.scene.obstacles.maps:
-        return Roadmap().clear_ways(part.scene, b, WAYS)
+        return clear_ways(part.scene, b, WAYS)
     rows = torch.tensor([b], device=part.rest.device)
     paths = part.seek(rows, (WAY_ROADMAP,), PATHS)
     corners = paths.corners[0][paths.live[0]].double().cpu().numpy()
@@ -134,9 +126,8 @@ def _candidates(part: Part, found: list[tuple[list[Array], Array]]) -> tuple[Pat
     problem, rest, (R, unit) = part.problem, part.rest, part.scales
     K = max(len(ways) for ways, _ in found)
     live = torch.tensor([[k < len(ways) for k in range(K)] for ways, _ in found], device=rest.device)
-    corners = (
-        torch.stack((part.scene.start, part.scene.goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1).repeat(1, K, 1, 1)
-    )
+    ends = torch.stack((part.scene.start, part.scene.goal), dim=1)
+    corners = ends[:, [0, *[1] * HOPS]].unsqueeze(1).repeat(1, K, 1, 1)
     U = rest.unsqueeze(1).repeat(1, K * EACH, 1, 1)
     for b, (ways, controls) in enumerate(found):
         for k, way in enumerate(ways):

@@ -42,14 +42,14 @@ def short_horizons(problem: Problem) -> str | None:
     if goal is None or goal.assumed or problem.B == 0 or problem.time is not None:
         return None
     with computing_on(problem.x0.device):
-        limit = _limit(problem)
+        limit = limit_of(problem)
         if limit is None:
             return None
         far = goal.distance(problem.x0[:, problem.position])
         reach = limit.reach(problem) + goal.radius
         far = torch.maximum(far, torch.where(far <= reach, _ways(problem, far <= reach), 0.0))
         if bool((far > reach).any()):  # the largest may lie between the samples
-            limit = _limit(problem, CLIMBS)
+            limit = limit_of(problem, CLIMBS)
             assert limit is not None
     short = (far > limit.reach(problem) + goal.radius).nonzero().flatten().tolist()
     if not short:
@@ -102,36 +102,21 @@ class Push(NamedTuple):
         return 2.0 * (way / self.push).sqrt() / float(problem.dynamics.dt)
 
 
-def _limit(problem: Problem, climbs: int = 0) -> Step | Push | None:
-    """What limits the way within a horizon; None where nothing does."""
+def limit_of(problem: Problem, climbs: int = 0) -> Step | Push | None:
+    """What limits the way within a horizon, by the bounds on states and controls; None where nothing does.
+
+    The longest step is the greatest of samples and corners of what it depends on, which has bounds at all knots, after
+    so many rounds of projected gradient ascent from each. So is the strongest push, where controls don't change the
+    speed at once; but what has no bounds may matter as long as the push doesn't grow with it: it is compared in ranges
+    that are a hundred times as wide, or as narrow.
+    """
     box = _Box.of(problem)
     if box is None:
         return None
-    step = _longest(problem, box, climbs)
-    if step is not None:
-        return Step(step)
+    if bool(box.bounded[:, box.depends].all()):
+        return Step(_climbed(lambda z: _way(problem, z), box.z, box.least, box.most, climbs).amax(-1).sqrt())
     push = _strongest(problem, box, climbs)
     return None if push is None else Push(push)
-
-
-def longest_step(problem: Problem, climbs: int = 0) -> Tensor | None:
-    """The longest way (B,), m, of a stage within the bounds on states and controls; None where nothing limits it.
-
-    The greatest of samples and corners of what it depends on, which has bounds at all knots, after so many rounds of
-    projected gradient ascent from each.
-    """
-    box = _Box.of(problem)
-    return None if box is None else _longest(problem, box, climbs)
-
-
-def strongest_push(problem: Problem, climbs: int = 0) -> Tensor | None:
-    """The largest increase of the speed (B,), m/s^2, within the bounds on states and controls; None without a limit.
-
-    Where controls don't change the speed at once. As `longest_step`, but what has no bounds may matter as long as the
-    increase doesn't grow with it: it is compared in ranges that are a hundred times as wide, or as narrow.
-    """
-    box = _Box.of(problem)
-    return None if box is None else _strongest(problem, box, climbs)
 
 
 class _Box(NamedTuple):
@@ -158,15 +143,8 @@ class _Box(NamedTuple):
         return cls(bounded, least, most, torch.cat((z, least + (share > 0.5) * (most - least)), dim=1), depends)
 
 
-def _longest(problem: Problem, box: _Box, climbs: int) -> Tensor | None:
-    """As `longest_step`."""
-    if not bool(box.bounded[:, box.depends].all()):
-        return None
-    return _climbed(lambda z: _way(problem, z), box.z, box.least, box.most, climbs).amax(-1).sqrt()
-
-
 def _strongest(problem: Problem, box: _Box, climbs: int) -> Tensor | None:
-    """As `strongest_push`."""
+    """The strongest push, (B,), m/s^2; None where it isn't limited."""
     if bool(box.depends[problem.n :].any()) or not problem.dynamics.is_integrated:
         return None
     bounded, some = box.bounded.unsqueeze(1), box.z[:, ::FEWER]

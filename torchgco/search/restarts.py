@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -14,17 +15,16 @@ from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.kernels import expect_interior
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.scene import has_paths
-from torchgco.search.attempts import Late, Search
+from torchgco.roadmap.scene import has_maps, has_paths
 from torchgco.search.chords import ClearChords
-from torchgco.search.converge import Converge, mapped
+from torchgco.search.converge import Converge
 from torchgco.search.freed import Freed
 from torchgco.search.nearby import among_nearby
-from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.proposals import PathProposals
-from torchgco.search.row import Passes, Row, passes_of
+from torchgco.search.search import Late, Search
+from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.suitability import suited_paths
-from torchgco.search.table import rows_of
+from torchgco.search.table import Passes, Row, passes_of
 from torchgco.search.through_gates import solved_through_gates
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PASSES = Passes((Solve(), PathProposals(), FromProposal(), FromSamples("unproposed"), IntoGoal(), ClearChords()))
+
+TABLE_COLUMNS = "name", "pass", "problems", "what it does"
 
 TIME_PACES = 0.7, 1.0, 1.4  # of the times found, where the time is free: each is a search of its own
 MOVING_PACES = 0.6, 0.7, 0.8, 0.9, 1.0, 1.2  # the same among obstacles that move: each gap opens at a time of its own
@@ -69,12 +71,15 @@ class Restarts(Solver):
     def table(self, problem: Problem | None = None) -> pd.DataFrame:
         """The passes, a row each: which problems they look at, and what they do with them.
 
+        A trajectory is accepted where it is better than the best before: arrived before feasible before cheap.
+
         Args:
             problem: only the rows that may work on problems of this kind; None: all.
         """
         import pandas as pd
 
-        table = pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
+        rows = [(name, type(row).__name__, row.problems, row.does) for name, row in self.passes.items()]
+        table = pd.DataFrame(rows, pd.RangeIndex(1, len(rows) + 1, name="row"), TABLE_COLUMNS)
         kind = None if problem is None else kind_of(problem)
         return table if kind is None else table[[kind in row.kinds for row in self.passes]]
 
@@ -128,7 +133,7 @@ class Restarts(Solver):
 
     def _solved(self, call: Call) -> Solution:
         solver = self.local
-        session = Session(call, solver.inner.rules, solver.record)
+        session = Session(call, solver.inner.as_printed, record=solver.record)
         passes, guidance = self._suited(session.call.problem)
         search = Search(session.call, solver, passes, guidance, self.interior, session.recorder)
         self._run(search, passes)
@@ -142,19 +147,14 @@ class Restarts(Solver):
 
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
         """All passes, until the time is over."""
-        for number, one in enumerate(passes, start=1):
+        for number, (name, one) in enumerate(zip(self.passes.names, passes, strict=True), start=1):
             if search.begun and search.call.late:
                 return
-            name, late = self.passes.names[number - 1], False
             search.next_pass(number, name)
-            try:
+            with suppress(Late):
                 if one is not None:
                     one.run(search)
-            except Late:
-                late = True
             search.end_pass(number, name)
-            if late:
-                return
 
     def _suited(self, problem: Problem) -> tuple[Sequence[Row | None], Guidance | None]:
         """The passes, None for those that can't serve these problems, and the guidance, None where it can't.
@@ -184,7 +184,7 @@ def kind_of(problem: Problem) -> str:
     """The kind of problem: "free" of obstacles, "moving" where no path can be sought, "maps", or "bodies" without."""
     if not problem.geometric:
         return "free"
-    return "moving" if not has_paths(problem) else "maps" if mapped(problem) else "bodies"
+    return "moving" if not has_paths(problem) else "maps" if has_maps(problem) else "bodies"
 
 
 def _check(passes: Passes) -> None:

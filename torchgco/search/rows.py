@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
-from torchgco.base.options import Count, Natural, Positive, check_options
+from torchgco.base.options import Count, Natural, Positive
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import Refine
 from torchgco.search.converge import Converge
 from torchgco.search.direct import Direct, Join
 from torchgco.search.following import Follow
-from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.proposals import PathProposals
-from torchgco.search.row import Row
 from torchgco.search.starts import Starts
+from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
+from torchgco.search.table import Row
 
 REPAIRED = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)  # of candidates that lie deep in an obstacle
 INSIDE_DEPTH = 0.5  # how deep these may lie, in R
@@ -37,17 +37,13 @@ class FirstSolve(Row):
 
     single_contact_after: Count | None = 3
 
-    def __post_init__(self) -> None:
-        check_options(self, "guess")
+    label: ClassVar[str] = "guess"
+    problems: ClassVar[str] = "all"
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
         solve = Solve(single_contact_after=self.single_contact_after)
         return Converge(among="free"), Solve("end", "pathless"), solve, Direct()
-
-    @property
-    def problems(self) -> str:
-        return "all"
 
     @property
     def does(self) -> str:
@@ -85,11 +81,10 @@ class Paths(Row):
     max_penetration: Positive = 0.1
     max_gap: Positive | None = None
 
+    label: ClassVar[str] = "paths"
     seeks_paths: ClassVar[bool] = True
     kinds: ClassVar[tuple[str, ...]] = ("maps", "bodies")
-
-    def __post_init__(self) -> None:
-        check_options(self, "paths")
+    problems: ClassVar[str] = "caught, not arrived"
 
     @property
     def proposals(self) -> PathProposals:
@@ -130,10 +125,6 @@ class Paths(Row):
         )  # fmt: skip
 
     @property
-    def problems(self) -> str:
-        return "caught, not arrived"
-
-    @property
     def does(self) -> str:
         more = "" if self.max_gap is None else f"; over {self.max_gap:.0%} above free: twice as many paths"
         near, far = "; without any: followed closer", "; still far: twice as many, all refined"
@@ -162,20 +153,15 @@ class Samples(Row):
 
     redraws: Natural = 2
 
+    label: ClassVar[str] = "samples"
     kinds: ClassVar[tuple[str, ...]] = ("moving", "maps", "bodies")
-
-    def __post_init__(self) -> None:
-        check_options(self, "samples")
+    problems: ClassVar[str] = "caught, not arrived"
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
         return (
             IntoGoal("pathless"), FromSamples("unproposed"), FromSamples(redraws=self.redraws), IntoGoal(), Join(),
         )  # fmt: skip
-
-    @property
-    def problems(self) -> str:
-        return "caught, not arrived"
 
     @property
     def does(self) -> str:
@@ -197,18 +183,13 @@ class Tighten(Row):
 
     starts: Natural = 8
 
+    label: ClassVar[str] = "tighten"
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "tighten")
+    problems: ClassVar[str] = "not solved as tightly yet"
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
         return Converge(), *((Starts(self.starts),) if self.starts > 0 else ())
-
-    @property
-    def problems(self) -> str:
-        return "not solved as tightly yet"
 
     @property
     def does(self) -> str:

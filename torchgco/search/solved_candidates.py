@@ -13,9 +13,11 @@ from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.lagrangian.state import SolveEnd
-from torchgco.search.attempts import Search
 from torchgco.search.candidates import Candidates, Refine, Refined
 from torchgco.search.converge import solved_nearby
+from torchgco.search.following import Paths
+from torchgco.search.proposals import Part
+from torchgco.search.search import Search
 from torchgco.solvers.interior import InteriorPoint
 
 LAST_DEPTH = 0.8  # depth in an obstacle, in R, of candidates that come after all others
@@ -72,6 +74,20 @@ def solved(search: Search, rows: Tensor, chosen: Candidates, grown: Tensor | Non
     X, U = chosen.X.clone(), chosen.U.clone()
     X[some], U[some] = end.best.X, end.best.U
     return Refined(replace(chosen, X=X, U=U), multipliers, best, cost)
+
+
+def solve_cheapest(search: Search, rows: Tensor, part: Part, paths: Paths, candidates: Candidates, count: int) -> None:
+    """Solve the first of the candidates `in_order`, `count` for each problem in `rows`, and record what became of all.
+
+    Args:
+        part: the same problems, with the paths that the candidates follow.
+    """
+    chosen = candidates.pick(in_order(candidates)[:, :count])
+    search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
+    ends = solved(search, rows, chosen)
+    if search.record is not None:
+        every, found = torch.arange(rows.numel(), device=rows.device), ends.cost[ends.best].isfinite()
+        part.note(every, paths, BOTH, candidates, chosen, chosen.live, ends, found)
 
 
 def _keep(search: Search, rows: Tensor, count: int, some: Tensor, end: SolveEnd, merit: Tensor, made: Tensor) -> None:

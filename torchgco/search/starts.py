@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
-from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.options import Count, Positive
 from torchgco.base.status import UNMOVED, Status, is_over
 from torchgco.base.tree import take
-from torchgco.constraints.bounds import ControlBounds
 from torchgco.lagrangian.state import Iterate
-from torchgco.problem.problem import Problem
-from torchgco.search.attempts import Search
 from torchgco.search.converge import Converge, keep_tight
-from torchgco.search.row import Row
+from torchgco.search.search import Search
+from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
+from torchgco.solvers.interior import half_ranges
 
 KNOTS = 4  # of the noise: with 8, guesses are bent more often than optima are, and lead to fewer of them
 STREAM = 1 << 21  # outer iteration that keys the noise: no solve makes so many
@@ -48,10 +47,8 @@ class Starts(Row):
     bend: Positive = 0.2
     change: Positive = 0.1
 
+    label: ClassVar[str] = "starts"
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "starts")
 
     @property
     def problems(self) -> str:
@@ -63,11 +60,8 @@ class Starts(Row):
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
-        problem = search.call.problem
-        if problem.B == 0 or not Converge.begins(problem):
-            return
-        left = self._rows(search)
-        if left.numel() == 0:  # which `split` would make one empty batch of
+        problem, left = search.call.problem, self._rows(search)
+        if not Converge.begins(problem) or left.numel() == 0:  # which `split` would make one empty batch of
             return
         slots = search.solver.slots or problem.B * self.count
         for rows in left.split(max(1, slots // self.count)):
@@ -103,13 +97,3 @@ class Starts(Row):
         line = X[:, :1] + way * (X[:, -1:] - X[:, :1])
         U = call.U0 + self.change * half_ranges(call.problem, call.U0) * smooth_normal(changes, KNOTS, call.U0)
         return line + self.bend * size * smooth_normal(bends, KNOTS, X), U
-
-
-def half_ranges(problem: Problem, U: Tensor) -> Tensor:
-    """Half the range of each control between its bounds, (B, 1, m); 1 or the largest control where it is unbounded."""
-    half = U.abs().amax(1, keepdim=True).clamp(min=1.0)
-    for bounds in problem.constraints:
-        if isinstance(bounds, ControlBounds):
-            own = 0.5 * bounds.range.unsqueeze(1)
-            half = torch.where(torch.isfinite(own), own, half)
-    return half

@@ -80,9 +80,7 @@ class Sampled(NamedTuple):
 def sampled(problem: Problem) -> Sampled | None:
     """None for vehicles that don't move in a plane by differential equations that are the same at all times."""
     model, at = problem.dynamics, problem.dynamics.position
-    if at is None or at.stop - at.start != 2 or model.at(0) is not model or problem.m < 2:
-        return None
-    if not model.is_integrated:
+    if at is None or at.stop - at.start != 2 or model.at(0) is not model or problem.m < 2 or not model.is_integrated:
         return None
     n, ends = problem.n, [part[0] for part in bounds_at_inner_knots(problem)]
     bounded = torch.isfinite(ends[0]) & torch.isfinite(ends[1])

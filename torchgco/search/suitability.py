@@ -11,7 +11,7 @@ from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
-from torchgco.search.row import Row
+from torchgco.search.table import Row
 
 
 def suited_paths(passes: Sequence[Row], problem: Problem) -> tuple[Sequence[Row | None], str | None]:

@@ -14,22 +14,21 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, check_options
+from torchgco.base.options import Count
 from torchgco.kernels import open_loop
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.clear import clear_path
 from torchgco.roadmap.known import Known
+from torchgco.roadmap.mapped import in_each
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import around_body
-from torchgco.search.attempts import Search
+from torchgco.roadmap.scene import around_body, has_maps
 from torchgco.search.candidates import Candidates
-from torchgco.search.converge import mapped
 from torchgco.search.following import Follow, Free, Paths
-from torchgco.search.manoeuvres import MANOEUVRES_TEXT as MANOEUVRES
-from torchgco.search.manoeuvres import manoeuvre
-from torchgco.search.proposals import Part
-from torchgco.search.pursue import DOES, PURSUED_AT_ONCE, pursue
-from torchgco.search.row import Row
-from torchgco.search.solved_candidates import BOTH, in_order, solved
+from torchgco.search.manoeuvres import MANOEUVRES_TEXT, manoeuvre
+from torchgco.search.pursue import PURSUED_AT_ONCE, PURSUIT_TEXT, pursue
+from torchgco.search.search import Search
+from torchgco.search.solved_candidates import solve_cheapest
+from torchgco.search.table import Row
 
 TRACKED_AT_ONCE = 256  # candidates of all problems that are tracked and solved together: bounds the memory
 # Tracked candidates lie a small part of R inside an obstacle, from where the interior point leads out of it again; from
@@ -67,11 +66,9 @@ class Tube(Row):
     among: Literal["maps", "bodies"] = "bodies"
     num_paths: Count = 6
 
+    label: ClassVar[str] = "tube"
     seeks_paths: ClassVar[bool] = True
     last: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "tube")
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -85,14 +82,14 @@ class Tube(Row):
     def does(self) -> str:
         more, first = "", ""
         if self.among == "maps":
-            more, first = " and one that keeps clear", f"{DOES}; others, or without success: "
+            more, first = " and one that keeps clear", f"{PURSUIT_TEXT}; others, or without success: "
         tracked = f"{self.num_paths} paths{more}: {FOLLOW}, {PACES} paces"
-        cars = f"cars with a body: {MANOEUVRES}; without success, and others: "
+        cars = f"cars with a body: {MANOEUVRES_TEXT}; without success, and others: "
         return f"{cars}{first}{tracked}; not relaxed; interior point from the {TOP} cheapest"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
-        if not search.has_paths or mapped(search.call.problem) != (self.among == "maps"):
+        if not search.has_paths or has_maps(search.call.problem) != (self.among == "maps"):
             return
         manoeuvre(search)
         rows = search.rows("unarrived")
@@ -114,30 +111,24 @@ class Tube(Row):
 
     def _some(self, search: Search, rows: Tensor) -> None:
         """As `run`, for the problems in `rows`."""
-        problem = search.call.problem.take(rows)
-        rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-        part = Part(problem.in_cost_units(), rest, search.call.rows[rows], search.record)
+        part = search.part(rows)
         if part.scene is None:
             return
         search.best.worked[rows] = True
-        every = torch.arange(problem.B, device=rows.device)
+        every = torch.arange(part.problem.B, device=rows.device)
         paths = part.seek(every, (ROADMAP,), self.num_paths)
         if part.scene.gates is None:
-            paths = paths.joined(*ROADMAP.clear_path(part.scene))
-            wide = around_body(problem, part.scene)
+            if part.scene.obstacles.maps:
+                paths = paths.joined(*in_each(part.scene, 1, ROADMAP.max_overlap, clear_path))
+            wide = around_body(part.problem, part.scene)
             if wide is not None:
                 paths = paths.joined(*ROADMAP.paths(wide, 1, every, Known()))
-        starts, usable = _starts(problem, rest)
+        starts, usable = _starts(part.problem, part.rest)
         live = (paths.live.unsqueeze(-1) & usable.unsqueeze(1)).flatten(1).repeat_interleave(PACES, dim=1)
         starts = starts.repeat_interleave(PACES, dim=1).repeat(1, paths.corners.shape[1], 1, 1)
         candidates = Candidates.begin(part.problem, starts, paths.R, paths.unit, live)
         tracked = FOLLOW.along(candidates, paths, self._arrivals(paths, part.free(FOLLOW.iterations)), PACES)
-        chosen = tracked.pick(in_order(tracked)[:, :TOP])
-        search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
-        ends = solved(search, rows, chosen)
-        if search.record is not None:
-            found = ends.cost[ends.best].isfinite()
-            part.note(every, paths, BOTH, tracked, chosen, chosen.live, ends, found)
+        solve_cheapest(search, rows, part, paths, tracked, TOP)
 
     def _arrivals(self, paths: Paths, free: Free) -> Tensor:
         """Shares (B * K * paces,) of the horizon at which each candidate arrives."""

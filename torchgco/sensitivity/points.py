@@ -25,7 +25,6 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 
 # With a tolerance of 1e-13, rounding ends some polishes before they meet it.
@@ -114,7 +113,7 @@ def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, re
     asked = part.grown(by) if bool((by > 0).any()) else part
     call = replace(Call.checked(asked, old.U, warm=old.multipliers), X0=old.X)
     end = POLISH.solved(call, smoothing=smoothing)
-    new = Session(call, RAW).trajectories(end)
+    new = Session(call, own_units=True).trajectories(end)
     stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STATIONARY_MOVE
     stays = end.status == SOLVED if smoothing > 0 else stays
     stays &= ~(chord_clearance(part, new.X) < chord_clearance(part, old.X).clamp(max=0.0))

@@ -95,14 +95,14 @@ class AugmentedLagrangian(Solver):
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
-        session = Session(call, self.inner.rules, self.record, self.by_kernels)
+        session = Session(call, self.inner.as_printed, record=self.record, by_kernels=self.by_kernels)
         guidance = None if self.guidance is None else self.guidance.suited(session.call.problem)
         end = self.outer_loop(session.call, guidance, recorder=session.recorder)
         return session.finished(end, self.violation_tolerance, self.slots)
 
     def improved(self, call: Call) -> tuple[Iterate, Tensor]:
         """The trajectories of a solve without its verdict, in the user's units, and the iterations made (B,)."""
-        session = Session(call, self.inner.rules)
+        session = Session(call, self.inner.as_printed)
         end = self.outer_loop(session.call)
         return session.trajectories(end), end.iterations
 
@@ -142,7 +142,8 @@ class OuterLoop:
     _passes: OuterPasses | None = None  # of the running problems
 
     def __post_init__(self) -> None:
-        self.rules = self.solver.inner.rules
+        # As printed, only the outer limit ends a solve, mu always grows, and inequalities have the printed form.
+        self.as_printed = self.solver.inner.as_printed
         self.limit = 1 if self.recorder is not None else self.solver.inner.max_iterations
 
     @property
@@ -161,7 +162,7 @@ class OuterLoop:
         else:
             multipliers = take(self.call.warm, rows)
         penalty = take(self.penalty, rows) if self.guidance is None else self.guidance.start(problem, X)
-        cost, merit = value(Lagrangian(problem, multipliers, penalty, self.rules.phr), X, U)
+        cost, merit = value(Lagrangian(problem, multipliers, penalty, not self.as_printed), X, U)
         none, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         state = State(
             rows=rows.clone(),
@@ -205,9 +206,9 @@ class OuterLoop:
         if self._passes is None or self._guided:  # guidance may have replaced tensors of the state
             after = None if stop is None else stop.single_contact_after
             self._passes = kernels_of(self.problem).outer_passes(
-                self.problem, s, solver.inner.descent, phr=self.rules.phr, base=self.call.outer[s.rows],
+                self.problem, s, solver.inner.descent, phr=not self.as_printed, base=self.call.outer[s.rows],
                 by_arrival=self.by_arrival, stops=stop is not None, single_after=-1 if after is None else after,
-                ends=self.rules.ends, max_outer=solver.max_outer_iterations,
+                ends=not self.as_printed, max_outer=solver.max_outer_iterations,
                 patience=-1 if solver.patience is None else solver.patience, growth=solver.penalty_growth,
                 stalled_growth=solver.stalled_growth or 0.0, penalty_max=PENALTY_MAX,
                 tolerance=solver.violation_tolerance, halved=HALVED, settled=SETTLED,
@@ -236,7 +237,7 @@ class OuterLoop:
         return status
 
     def _by_iterations(self, s: State) -> Tensor:
-        lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, self.rules.phr)
+        lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, not self.as_printed)
         end = kernels_of(self.problem).descend(lagrangian, s, self.solver.inner.descent, self.limit)
         if self.recorder is not None:
             self.recorder.add(self.problem, self.call.rows[s.rows], s, end)
@@ -252,7 +253,7 @@ class OuterLoop:
         growth = torch.full_like(worst, solver.penalty_growth)
         if solver.stalled_growth is not None:
             growth = growth.masked_fill(worst > HALVED * s.last_violation[rows], solver.stalled_growth)
-        if self.rules.ends:
+        if not self.as_printed:
             growth = growth.masked_fill(worst <= solver.violation_tolerance, 1.0)
         multipliers = update_and_raise_penalty(problem, X, U, take(s.multipliers, rows), growth, PENALTY_MAX)
         self._keep_best(s, rows, problem, Iterate(X, U, multipliers, s.cost[rows], worst))
@@ -275,7 +276,7 @@ class OuterLoop:
         status[over & ~end.stuck[rows]] = Status.MAX_ITERATIONS
         if self.solver.patience is not None:
             status[s.waited[rows] >= self.solver.patience] = STALLED
-        if self.rules.ends:
+        if not self.as_printed:
             settled = (s.cost[rows] - s.last_cost[rows]).abs() <= SETTLED * s.cost[rows].abs()
             status[end.converged[rows] & settled & (worst <= self.solver.violation_tolerance)] = Status.CONVERGED
         return status
@@ -298,7 +299,7 @@ class OuterLoop:
         """The next inner solve of `rows` of the running problems: L_M with its new multipliers and penalty."""
         s.regularisation[rows] = 0.0
         multipliers, penalty = take((s.multipliers, s.penalty), rows)
-        lagrangian = Lagrangian(running.take(rows), multipliers, penalty, self.rules.phr)
+        lagrangian = Lagrangian(running.take(rows), multipliers, penalty, not self.as_printed)
         s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
         s.inner[rows] = s.rung[rows] = 0
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.base.status import STALLED, UNMOVED, Status, is_over
 from torchgco.ilqr.riccati import BackwardPass
-from torchgco.kernels import cost_unit, kernels_of
+from torchgco.kernels import cost_scale, cost_unit, kernels_of
 from torchgco.lagrangian.lagrangian import Lagrangian, binding
 from torchgco.problem.problem import Problem
 
@@ -56,7 +56,8 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         mu = torch.where(step.failed, FIRST * STRONGER**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
-    cost = least_cost(problem) + (problem.cost.total(X, U) - constant_cost(problem)).abs()
+    _, constant, least = cost_scale(problem)
+    cost = least + (problem.cost.total(X, U) - constant).abs()
     rounds = _rounds(lagrangian, X, U)
     if bool(((mu > 0) | rounds).any()):
         sizes = _sizes(problem, U)
@@ -102,18 +103,6 @@ def _by_slopes(problem: Problem, run: Callable[[Tensor], BackwardPass], sizes: T
     mu = torch.finfo(sizes.dtype).max ** 0.5 * cost_unit(problem).clamp(max=1.0)
     slopes = run(mu).gains[..., -1].movedim(0, 1).abs() * mu.view(-1, 1, 1)
     return (slopes * sizes.unsqueeze(1)).contiguous().sum(-1).sum(-1)
-
-
-def constant_cost(problem: Problem) -> Tensor:
-    """What is constant in each problem's cost, (B,), where it dwarfs the rest; 0 elsewhere."""
-    cost_unit(problem)  # by native kernels, where PyTorch would differentiate
-    return problem.cost_scale.constant
-
-
-def least_cost(problem: Problem) -> Tensor:
-    """As how much each problem's cost counts at least where a share of it is meant, (B,)."""
-    cost_unit(problem)  # by native kernels, where PyTorch would differentiate
-    return problem.cost_scale.size
 
 
 def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:

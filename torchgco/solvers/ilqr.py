@@ -19,7 +19,6 @@ from torchgco.obstacles.base import ADMITTED
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.ending import start_status
-from torchgco.solvers.rules import PRINTED, STANDARD, Rules
 from torchgco.solvers.session import Session
 
 
@@ -56,18 +55,13 @@ class ILQR(Solver):
         check_options(self, "ilqr")
 
     @property
-    def rules(self) -> Rules:
-        """The form of the algorithm."""
-        return PRINTED if self.as_printed else STANDARD
-
-    @property
     def descent(self) -> Descent:
         """The options as kernels read them."""
         return Descent(self.line_search, self.tolerance, self.max_iterations, self.damp_below, self.as_printed)
 
     def run(self, call: Call) -> Solution:
         """One inner solve of a checked call."""
-        session = Session(call, self.rules)
+        session = Session(call, self.as_printed)
         problem, warm = session.call.problem, session.call.warm
         fixed = Multipliers.zero(problem, 0.0) if warm is None else warm
         lagrangian = Lagrangian(problem, fixed, None, phr=False)

@@ -30,28 +30,18 @@ def least_violated(call: Call, end: SolveEnd, tolerance: float) -> SolveEnd:
     if rows.numel() == 0 or call.late:
         return end
     problem, old = call.problem.take(rows).held_at(end.best.X[rows, 0]), take(end.best, rows)
-    X, U, stuck = least_violation(problem, old.U)
-    violation = measured(problem, X, U)
-    stuck &= violation > tolerance
+    cost_unit(problem)
+    given = Multipliers.zero(problem, HEAVY)
+    found, ended = descend(REPAIR, Lagrangian(problem.in_cost_units(), given, None, phr=True), old.U)
+    X, U, violation = found.X, found.U, measured(problem, found.X, found.U)
+    # A problem without a feasible trajectory ends at a stationary point of the violation; others may do so, too.
+    stuck = (ended != Status.NON_FINITE) & (ended != Status.NOT_POSITIVE_DEFINITE)
+    stuck &= (left_to_close(problem, X, U) <= STUCK) & (violation > tolerance)
     less = (stuck & (violation < old.violation)).nonzero().flatten()
     new = Iterate(X, U, old.multipliers, problem.cost.total(X, U), violation)
     put(end.best, rows[less], take(new, less))
     end.status[rows[stuck]] = STALLED
     return end
-
-
-def least_violation(problem: Problem, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Controls whose violation is locally least in squares, from U (B, N, m).
-
-    Returns:
-        X, U of the descent, and whether its end is a stationary point of the violation, (B,) bool. A problem without a
-        feasible trajectory ends at one; other problems may do so too, from some guesses.
-    """
-    cost_unit(problem)
-    given = Multipliers.zero(problem, HEAVY)
-    end, status = descend(REPAIR, Lagrangian(problem.in_cost_units(), given, None, phr=True), U)
-    failed = (status == Status.NON_FINITE) | (status == Status.NOT_POSITIVE_DEFINITE)
-    return end.X, end.U, ~failed & (left_to_close(problem, end.X, end.U) <= STUCK)
 
 
 def left_to_close(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

@@ -14,25 +14,17 @@ from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.fixed import GOLDEN, ROUNDINGS
 from torchgco.eager.kernels import least_violation
-from torchgco.kernels import (
-    cost_unit,
-    expect_interior,
-    followed,
-    interior_of,
-    measured,
-    open_loop,
-)
+from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
 from torchgco.kernels.base import InteriorKernels
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
-from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Call, Progress, Solver, check_states
-from torchgco.solvers.ending import STATIONARY, constant_cost, least_cost, start_status
+from torchgco.solvers.contracts import Call, Progress, Solver
+from torchgco.solvers.ending import STATIONARY, start_status
 from torchgco.solvers.infeasible import least_violated
-from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
 
@@ -101,7 +93,7 @@ class InteriorPoint(Solver):
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
-        session, admitted = Session(call, RAW), self.admitted(call.problem)
+        session, admitted = Session(call, own_units=True), self.admitted(call.problem)
         guess = guessed(session.call)
         end = self.no_worse(session.call, guess, self.solved(session.call, guess=guess, escapes=True))
         return session.finished(least_violated(session.call, end, admitted), admitted)
@@ -127,21 +119,6 @@ class InteriorPoint(Solver):
         held = replace(self, tolerance=max(self.tolerance, ROUGH), max_iterations=min(self.max_iterations, FEW))
         first = replace(self, max_iterations=held.max_iterations)
         return Chooser(held, self, self.admitted(problem), first)
-
-    def solve_from(self, problem: Problem, X0: Tensor, U0: Tensor, max_seconds: float | None = None) -> Solution:
-        """Solve from states that the controls need not lead to, such as waypoints.
-
-        Args:
-            X0: (B, N+1, n); the first states are those of the problem, whatever is given, but where these are free.
-            U0: (B, N, m).
-            max_seconds: as of `solve`.
-
-        Raises:
-            InputError: X0 or U0 don't fit the problem.
-        """
-        problem = current_problem(problem)
-        check_states(X0, problem)
-        return self.solve(problem, U0, max_seconds=max_seconds, X0=X0)
 
     def solved(
         self,
@@ -244,10 +221,11 @@ class InteriorPoint(Solver):
         how = how | {"smoothing": smoothing, "minimum": int(escapes)}
         X, U = inside(problem, X, call.U0, how["push"])
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
-        fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
+        scale = cost_scale(problem)
+        fitted = Multipliers(multipliers, PENALTY * scale.unit)
         out = kernels.solve(
             problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
-            constant=constant_cost(problem), least_cost=least_cost(problem), seconds=call.seconds_left,
+            constant=scale.constant, least_cost=scale.size, seconds=call.seconds_left,
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
         X, U = rolled_out(problem, X, U, out["gains"][..., :-1])
@@ -268,12 +246,17 @@ class InteriorPoint(Solver):
 
 def _beside(problem: Problem, U: Tensor, share: float) -> Tensor:
     """Controls (B, N, m) beside U, by an uneven share of their size or range, the same whatever the batch."""
-    size = U.abs().amax(1, keepdim=True).clamp(min=1.0)
-    if problem.control_bounds is not None:
-        half = 0.5 * problem.control_bounds.range.unsqueeze(1)
-        size = torch.where(torch.isfinite(half), half, size)
     count = torch.arange(1, U[0].numel() + 1, dtype=U.dtype, device=U.device).view(U.shape[1:])
-    return U + share * size * (2.0 * torch.frac(GOLDEN * count) - 1.0)
+    return U + share * half_ranges(problem, U) * (2.0 * torch.frac(GOLDEN * count) - 1.0)
+
+
+def half_ranges(problem: Problem, U: Tensor) -> Tensor:
+    """Half the range of each control between its bounds, (B, 1, m); 1 or the largest control where it is unbounded."""
+    size = U.abs().amax(1, keepdim=True).clamp(min=1.0)
+    if problem.control_bounds is None:
+        return size
+    half = 0.5 * problem.control_bounds.range.unsqueeze(1)
+    return torch.where(torch.isfinite(half), half, size)
 
 
 def rolled_out(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:

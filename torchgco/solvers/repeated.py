@@ -29,7 +29,7 @@ class RepeatedDescent:
     @cached_property
     def _kept(self) -> KeptDescent | None:
         """Packed at the first solve, as many a subset never has one; None where PyTorch's kernels serve."""
-        return kernels_of(self.problem).kept_descent(self.problem, self.inner.descent, self.inner.rules.phr)
+        return kernels_of(self.problem).kept_descent(self.problem, self.inner.descent, not self.inner.as_printed)
 
     def take(self, index: Rows) -> RepeatedDescent:
         """The same for the problems in `index`."""
@@ -48,5 +48,5 @@ class RepeatedDescent:
         if kept is not None and kept.solve(U, multipliers):
             return kept.X, kept.U.clone(), kept.violation()
         problem = self.problem.renewed()  # whose numbers are others than those that it was packed with
-        found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, self.inner.rules.phr), U)
+        found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, not self.inner.as_printed), U)
         return found.X, found.U, measured(problem, found.X, found.U)

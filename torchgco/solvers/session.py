@@ -21,7 +21,6 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import Optimality, final_status, optimality
 from torchgco.solvers.history import Recorder
-from torchgco.solvers.rules import Rules
 from torchgco.solvers.unbounded import falls_without_end
 
 # Where a required goal is covered by an obstacle, the reason is known; these say only how the solve came to its end.
@@ -34,15 +33,22 @@ class Session:
 
     Args:
         given: the call in the user's units.
-        rules: of the solver; `call` is in their units of cost, `unit` (B,).
+        as_printed: the form of the algorithm, as of `ILQR`.
+        own_units: `call` has costs in their own units, as it has as printed; else in units of `Problem.cost_unit`, so
+            that scaling all weights changes no iterate. `unit` (B,) are these.
         record: keep the history of every problem in `recorder`.
         by_kernels: violations of what is returned are those that the solver's kernels measure, but for a user's rows;
             else PyTorch measures them, whatever kernels say.
     """
 
-    def __init__(self, given: Call, rules: Rules, record: bool = False, by_kernels: bool = False) -> None:
-        self.given, self.rules, self.by_kernels = given, rules, by_kernels
-        self.call, self.unit = rules.in_units(given)
+    def __init__(
+        self, given: Call, as_printed: bool = False, own_units: bool = False, record: bool = False,
+        by_kernels: bool = False,
+    ) -> None:  # fmt: skip
+        self.given, self.as_printed, self.by_kernels = given, as_printed, by_kernels
+        self.call, self.unit = given, torch.ones_like(given.problem.x0[:, 0])
+        if not (as_printed or own_units):
+            self.call, self.unit = given.in_cost_units()
         self.recorder = Recorder() if record else None
 
     @property
@@ -132,5 +138,5 @@ class Session:
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
     def _optimality(self, best: Iterate, rows: Rows) -> Optimality:
-        part = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, self.rules.phr)
+        part = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, not self.as_printed)
         return optimality(part, best.X[rows], best.U[rows])

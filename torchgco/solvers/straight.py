@@ -48,11 +48,6 @@ class Legs:
         return cls(stops, torch.cat((first, gates.places, last), dim=1))
 
     @property
-    def lengths(self) -> Tensor:
-        """(B, G+1), m."""
-        return self.stops.diff(dim=1).norm(dim=-1)
-
-    @property
     def farthest(self) -> Tensor:
         """The stop (B, d) that is farthest from the start."""
         place = (self.stops - self.stops[:, :1]).norm(dim=-1).argmax(-1)
@@ -75,7 +70,7 @@ class Legs:
         """
         far = (self.farthest - self.stops[:, 0]).norm(dim=-1, keepdim=True).clamp(min=1e-12)
         stages = self.knots.diff(dim=1).clamp(min=1)
-        each = estimate * N * (self.lengths / far).sqrt() / stages
+        each = estimate * N * (self.stops.diff(dim=1).norm(dim=-1) / far).sqrt() / stages
         return each.gather(1, self._leg(torch.arange(N, device=self.knots.device).expand(len(each), -1).contiguous()))
 
     def _leg(self, k: Tensor) -> Tensor:

@@ -74,7 +74,14 @@ class Timed:
     Args:
         problem: the user's.
         call: of the problem in free time, whose X0 and warm multipliers, where given, are guesses of the user.
+
+    Attributes:
+        best: the best trajectories, from the first attempt on, which is at all problems.
+        clear: whether these touch no obstacle between two knots, (B,) bool.
     """
+
+    best: Solution
+    clear: Tensor
 
     def __init__(self, chooser: Chooser, problem: Problem, call: Any) -> None:
         self.chooser, self.problem, self.call = chooser, problem, call
@@ -82,7 +89,6 @@ class Timed:
         self.time = problem.time
         self.through_gates = gates_of(problem) is not None and problem.dynamics.position is not None
         self.first = self._first()
-        self.best: Solution | None = None
 
     @cached_property
     def _line(self) -> Tensor:
@@ -95,7 +101,10 @@ class Timed:
     @cached_property
     def _steering(self) -> LinearTime:
         line, legs = self._line, self._legs
-        return LinearTime(self.problem, line if legs is None else _to_the_farthest(self.problem, line, legs))
+        if legs is not None:  # as long as the way to the stop that is farthest from the start
+            line = line.clone()
+            line[:, -1, self.problem.position] = legs.farthest
+        return LinearTime(self.problem, line)
 
     @cached_property
     def _estimate(self) -> Tensor:
@@ -128,7 +137,7 @@ class Timed:
         given = self.call.X0 is not None
         while rows.numel() > 0:
             self._tried(rows, guess[rows], given)
-            best = self._found
+            best = self.best
             over = (best.status == Status.CONVERGED) | (best.status == Status.INVALID_START)
             if self.chooser.paces:  # a search that found a way is followed by others anyway
                 over = over | (best.violation <= self.chooser.limit)
@@ -141,7 +150,7 @@ class Timed:
                 break
         self._freed_where_none_is()
         self._again()
-        return self._found
+        return self.best
 
     def _first(self) -> Tensor:
         """The factors (B, S) to begin with: the guess, or `own`.
@@ -153,11 +162,6 @@ class Timed:
         if guess is None:
             return self.own
         return guess if self.call.X0 is not None else torch.where(guess < self._estimate, self.own, guess)
-
-    @property
-    def _found(self) -> Solution:
-        assert self.best is not None
-        return self.best
 
     def _tried(self, rows: Tensor, guess: Tensor, given: bool) -> None:
         """Solve problems with the time held at `guess` (b, S), then free; `given`: from the user's states."""
@@ -211,15 +215,15 @@ class Timed:
             self._tried(rows, guess[rows], False)
         rows = self._lost
         if rows.numel() > 0 and not self.call.late:
-            start = self._found.take(rows)
+            start = self.best.take(rows)
             call = self._at(rows, factors_in(self.problem.take(rows), start.X), False)
             self._keep(rows, self._freed(call, start))
 
     @property
     def _lost(self) -> Tensor:
         """The problems (b,) that could be solved, and have no feasible trajectory."""
-        status = self._found.status
-        lost = ~(self._found.violation <= self.chooser.limit) & (status != Status.INVALID_START)
+        status = self.best.status
+        lost = ~(self.best.violation <= self.chooser.limit) & (status != Status.INVALID_START)
         return lost.nonzero().flatten()
 
     def _again(self) -> None:
@@ -232,9 +236,9 @@ class Timed:
             return
         far = ((self.first / self.own - 1.0).abs() > SAME_TIME).any(-1)
         for pace in (None, *self.chooser.paces):
-            found = self._found.violation <= self.chooser.limit
+            found = self.best.violation <= self.chooser.limit
             rows = (found & far if pace is None else found).nonzero().flatten()
-            factors = self.own if pace is None else pace * factors_in(self.problem, self._found.X)
+            factors = self.own if pace is None else pace * factors_in(self.problem, self.best.X)
             if rows.numel() > 0 and not self.call.late:
                 self._tried(rows, factors.clamp(self.time.least, self.time.most)[rows], False)
 
@@ -249,19 +253,20 @@ class Timed:
 
     def _keep(self, rows: Tensor, found: Solution) -> None:
         """Keep what is better than before; iterations add up, and so do records."""
-        if self.best is None:
-            self.best = found
-            return
-        best, old = self.best, self.best.take(rows)
         limit, problem = self.chooser.limit, self.call.problem.take(rows)
+        clear = chord_clearance(problem, found.X) >= 0.0
+        if "best" not in vars(self):
+            self.best, self.clear = found, clear
+            return
+        best, old, was = self.best, self.best.take(rows), self.clear[rows]
         better = is_better(found.cost, found.violation, old.cost, old.violation, limit)
         same = (found.cost <= old.cost) & (found.violation <= limit)
         better |= same & (found.status == Status.CONVERGED)
         # Of feasible trajectories those that touch no obstacle between two knots come first.
-        clear, was = (chord_clearance(problem, one.X) >= 0.0 for one in (found, old))
         both = (found.violation <= limit) & (old.violation <= limit)
         better = torch.where(both & (clear != was), clear, better)
         where = better.nonzero().flatten()
+        self.clear[rows[where]] = clear[where]
         for name in ("X", "U", "K", "d", "multipliers", "cost", "violation", "status"):
             put(getattr(best, name), rows[where], take(getattr(found, name), where))
         for name in ("iterations", "outer_iterations", "guided"):
@@ -271,13 +276,6 @@ class Timed:
         self.best = replace(best, trace=appended(best.trace, found.trace), search=search)
 
 
-def _to_the_farthest(problem: Problem, line: Tensor, legs: Legs) -> Tensor:
-    """States (B, N+1, n) as on a line, of which the last is at the stop that is farthest from the start."""
-    line = line.clone()
-    line[:, -1, problem.position] = legs.farthest
-    return line
-
-
 def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | None) -> Solution:
     """The solution of a user's problem with a free time, for a call of the problem `in_time`.
 
@@ -285,11 +283,11 @@ def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | No
         X0: states (B, N+1, n) of the user's problem to begin with; None: those of the linear model, or on the straight
             line to the end.
     """
-    found = _found(chooser, problem, replace(call, X0=X0))
-    return of_user(problem, found, told_of(chooser, problem, call, found))
+    found = _solved(chooser, problem, replace(call, X0=X0))
+    return of_user(problem, found, needed_durations(chooser, problem, call, found))
 
 
-def _found(chooser: Chooser, problem: Problem, call: Any) -> Solution:
+def _solved(chooser: Chooser, problem: Problem, call: Any) -> Solution:
     """What `Timed` finds, in the units of the call.
 
     It works in units of cost: seconds alone are small beside the barrier where stages are many and short, and a method
@@ -322,7 +320,7 @@ def lifted_multipliers(problem: Problem, whole: Problem, warm: Multipliers) -> M
     return Multipliers((*warm.lam, *more), warm.mu)
 
 
-def told_of(chooser: Chooser, problem: Problem, call: Any, found: Solution) -> Tensor | None:
+def needed_durations(chooser: Chooser, problem: Problem, call: Any, found: Solution) -> Tensor | None:
     """Durations (B,), s, beyond the longest allowed, at which problems can be solved that can't within it.
 
     NaN where nothing was asked or found; None where all is feasible. A HorizonWarning names them.
@@ -335,7 +333,7 @@ def told_of(chooser: Chooser, problem: Problem, call: Any, found: Solution) -> T
     time = time.take(rows)
     freed = replace(time, least=time.most, most=BEYOND * time.most, guess=None, weight=torch.ones_like(time.weight))
     longer = some._with({"time": freed, "cost": _Nothing(some.cost)})
-    again = _found(chooser, longer, replace(call.take(rows), problem=in_time(longer), X0=None, warm=None))
+    again = _solved(chooser, longer, replace(call.take(rows), problem=in_time(longer), X0=None, warm=None))
     needed = torch.full_like(found.cost, torch.nan)
     does = again.violation <= chooser.limit
     needed[rows[does]] = times_of(some, factors_in(some, again.X))[does, -1]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.kernels import cost_unit, measured, open_loop
+from torchgco.kernels import cost_scale, cost_unit, measured, open_loop
 from torchgco.lagrangian.state import Iterate
 from torchgco.problem.problem import Problem
-from torchgco.solvers.ending import STATIONARY, constant_cost
+from torchgco.solvers.ending import STATIONARY
 
 # Falls of the cost from that of the guess, as multiples of the size of that cost plus the cost unit of all stages.
 DEEP_FALL = 1e6  # a fall that asks for a closer look
@@ -41,7 +41,7 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     fall, size, times = before - costs, before.abs() + unit, cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
     linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP_FALL * size)
     rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
-    without = (cost - constant_cost(held)).abs() + unit
+    without = (cost - cost_scale(held).constant).abs() + unit
     by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]
     falls[rows] = (fall[0] >= BOTTOMLESS * size) | ((linear | by_decades) & clear)
     return falls

@@ -45,7 +45,7 @@ def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | N
         elif tries > 0:
             tries -= 1
         else:
-            wrong = _last(wrong)
+            wrong = torch.zeros_like(wrong).index_fill(0, wrong.nonzero()[-1], True)
         working = working ^ wrong
     return None
 
@@ -79,9 +79,3 @@ def _on(S: Tensor, b: Tensor, working: Tensor) -> Tensor:
         L, _ = torch.linalg.cholesky_ex(S[rows][:, rows])
         lam[rows] = torch.cholesky_solve(b[rows].unsqueeze(-1), L).squeeze(-1)
     return lam
-
-
-def _last(wrong: Tensor) -> Tensor:
-    only = torch.zeros_like(wrong)
-    only[wrong.nonzero()[-1]] = True
-    return only

@@ -79,7 +79,9 @@ class Polish:
         Raises:
             InputError: a problem that isn't float64, or a solution of other problems.
         """
-        self.check(problem)
+        problem = current_problem(problem)
+        if problem.x0.dtype != torch.float64:  # whose rounding exceeds any useful tolerance
+            raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
         if not isinstance(solution, Solution):
             raise InputError("solution", "a Solution", type(solution).__name__)
         problem.check_controls(solution.U, "solution.U")
@@ -98,12 +100,6 @@ class Polish:
                 put(result, rows, after)
             result.iterations[rows] = before.iterations + steps
         return replace(result, trace=solution.trace, search=solution.search, account=solution.account)
-
-    def check(self, problem: Problem) -> None:
-        """Raise InputError for a problem that isn't float64: its rounding exceeds any useful tolerance."""
-        problem = current_problem(problem)
-        if problem.x0.dtype != torch.float64:
-            raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
 
     def _polished(self, problem: Problem, solution: Solution) -> tuple[Solution, int]:
         """The solution of one problem, `solution` itself if nothing better was found; and the number of steps."""

@@ -11,17 +11,16 @@ from typing import ClassVar, Literal
 
 import torch
 
-from torchgco.base.options import Count, Natural, check_options
+from torchgco.base.options import Count, Natural
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
 from torchgco.kernels import cost_unit
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import goal_tolerance
-from torchgco.lagrangian.state import SolveEnd
 from torchgco.problem.problem import Problem
-from torchgco.search.attempts import Search
 from torchgco.search.proposals import WHEN
-from torchgco.search.row import Row
+from torchgco.search.search import Search
+from torchgco.search.table import Row
 from torchgco.solvers.caught import StopWhenCaught
 
 ATTRACTED_TO = 0.95  # share of the goal tolerance to which trajectories are attracted
@@ -49,8 +48,7 @@ class Solve(Row):
     among: Literal["pathless", "all"] = "all"
     single_contact_after: Count | None = None
 
-    def __post_init__(self) -> None:
-        check_options(self, "solve")
+    label: ClassVar[str] = "solve"
 
     @property
     def problems(self) -> str:
@@ -71,8 +69,6 @@ class Solve(Row):
         stop = StopWhenCaught(self.single_contact_after) if self.until == "caught" and search.guided else None
         if not search.begun:
             search.begin(search.solver.outer_loop(search.call, stop, recorder=search.recorder, by_arrival=True))
-            if search.record is not None:
-                search.record.passes[-1][2].extend(search.call.rows.tolist())
         elif search.guided:
             self._again(search, stop)
 
@@ -83,7 +79,7 @@ class Solve(Row):
             done = done | (caught.status == Status.CONVERGED)
         rows = (~done).nonzero().flatten()
         if rows.numel() > 0:
-            again: SolveEnd = best.attempt(search.call.take(rows), stop)
+            again = best.attempt(search.call.take(rows), guidance=stop)
             best.keep(rows, again)
             put(caught, rows, again)
 
@@ -95,15 +91,15 @@ class FromProposal(Row):
     The penalty of a rejected proposal is kept: it keeps the solver from returning to the caught trajectory.
     """
 
-    problems: ClassVar[str] = "with a proposal"  # type: ignore[misc]
-    does: ClassVar[str] = "AL-iLQR from there"  # type: ignore[misc]
+    problems: ClassVar[str] = "with a proposal"
+    does: ClassVar[str] = "AL-iLQR from there"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
-        over = search.take_round()
-        if over is None:
+        if search.round is None:
             return
-        rows, proposal, best = over[0], over[1].result(), search.best
+        (rows, begun), search.round, best = search.round, None, search.best
+        proposal = begun.result()
         best.end.iterations[rows] += proposal.iterations
         mu = torch.fmax(search.caught.last.multipliers.mu[rows], proposal.multipliers.mu)
         found, others = proposal.found.nonzero().flatten(), (~proposal.found).nonzero().flatten()
@@ -132,10 +128,8 @@ class IntoGoal(Row):
         where = ", where no path can be sought" if self.among == "pathless" else ""
         return f"caught, close to the goal, not arrived{where}"
 
-    does: ClassVar[str] = "AL-iLQR with the end attracted to the goal"  # type: ignore[misc]
-
-    def __post_init__(self) -> None:
-        check_options(self, "into_goal")
+    label: ClassVar[str] = "into_goal"
+    does: ClassVar[str] = "AL-iLQR with the end attracted to the goal"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
@@ -167,8 +161,7 @@ class FromSamples(Row):
     when: Literal["caught", "unarrived", "unproposed"] = "unarrived"
     redraws: Natural = 0
 
-    def __post_init__(self) -> None:
-        check_options(self, "samples")
+    label: ClassVar[str] = "samples"
 
     @property
     def problems(self) -> str:

@@ -1,0 +1,118 @@
+"""The best trajectory of each problem of a call among several attempts at it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.status import STOPPED
+from torchgco.base.tree import copied, put, take
+from torchgco.kernels import chord_clearance
+from torchgco.lagrangian.quality import arrive_alike, has_arrived, is_preferred
+from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.problem.problem import Problem
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.contracts import Call, Callback, Progress
+from torchgco.solvers.history import Recorder
+
+
+class Best:
+    """Keeps the best trajectory of each problem and the sums of all counts, during one solve."""
+
+    def __init__(
+        self, call: Call, first: SolveEnd, solver: AugmentedLagrangian, recorder: Recorder | None = None
+    ) -> None:
+        self.call, self.solver, self.recorder = call, solver, recorder
+        self.end = copied(first)
+        self.worked = torch.ones_like(call.ids, dtype=torch.bool)  # (B,): on which problems the present pass has
+        self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that a cheaper one has replaced
+        self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
+        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced
+
+    def of(self, rows: Tensor) -> SolveEnd:
+        """How the best attempts of problems `rows` (b,), ascending, have ended: to be read, not to be kept."""
+        return self.end if rows.numel() == self.call.problem.B else take(self.end, rows)
+
+    def arrived(self, tolerances: float = 1.0) -> Tensor:
+        """Whether each problem's best trajectory is feasible and ends within `tolerances` goal tolerances, (B,)."""
+        if tolerances not in self._arrived:
+            best = self.end.best
+            fits = best.violation <= self.solver.violation_tolerance
+            self._arrived[tolerances] = fits & has_arrived(self.call.problem, best.X, tolerances)
+        return self._arrived[tolerances]
+
+    def next_attempt(self) -> None:
+        """Count attempts in the trace, also those that no problem of this batch needs."""
+        if self.recorder is not None:
+            self.recorder.attempt += 1
+
+    def improve(self, rows: Tensor, call: Call, **how: Any) -> None:
+        """One more `attempt` at the problems in `rows`, by a call for them; the better trajectory is kept."""
+        if rows.numel() > 0:
+            self.keep(rows, self.attempt(call, **how))
+
+    def attempt(self, call: Call, **how: Any) -> SolveEnd:
+        """A solve with progress and trace of the whole, by further arguments of `AugmentedLagrangian.outer_loop`."""
+        call = replace(call, callback=self._callback(call))
+        return self.solver.outer_loop(call, recorder=self.recorder, by_arrival=True, **how)
+
+    def keep(self, rows: Tensor, new: SolveEnd) -> None:
+        """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""
+        problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
+        old = self.of(rows)
+        preferred = is_preferred(problem, new.best, old.best, limit)
+        self._spare(problem, rows, preferred, old, new)
+        self.replace(rows, preferred, new.best, new)
+
+    def _spare(self, problem: Problem, rows: Tensor, preferred: Tensor, old: SolveEnd, new: SolveEnd) -> None:
+        """Remember those of two trajectories that lose by their cost alone to one that touches between two knots."""
+        limit = self.solver.violation_tolerance
+        fits = (old.best.violation <= limit) & (new.best.violation <= limit)
+        if not bool(fits.any()):
+            return
+        fits &= arrive_alike(problem, new.best.X, old.best.X)
+        if not bool(fits.any()):
+            return
+        before, now = (chord_clearance(problem, end.best.X) >= 0 for end in (old, new))
+        for at in (fits & (before != now) & (before == preferred)).nonzero().flatten():
+            one = take(old if bool(preferred[at]) else new, at.unsqueeze(0))
+            kept = self.spare.setdefault(int(rows[at]), one)
+            if bool(one.best.cost < kept.best.cost):
+                self.spare[int(rows[at])] = one
+
+    def restore(self, rows: Tensor, touching: Tensor) -> None:
+        """Take back the clear trajectories that cheaper ones of `rows` have replaced.
+
+        That is where these are still `touching` an obstacle, (b,) bool, or have become more expensive by keeping clear.
+        """
+        for row, touches in zip(rows.tolist(), touching.tolist(), strict=True):
+            one = self.spare.pop(row, None)
+            if one is not None and (touches or bool(one.best.cost < self.end.best.cost[row])):
+                put(self.end.best, rows.new_tensor([row]), one.best)
+                self.end.status[row] = one.status
+
+    def replace(self, rows: Tensor, where: Tensor, trajectories: Iterate, new: SolveEnd) -> None:
+        """New trajectories of `rows` where a mask (b,) says so, and the counts of their solves."""
+        self.worked[rows] = True
+        chosen = where.nonzero().flatten()
+        if chosen.numel() > 0:
+            self._arrived.clear()
+            put(self.end.best, rows[chosen], take(trajectories, chosen))
+            self.end.status[rows[chosen]] = new.status[chosen]
+        for name in ("iterations", "outer", "guided"):
+            getattr(self.end, name)[rows] += getattr(new, name)
+
+    def _callback(self, call: Call) -> Callback | None:
+        """Reports an attempt's progress as the batch's, where all other problems have finished; it never falls."""
+        if call.callback is None:
+            return None
+        report, total = call.callback, self.call.problem.B
+
+        def onward(now: Progress) -> None:
+            self.finished = max(self.finished, total - now.total + now.finished)
+            report(replace(now, finished=self.finished, total=total))
+
+        return onward
