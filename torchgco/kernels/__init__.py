@@ -1,4 +1,4 @@
-"""What solvers compute with: one interface (`base.Kernels`), in C and in PyTorch, chosen once per form of problems."""
+"""What solvers compute with: in PyTorch (`in_pytorch.Kernels`) and in C, chosen once per form of problems."""
 
 from torchgco.kernels.choice import EagerWarning as EagerWarning
 from torchgco.kernels.choice import current as current

@@ -10,9 +10,8 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import is_forward
-from torchgco.kernels.base import Kernels
 from torchgco.kernels.in_c import NativeKernels
-from torchgco.kernels.in_pytorch import TorchKernels
+from torchgco.kernels.in_pytorch import Kernels
 from torchgco.kernels.switch import native
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
@@ -58,7 +57,7 @@ def kernels_of(problem: Problem) -> Kernels:
             return known.in_c
     if known.in_pytorch is None:
         _check_eager(problem)
-        known.in_pytorch = TorchKernels()
+        known.in_pytorch = Kernels()
     return known.in_pytorch
 
 
@@ -90,7 +89,7 @@ def _warn(warned: set[str], error: Exception) -> None:
 
 def used(problem: Problem) -> str:
     """The name of the kernels that have worked on problems of this form."""
-    return NativeKernels.name if problem.known.in_c and native() else TorchKernels.name
+    return NativeKernels.name if problem.known.in_c and native() else Kernels.name
 
 
 def expect_interior(problem: Problem) -> None:

@@ -17,11 +17,9 @@ from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.line_search import Rollouts
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import keep_lifted
-from torchgco.kernels.base import InteriorKernels
-from torchgco.kernels.in_pytorch import TorchKernels, clearance_of
+from torchgco.kernels.in_pytorch import InteriorKernels, Kernels, clearance_of
 from torchgco.kernels.outer import NativeOuter
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
@@ -36,8 +34,8 @@ AMPLIFIED = 1e6  # times CONTROL_NUDGE: where the states change by less, differe
 ITERATED = "X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"
 
 
-class NativeKernels:
-    """See `kernels.base.Kernels`.
+class NativeKernels(Kernels):
+    """See `Kernels`.
 
     Args:
         engine: the library of the problems' form.
@@ -49,12 +47,8 @@ class NativeKernels:
     compiled = True
 
     def __init__(self, engine: Engine, B: int, warn: Callable[[Exception], None]) -> None:
-        self.engine, self.B, self._warn = engine, B, warn
+        self.engine, self.B, self._warn, self.affine = engine, B, warn, engine.model.affine
         self._samplers: dict[Hashable, Sampler] = {}
-
-    @property
-    def affine(self) -> bool:
-        return self.engine.model.affine
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         return self.engine.open_loop(problem, U)
@@ -73,7 +67,7 @@ class NativeKernels:
     def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
         if self.engine.measures:
             return self.engine.violation(problem, X, U, obstacles)
-        return violation(problem.geometric if obstacles else problem.constraints, X, U)
+        return super().violation(problem, X, U, obstacles)
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float) -> Tensor:
         parts = [c.bare for c in problem.constraints]
@@ -125,7 +119,7 @@ class NativeKernels:
             return InteriorEngine(self.engine, self.B)
         except InputError as error:  # second derivatives whose code would be too long
             self._warn(error)
-            return TorchKernels().interior(problem)
+            return super().interior(problem)
 
     def sample(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
         if how.dtype not in self._samplers:  # compiled at the first call: most solves never sample

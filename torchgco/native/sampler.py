@@ -28,7 +28,7 @@ class Sampler:
         self.library = engine.further(dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]))
 
     def improve(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
-        """See `kernels.base.Kernels.sample`."""
+        """See `kernels.in_pytorch.Kernels.sample`."""
         mean = U.clone(memory_format=torch.contiguous_format)
         rounds = _structure(problem, how)
         rounds.of = self.engine.packed(problem, X=problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1))

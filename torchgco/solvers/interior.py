@@ -22,7 +22,7 @@ from torchgco.kernels import (
     measured,
     open_loop,
 )
-from torchgco.kernels.base import InteriorKernels
+from torchgco.kernels.in_pytorch import InteriorKernels
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
