@@ -125,11 +125,6 @@ def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: 
     H[:, knots, at, at] += hessian
 
 
-def innermost(constraint: Constraint) -> Constraint:
-    """The constraint within all that wraps it."""
-    return innermost(constraint.constraint) if isinstance(constraint, WrappedConstraint) else constraint
-
-
 def count_of(index: slice | Tensor, of: int) -> int:
     """How many of `of` things a slice or indices take."""
     return len(range(of)[index]) if isinstance(index, slice) else len(index)

@@ -241,6 +241,12 @@ class RateBounds(_Bounds):
         every = torch.arange(self.upper.shape[-1], device=self.upper.device)
         return torch.cat((every[self.above], every[self.below])).unique()
 
+    @property
+    def before(self) -> Tensor:
+        """The bounded controls of the stage before the first, (B|1, r), in a solver: 0 where they are free."""
+        every = self.upper.new_zeros(1, self.upper.shape[-1]) if self.previous is None else self.previous
+        return every[:, self.controls]
+
     def with_states_from(self, first: int) -> Self:
         """The same rows for a solver's states, of which those from `first` on are the bounded controls of k - 1."""
         states = torch.zeros(self.upper.shape[-1], dtype=torch.int64, device=self.upper.device)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
-from torchgco.constraints.base import Constraint, innermost, whole
+from torchgco.constraints.base import Constraint, whole
 from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
 
 
@@ -199,7 +199,7 @@ def has_gates(problem: Any) -> bool:
 
 def gates_of(problem: Any) -> GateBalls | GateSquares | None:
     """The first gates that a trajectory has to pass; None where there are none."""
-    bare = (innermost(part) for part in problem.constraints)
+    bare = (part.bare for part in problem.constraints)
     return next((part for part in bare if isinstance(part, GateBalls | GateSquares)), None)
 
 

@@ -16,12 +16,11 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
-from torchgco.constraints.base import Constraint, WrappedConstraint, innermost
+from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.norms import NormBounds
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
-from torchgco.native.codegen.body import trace_lift
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
@@ -69,7 +68,7 @@ class Engine:
         self.cost = trace_cost(problem) if quadratic is None else None
         parts = problem.constraints
         traced = (i for i, part in enumerate(parts) if is_lifted(part) or kind_of(part) is Kind.FUNCTION)
-        sources = ((i, trace_lift(problem, i) if is_lifted(parts[i]) else trace_rows(problem, i)) for i in traced)
+        sources = ((i, trace_rows(problem, i)) for i in traced)
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
         self.measures = all(kind_of(part) is not Kind.FUNCTION or _measured(part) for part in parts)
@@ -386,7 +385,7 @@ os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child has none of 
 def _measured(part: Constraint) -> bool:
     """Whether violations are what the base class says of rows, or C finds them from these."""
     if part.row_radii is not None:
-        return type(innermost(part)).violation in (NormBounds.violation, SpheresInFreeTime.violation)
+        return type(part.bare).violation in (NormBounds.violation, SpheresInFreeTime.violation)
     while isinstance(part, WrappedConstraint) and part.keeps_rows:
         part = part.constraint
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of
+from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of
 from torchgco.constraints.base import Constraint, add_at, resolve_knots
 from torchgco.obstacles.base import TOUCH, OwnKind, Solids, least, picked
 from torchgco.obstacles.body import Body
-from torchgco.obstacles.inputs import own_radii, per_problem, points, vehicle_radii
+from torchgco.obstacles.inputs import own_radii, points, vehicle_radii
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ class Spheres(Constraint):
         vehicle = vehicle_radii(self.vehicle_radius, "obstacles.vehicle_radius", dims)
         velocities = None
         if self.velocities is not None:
-            velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
-            check_shape(velocities, tuple(centers.shape), "obstacles.velocities")
+            velocities = per_row(self.velocities, "obstacles.velocities", dims, *centers.shape[1:])
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
             check_finite(velocities, "obstacles.velocities", "finite velocities of every sphere")
             if dims.dt is None:

@@ -20,7 +20,7 @@ from torchgco.base.errors import InputError, theirs
 from torchgco.base.mixing import why
 from torchgco.base.shapes import MISTAKES, Dimensions, describe
 from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint, FunctionConstraint, innermost
+from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import check_names
@@ -242,7 +242,7 @@ def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint
     if is_users(cost):
         _called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
     for i, constraint in enumerate(constraints):
-        if is_users(constraint) and type(innermost(constraint)).accumulate is not Constraint.accumulate:
+        if is_users(constraint) and type(constraint.bare).accumulate is not Constraint.accumulate:
             part = constraint.take(first)
             zero = torch.zeros_like(_called(f"constraints[{i}].value", wanted, part.value, X, U))
             _called(f"constraints[{i}].value", wanted, part.accumulate, X, U, zero, zero, _blocks(X, U)[first])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -249,7 +249,7 @@ def _names(expression: Any) -> set[int]:
 
 def _form(function: Any) -> tuple[list[tuple], list[int]]:
     """The instructions of a function (x, u, numbers), its numbers renamed in order of first use, and that order."""
-    reads, holds = _operations()
+    reads, holds = (emit.codes()[name] for name in ("INPUT", "CONST"))
     turn: dict[int, int] = {}
     form: list[tuple] = []
     for i in range(function.n_instructions()):
@@ -259,11 +259,3 @@ def _form(function: Any) -> tuple[list[tuple], list[int]]:
         constant = function.instruction_constant(i) if operation == holds else 0.0
         form.append((operation, read, tuple(function.instruction_output(i)), np.float64(constant).tobytes()))
     return form, list(turn)
-
-
-@cache
-def _operations() -> tuple[int, int]:
-    """CasADi's numbers for reading an input and for a constant."""
-    import casadi
-
-    return casadi.OP_INPUT, casadi.OP_CONST

@@ -13,7 +13,7 @@ from typing import Any
 from torchgco.native.codegen.cost import CostSource
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource
-from torchgco.native.codegen.emit import PRELUDE, literal
+from torchgco.native.codegen.emit import PRELUDE, literal, switch
 from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes
 from torchgco.native.declarations import defines, head
@@ -199,16 +199,11 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
             slopes.append(f"        *columns = {name}_columns; return {name}_count;")
         else:
             adds.append(f"    case {i}: {name}_add(x, u, p, w, by_c, by_cc, g, H); break;")
+    given = "int i, const V *x, const V *u, const V *p, const double *w"
     return "\n".join(
-        [
-            "static inline void tgco_rows(int i, const V *x, const V *u, const V *p, const double *w, V *c) {",
-            "    switch (i) {", *values, "    }", "}",
-            "static inline void tgco_add_rows(",
-            "    int i, const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc,",
-            "    V *g, V *H) {",
-            "    switch (i) {", *adds, "    }", "}",
-            "static inline int tgco_slopes(",
-            "    int i, const V *x, const V *u, const V *p, const double *w, V *e, const int **columns) {",
-            "    switch (i) {", *slopes, "    }", "    return 0;", "}",
-        ]
-    )  # fmt: skip
+        (
+            switch(f"void tgco_rows({given}, V *c)", values),
+            switch(f"void tgco_add_rows(\n    {given}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
+            switch(f"int tgco_slopes(\n    {given}, V *e, const int **columns)", slopes, "    return 0;"),
+        )
+    )
