@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from tests.engines import engine_of
+from tests.engines import in_c
 from tests.native import changes
 from tests.native.changes import CODE, INPUTS, D, Drag, number
 from torchgco import FunctionDynamics, Problem, QuadraticCost
@@ -36,9 +36,9 @@ def usual() -> Any:
 def after(problem: Problem) -> tuple[Tensor, bool]:
     """The states of a rollout in C as of a solve's, which are those of PyTorch, and whether a trace was kept for it."""
     fresh = current(problem)
-    engine = engine_of(fresh)
-    assert engine is not None
-    found = engine.open_loop(fresh, U)
+    kernels = in_c(fresh)
+    assert kernels is not None
+    found, engine = kernels.open_loop(fresh, U), kernels.engine
     return found, any(engine.captured is kept.captured for kept, _ in choice._engines.values())
 
 
@@ -121,9 +121,11 @@ def test_what_is_kept_holds_no_numbers_of_problems() -> None:
 
     for drag in (0.2, 2.0):
         problem = given(drag)
-        engine = engine_of(current(problem))
-        assert engine is not None and engine.captured is [*choice._engines.values()][-1][0].captured
-        found = engine.open_loop(problem, U.repeat(B, 1, 1))
+        kernels = in_c(current(problem))
+        assert kernels is not None
+        engine = kernels.engine
+        assert engine.captured is [*choice._engines.values()][-1][0].captured
+        found = kernels.open_loop(problem, U.repeat(B, 1, 1))
         expected = by_pytorch(problem.dynamics, problem.x0, U.repeat(B, 1, 1)).detach()
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
         held = [tensor for traced in engine.captured.traces for tensor in traced._captured.values()]

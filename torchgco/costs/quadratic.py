@@ -221,10 +221,14 @@ def check_semidefinite(Q: Tensor, R: Tensor, Qf: Tensor, H: Tensor | None) -> No
         blocks["H"] = torch.cat((torch.cat((Q, H.mT), -1), torch.cat((H, R), -1)), -2)
     for field, W in blocks.items():
         check_finite(W, f"cost.{field}")
-        scale = float(W.abs().max()) if W.numel() else 0.0
-        if float((W - W.mT).abs().max()) > 1e-9 * max(scale, 1.0):
-            raise InputError(f"cost.{field}", "a symmetric matrix", "an unsymmetric one")
-        lowest = float(torch.linalg.eigvalsh(W).min())
-        if lowest < -1e-9 * max(scale, 1.0):
-            what = "a weight [[Q, H'], [H, R]]" if field == "H" else "a weight"
-            raise InputError(f"cost.{field}", f"{what} that is positive semidefinite", f"an eigenvalue of {lowest:.3g}")
+        if (wrong := unfit(W, "a weight [[Q, H'], [H, R]]" if field == "H" else "a weight")) is not None:
+            raise InputError(f"cost.{field}", *wrong)
+
+
+def unfit(W: Tensor, what: str = "a weight") -> tuple[str, str] | None:
+    """What is wrong with finite matrices (..., n, n) as weights, (expected, got); None: nothing."""
+    rounding = 1e-9 * max(float(W.abs().max()) if W.numel() else 0.0, 1.0)
+    if float((W - W.mT).abs().max()) > rounding:
+        return "a symmetric matrix", "an unsymmetric one"
+    lowest = float(torch.linalg.eigvalsh(W).min())
+    return (f"{what} that is positive semidefinite", f"an eigenvalue of {lowest:.3g}") if lowest < -rounding else None

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.status import Status
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.norms import NormBounds
 from torchgco.costs.quadratic import BoundQuadratic
@@ -120,116 +119,8 @@ class Engine:
         functions = self.functions.items()
         return found + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
 
-    def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
-        """X (B, N+1, n) from U (B, N, m)."""
-        X = U.new_empty(problem.B, problem.N + 1, problem.n)
-        X[:, 0] = problem.x0
-        self._run("tgco_open_loop", problem.B, self._rolled(problem, X=X, U=U.contiguous()))
-        return X
-
-    def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, G: Tensor) -> tuple[Tensor, Tensor]:
-        """X and U of a rollout of U + K (x - X) from the first knots of X; G = [K d] (B, N, m, n+1), d isn't used."""
-        X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
-        self._run("tgco_closed_loop", problem.B, self._rolled(problem, X=X, U=U, gains=G.contiguous()))
-        return X, U
-
-    def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-        """J_var (B,) and L_M (B,) of trajectories."""
-        B = lagrangian.problem.B
-        cost, merit = X.new_empty(B), X.new_empty(B)
-        packed = self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=cost, merit=merit)
-        self._run("tgco_value", B, packed)
-        return cost, merit
-
-    def gains(
-        self, lagrangian: Lagrangian, X: Tensor, U: Tensor, mu_r: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gains G = [K d] (B, N, m, n+1) for J_var + lam'c, the two sums of its expected change, (B,) each, and where
-        the backward pass failed, (B,) bool; mu_r (B,) is the regularisation.
-        """
-        problem = lagrangian.problem
-        G, status = X.new_empty(problem.B, problem.N, problem.m, problem.n + 1), _flags(problem.B)
-        linear, quadratic = torch.zeros_like(mu_r), torch.zeros_like(mu_r)
-        packed = self.terms(
-            lagrangian, X=X.contiguous(), U=U.contiguous(), regularisation=mu_r.contiguous(), cost=linear,
-            merit=quadratic, gains=G, status=status, optimality=True,
-        )  # fmt: skip
-        self._run("tgco_gains", problem.B, packed)
-        return G, linear, quadratic, status != Status.RUNNING
-
-    def expand(
-        self, problem: Problem, X: Tensor, U: Tensor, lagrangian: Lagrangian | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M; of J_var without a Lagrangian.
-
-        Only the upper triangles of the Hessians are filled.
-        """
-        B, N, size = problem.B, problem.N, problem.n + problem.m
-        slopes, H, none = X.new_empty(B, N + 1, size), X.new_empty(B, N + 1, size, size), X.new_zeros(B)
-        values = {"X": X.contiguous(), "U": U.contiguous(), "cost": none, "merit": none}
-        if lagrangian is None:
-            packed = self.packed(problem, **values, mu=none, constraints=0)
-        else:
-            packed = self.terms(lagrangian, None, **values)
-        packed.slopes, packed.curvatures = slopes, H
-        self._run("tgco_expand", B, packed)
-        return slopes, H
-
-    def lift(self, lagrangian: Lagrangian, state: dict[str, Tensor], rounds: int, gain: float) -> Tensor:
-        """Up to `rounds` steps in states and controls together, in place in `state`; where one gave a better rollout.
-
-        Args:
-            state: X, U, cost, merit, all contiguous.
-            gain: share of L_M by which a rollout must lower it.
-        """
-        B = lagrangian.problem.B
-        found, mu_r = _flags(B), torch.zeros_like(state["merit"])
-        packed = self.terms(lagrangian, None, **state, converged=found, regularisation=mu_r, limit=rounds, gain=gain)
-        self._run("tgco_lift", B, packed)
-        return found != 0
-
-    def inner_solve(
-        self, lagrangian: Lagrangian, state: dict[str, Tensor], options: c.Options, limit: int
-    ) -> dict[str, Tensor]:
-        """Up to `limit` iterations of every problem's inner solve, in place in `state`.
-
-        Args:
-            state: X, U, cost, merit, regularisation; inner, iterations, rung (int64): all contiguous.
-
-        Returns:
-            status, a `Status` or `End`; converged, refused, lost (int32); alpha and used: step length and mu_r of the
-            last iteration.
-        """
-        B = lagrangian.problem.B
-        out = {name: _flags(B) for name in ("status", "converged", "refused", "lost")}
-        out |= {name: torch.zeros(B, dtype=torch.float64) for name in ("alpha", "used")}
-        packed = self.terms(lagrangian, None, **state, **out, options=options, limit=limit, replicas=replicas_of(B))
-        self._run("tgco_ilqr", B, packed)
-        return out
-
-    def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
-        """The largest violation (B,) of trajectories, of problems that the library `measures`; of obstacles alone?"""
-        worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
-        self._run(name, problem.B, self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
-        return worst
-
-    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
-        """`Lagrangian.slack`, (B,)."""
-        B, found = lagrangian.problem.B, X.new_zeros(lagrangian.problem.B)
-        self._run("tgco_slack", B, self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=found, merit=found))
-        return found
-
-    def chords(self, problem: Problem, X: Tensor, scale: float) -> Tensor:
-        """The smallest distance (B,) of the lines between knots from spheres with radii times `scale`; or infinity."""
-        U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
-        self._run("tgco_chords", problem.B, self.packed(problem, X=X.contiguous(), U=U, merit=least, gain=scale))
-        return least
-
-    def outer_loop(self, outer: c.Outer, B: int) -> None:
-        """Passes of the outer loop, in place in the tensors that `outer` names."""
-        run(self.library.tgco_outer, B, LANES, outer)
-
-    def _run(self, name: str, B: int, packed: c.Problem) -> None:
+    def run(self, name: str, B: int, packed: c.Problem) -> None:
+        """Call a function of the library on B problems."""
         run(getattr(self.library, name), B, LANES, packed)
 
     def packed(self, problem: Problem, **values: Any) -> c.Problem:
@@ -239,7 +130,7 @@ class Engine:
         packed.fill(values)
         return packed
 
-    def _rolled(self, problem: Problem, **values: Any) -> c.Problem:
+    def rolled(self, problem: Problem, **values: Any) -> c.Problem:
         """The model alone, and further fields: what rollouts read. Many problems are rolled out and not solved."""
         packed = self._model(problem).copy()
         packed.fill(values)
@@ -389,7 +280,3 @@ def _measured(part: Constraint) -> bool:
     while isinstance(part, WrappedConstraint) and part.keeps_rows:
         part = part.constraint
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
-
-
-def _flags(B: int) -> Tensor:
-    return torch.zeros(B, dtype=torch.int32)
