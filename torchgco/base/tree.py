@@ -37,7 +37,7 @@ class PerElement(Brief):
 
 
 def passed_on(part: str, *names: str) -> tuple[Any, ...]:
-    """Properties that are those of a part: `knots, dt = passed_on("inner", "knots", "dt")`."""
+    """Properties and methods that are those of a part: `knots, dt = passed_on("inner", "knots", "dt")`."""
     return tuple(property(lambda self, name=name: getattr(getattr(self, part), name)) for name in names)
 
 

@@ -6,6 +6,7 @@ stages stays shared.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -172,6 +173,20 @@ def as_floats(value: Any, name: str) -> Floats:
         raise InputError(name, "numbers", type(value).__name__) from None
 
 
+def measured(x: Any, B: int, n: int) -> Floats:
+    """States (B, n), or (n,) of all vehicles.
+
+    Raises:
+        InputError: another shape, no numbers, NaN or infinity.
+    """
+    state = as_floats(x, "x")
+    if state.shape not in ((B, n), (n,)):
+        raise InputError("x", f"shape ({B}, {n}), or ({n},) for all vehicles", state.shape)
+    if not math.isfinite(state.sum()) and not np.isfinite(state).all():  # a sum takes a third of the time
+        raise InputError("x", "finite states", "NaN or infinity")
+    return state
+
+
 def with_own_numbers(problem: Problem) -> Problem:
     """The same problems, with memory of its own for every number of every problem."""
     B = problem.B
@@ -244,24 +259,13 @@ def numbers(
 
 def with_numbers_as_they_are(problem: Problem) -> Problem:
     """The same problems after numbers were written, with nothing that was computed from the previous ones."""
-    constraints = tuple(_renewed(part) for part in problem.constraints)
-    known = replace(problem.known, row_shapes=None, interior=None, packed={}, cost=(None, 0, None), lifted={})
+    constraints = tuple(c.remade() if isinstance(c, BoundSpheres) else c for c in problem.constraints)
+    known = replace(problem.known, row_shapes=None, interior=None, packed={}, lifted={})
     now = problem._with({"constraints": constraints}, known)
     if now.goal is None or now.goal.assumed:
         dims = now._dimensions(now.x0)
         now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, known)
     return now
-
-
-def _renewed(part: Any) -> Any:
-    """A part of a problem with what was derived from its numbers made again."""
-    if not isinstance(part, BoundSpheres):
-        return part
-    made = BoundSpheres.prepare(
-        part.centers, part.inflated_radii, part.velocities, part.absent, part.vehicle_radius, part.knots,
-        part.position, part.dt,
-    )  # fmt: skip
-    return replace(made, stops=part.stops)
 
 
 def _own(part: Any, B: int) -> Any:

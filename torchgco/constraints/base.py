@@ -108,14 +108,11 @@ class WrappedConstraint(Constraint):
     keeps_rows: ClassVar[bool] = False  # whether rows, and by how much they are violated, are those of the other one
 
     sense, geometric, knots = passed_on("constraint", "sense", "geometric", "knots")
-    bare, row_radii = passed_on("constraint", "bare", "row_radii")
+    bare, row_radii, start_is_clear = passed_on("constraint", "bare", "row_radii", "start_is_clear")
     calls_function = property(lambda self: is_users(self.constraint))
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, constraint=self.constraint.grown(by))
-
-    def start_is_clear(self, x0: Tensor) -> Tensor:
-        return self.constraint.start_is_clear(x0)
 
 
 def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:

@@ -73,7 +73,10 @@ class Engine:
         self.measures = all(kind_of(part) is not Kind.FUNCTION or _measured(part) for part in parts)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
         self.captured = Captured(self.model, self.cost, self.functions)
-        self.shared = self._first_shared()
+        first = self.captured.read()
+        if first is None:  # changed since the functions were traced, by another thread
+            raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
+        self.shared = first
         lifted = frozenset(i for i in self.functions if is_lifted(parts[i]))
         self.form = Form(self.model, at, self.cost, dense, functions, lifted)
         if ahead is not None:
@@ -98,12 +101,6 @@ class Engine:
         other = copy(self)
         other.shared = shared
         return other
-
-    def _first_shared(self) -> Shared:
-        found = self.captured.read()
-        if found is None:  # changed since the functions were traced, by another thread
-            raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
-        return found
 
     def computes_as(self, other: Engine, problem: Problem) -> bool:
         """Whether another engine computes the same for `problem`."""
@@ -172,49 +169,41 @@ class Engine:
         return vars(problem)["packed"]
 
     def _model(self, problem: Problem) -> c.Problem:
-        """The model's part of it; that of the last problem where this one has the same dynamics."""
+        """The model's part of it."""
         if problem.one is not None:
             return self._model(problem.one)
         if "model_packed" not in vars(problem):
-            known, B, packed = problem.known.model
-            if known is not problem.dynamics or B != problem.B:  # what problems share stays the same object in a subset
-                packed = c.Problem(N=problem.N, **shared_fields(self.shared))
-                if self.model.count > 0 and problem.B > 0:
-                    numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
-                    packed.parameters = array(numbers, knots=True)
-                problem.known.model = problem.dynamics, problem.B, packed
+            packed = _of_last(problem, "dynamics", problem.dynamics, lambda: self._model_made(problem))
             object.__setattr__(problem, "model_packed", packed)
         return vars(problem)["model_packed"]
+
+    def _model_made(self, problem: Problem) -> c.Problem:
+        packed = c.Problem(N=problem.N, **shared_fields(self.shared))
+        if self.model.count > 0 and problem.B > 0:
+            numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
+            packed.parameters = array(numbers, knots=True)
+        return packed
 
     def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
-        rows, packed = self._constraints(problem), self._model(problem).copy()
+        rows = [self._row(problem, i) for i in range(len(problem.constraints))]
+        packed = self._model(problem).copy()
         packed.constraints, packed.constraint = len(rows), rows
-        packed.cost_data, packed.bounded = self._cost(problem)
+        packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, lambda: self._cost_made(problem))
         return packed, rows
 
-    def _cost(self, problem: Problem) -> tuple[list[c.Array], int]:
-        """The cost's arrays, and whether it is `bounded`; those of the last problem where this one has the same."""
-        known, B, own = problem.known.cost
-        if known is not problem.cost or B != problem.B:
-            if self.cost is None:
-                own = quadratic_arrays(problem.cost), int(is_bounded(problem.cost))
-            else:
-                own = cost_arrays(problem, self.cost, self.shared.cost), 0
-            problem.known.cost = problem.cost, problem.B, own
-        return own
+    def _cost_made(self, problem: Problem) -> tuple[list[c.Array], int]:
+        """The cost's arrays, and whether it is `bounded`."""
+        if self.cost is None:
+            return quadratic_arrays(problem.cost), int(is_bounded(problem.cost))
+        return cost_arrays(problem, self.cost, self.shared.cost), 0
 
-    def _constraints(self, problem: Problem) -> list[c.Constraint]:
-        """The rows without multipliers; of each constraint those of the last problem where this one has the same."""
-        packed, rows = problem.known.packed, []
-        for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
-            known, B, row = packed.get(i, (None, 0, None))
-            if known is not constraint or B != problem.B:
-                row = constraint_of(constraint, shape, self.row_numbers(problem, i), problem)
-                packed[i] = constraint, problem.B, row
-            rows.append(row)
-        return rows
+    def _row(self, problem: Problem, i: int) -> c.Constraint:
+        """Constraint i without multipliers."""
+        part, shape = problem.constraints[i], problem.row_shapes[i]
+        make = lambda: constraint_of(part, shape, self.row_numbers(problem, i), problem)
+        return _of_last(problem, i, part, make)
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
         """The fields of a `Constraint` in C that hold the numbers of constraint i."""
@@ -224,6 +213,18 @@ class Engine:
         shared = self.shared.rows[i]
         own = numbers_of(constraint, rows_numbers(problem, i, source, shared), problem)
         return {**own, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
+
+
+def _of_last(problem: Problem, name: str | int, part: Any, make: Callable[[], Any]) -> Any:
+    """What was made of a part for the last problem of the form, where this one has the same part, else made now.
+
+    What problems share stays the same object in a subset.
+    """
+    known, B, made = problem.known.packed.get(name, (None, 0, None))
+    if known is not part or B != problem.B:
+        made = make()
+        problem.known.packed[name] = part, problem.B, made
+    return made
 
 
 def replicas_of(B: int) -> int:

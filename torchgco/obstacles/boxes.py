@@ -57,8 +57,6 @@ class Boxes(Constraint):
     radii: Any = None
     knots: Any = None
 
-    geometric: ClassVar[bool] = True
-
     def bind(self, dims: Dimensions) -> Constraint:
         if isinstance(self.vehicle_radius, Body):
             return self.vehicle_radius.around(self, dims)

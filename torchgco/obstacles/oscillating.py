@@ -39,8 +39,6 @@ class OscillatingBoxes(Constraint):
     rates: Any
     phases: Any
 
-    geometric: ClassVar[bool] = True
-
     def bind(self, dims: Dimensions) -> Constraint:
         if isinstance(self.boxes.vehicle_radius, Body):
             return self.boxes.vehicle_radius.around(self, dims)

@@ -44,8 +44,6 @@ class Spheres(Constraint):
     velocities: Any = None
     knots: Any = None
 
-    geometric: ClassVar[bool] = True
-
     def bind(self, dims: Dimensions) -> Constraint:
         if isinstance(self.vehicle_radius, Body):
             return self.vehicle_radius.around(self, dims)
@@ -171,11 +169,11 @@ class BoundSpheres(OwnKind):
         return replace(self, inflated_radii=radii, vehicle_radius=self.vehicle_radius + by, weights=weights)
 
     def later(self, t: float) -> BoundSpheres:
-        return self if self.velocities is None else self._with(centers=self.centers + t * self.velocities)
+        return self if self.velocities is None else self.remade(centers=self.centers + t * self.velocities)
 
     def paced(self, factor: Tensor) -> BoundSpheres:
         """The same spheres, which move `factor` (B,) times as far from knot to knot."""
-        return self if self.velocities is None else self._with(velocities=factor.view(-1, 1, 1) * self.velocities)
+        return self if self.velocities is None else self.remade(velocities=factor.view(-1, 1, 1) * self.velocities)
 
     def chosen(self, at: Tensor) -> BoundSpheres:
         absent = (at < 0) | picked(self.absent, at)
@@ -184,10 +182,10 @@ class BoundSpheres(OwnKind):
             for part in (self.centers, self.velocities)
         )
         radii = torch.where(absent, 0.0, picked(self.inflated_radii, at))
-        return self._with(centers=centers, inflated_radii=radii, velocities=velocities, absent=absent)
+        return self.remade(centers=centers, inflated_radii=radii, velocities=velocities, absent=absent)
 
-    def _with(self, **changes: Tensor | None) -> BoundSpheres:
-        """The same with other numbers, and the matrices of these."""
+    def remade(self, **changes: Tensor | None) -> BoundSpheres:
+        """The same with other numbers, and matrices of the numbers as they are."""
         names = "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "knots", "position", "dt"
         numbers: dict[str, Any] = {name: getattr(self, name) for name in names} | changes
         return replace(self.prepare(**numbers), stops=self.stops)

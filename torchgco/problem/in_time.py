@@ -324,11 +324,17 @@ def _constraint(constraint: Constraint, problem: Problem) -> Constraint:
                        upper=pad(constraint.upper, (0, 1), value=torch.inf))  # fmt: skip
     if isinstance(constraint, BoundSpheres) and constraint.moving:
         return SpheresInFreeTime(constraint, n)
-    return on_first(constraint, n, m)
+    return on_first(constraint, n, m, _Rows)
+
+
+class _Rows(FirstRows):
+    """Rows of the first states and controls that kernels in C measure, too."""
+
+    keeps_rows: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
-class _Rates(FirstRows):
+class _Rates(_Rows):
     """Bounds on changes of controls from stage to stage, which grow with the length of the stage: tau times these."""
 
     constraint: RateBounds

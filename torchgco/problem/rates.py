@@ -130,13 +130,15 @@ class _OwnTotal(_OwnExpansion):
 
 
 def _constraint(constraint: Constraint, n: int, m: int) -> Constraint:
-    return constraint.with_states_from(n) if isinstance(constraint, RateBounds) else on_first(constraint, n, m)
+    if isinstance(constraint, RateBounds):
+        return constraint.with_states_from(n)
+    return on_first(constraint, n, m, FirstRows)
 
 
-def on_first(constraint: Constraint, n: int, m: int) -> Constraint:
+def on_first(constraint: Constraint, n: int, m: int, kind: type[FirstRows]) -> Constraint:
     """The constraint where further states and controls follow the first n and m."""
     in_place = isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE
-    return constraint if in_place else FirstRows(constraint, n, m)
+    return constraint if in_place else kind(constraint, n, m)
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,6 @@ class FirstRows(WrappedConstraint):
     m: int
 
     batched: ClassVar[tuple[str, ...]] = ("constraint",)
-    keeps_rows: ClassVar[bool] = True
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self.constraint.value(X[..., : self.n], U[..., : self.m])

@@ -135,12 +135,12 @@ def knot_parts(
         function = ca.Function("knot", [*knot.inputs, *made], [knot.rows, *(call.inputs for call in knot.calls)])
         form = span.n, span.m, *_form(function), *(NetSource(call.net, 0).key for call in knot.calls)
         name = store.key_of((kind, str(form), *makers(__file__, *files)))[:16]
-        return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "places": places}
+        return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "numbers_at": places}
 
     key = kind, shape, span.traced.fingerprint(), *makers(__file__, *files)
     _, parts = store.made(key, make, f"{kind} {shape} {span.traced.kin}")
     emit.checked(span.traced.field, parts["code"])
-    places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
+    places = torch.tensor(parts["numbers_at"], dtype=torch.int64).reshape(len(parts["numbers_at"]), -1)
     return KnotSource(parts["code"], parts["name"], parts["size"], places, span), parts
 
 
