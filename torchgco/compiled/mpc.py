@@ -16,8 +16,7 @@ from torchgco.base.status import Status
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Answer, Compiled, compile
 from torchgco.compiled.numbers import Numbers, measured
 from torchgco.compiled.plan import Plan
-from torchgco.compiled.stages import check_loop_in_free_time, stage_of, stages_between
-from torchgco.constraints.bounds import RateBounds
+from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of, stages_between
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 
@@ -79,7 +78,7 @@ class MPC:
         self.max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
-        self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if _follows(part)]
+        self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if follows(part)]
         changes = None if changes is None else ["x0", *self._previous, *changes]
         self.compiled: Compiled = compile(problem, solver, changes, tolerance=tolerance)
         self._problem = problem
@@ -198,7 +197,3 @@ def _mixed(new: np.ndarray, plan: Plan, before: Plan) -> Plan:
     )
     knots = None if plan.knots is None else torch.where(rows.unsqueeze(-1), plan.knots, before.knots)  # type: ignore[arg-type]
     return replace(plan, X=X, U=U, K=K, start=np.where(new, plan.start, before.start), knots=knots)
-
-
-def _follows(part: Any) -> bool:
-    return isinstance(part, RateBounds) and part.previous is not None

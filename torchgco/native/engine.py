@@ -178,11 +178,13 @@ class Engine:
         return vars(problem)["model_packed"]
 
     def _model_made(self, problem: Problem) -> c.Problem:
-        packed = c.Problem(N=problem.N, **shared_fields(self.shared))
-        if self.model.count > 0 and problem.B > 0:
-            numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
-            packed.parameters = array(numbers, knots=True)
-        return packed
+        return c.Problem(N=problem.N, parameters=self.model_numbers(problem), **shared_fields(self.shared))
+
+    def model_numbers(self, problem: Problem) -> c.Array:
+        """The model's numbers of each problem."""
+        if self.model.count == 0 or problem.B == 0:
+            return c.Array()
+        return array(self.model.numbers(problem.B, problem.dynamics, self.shared.model), knots=True)
 
     def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         if problem.B == 0:
@@ -190,20 +192,20 @@ class Engine:
         rows = [self._row(problem, i) for i in range(len(problem.constraints))]
         packed = self._model(problem).copy()
         packed.constraints, packed.constraint = len(rows), rows
-        packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, lambda: self._cost_made(problem))
+        make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
+        packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, make)
         return packed, rows
 
-    def _cost_made(self, problem: Problem) -> tuple[list[c.Array], int]:
-        """The cost's arrays, and whether it is `bounded`."""
+    def cost_numbers(self, problem: Problem) -> list[c.Array]:
+        """The cost's arrays."""
         if self.cost is None:
-            return quadratic_arrays(problem.cost), int(is_bounded(problem.cost))
-        return cost_arrays(problem, self.cost, self.shared.cost), 0
+            return quadratic_arrays(problem.cost)
+        return cost_arrays(problem, self.cost, self.shared.cost)
 
     def _row(self, problem: Problem, i: int) -> c.Constraint:
         """Constraint i without multipliers."""
-        part, shape = problem.constraints[i], problem.row_shapes[i]
-        make = lambda: constraint_of(part, shape, self.row_numbers(problem, i), problem)
-        return _of_last(problem, i, part, make)
+        make = lambda: constraint_of(problem, i, self.row_numbers(problem, i))
+        return _of_last(problem, i, problem.constraints[i], make)
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
         """The fields of a `Constraint` in C that hold the numbers of constraint i."""

@@ -48,11 +48,9 @@ def shared_fields(shared: Shared) -> dict[str, Any]:
     return {"shared": shared.model, "stage_shared": stage, "last_shared": last}
 
 
-def constraint_of(
-    constraint: Constraint, shape: tuple[int, int], own: dict[str, Any], problem: Problem
-) -> c.Constraint:
-    """A constraint without multipliers, with knots and rows as `shape` says, and the fields that `numbers_of` gives."""
-    knots, rows = shape
+def constraint_of(problem: Problem, i: int, own: dict[str, Any]) -> c.Constraint:
+    """Constraint i without multipliers, with the fields that `numbers_of` gives."""
+    constraint, (knots, rows) = problem.constraints[i], problem.row_shapes[i]
     place = torch.full((problem.N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
         place[constraint.knots] = torch.arange(knots, dtype=torch.int32)

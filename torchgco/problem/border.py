@@ -23,7 +23,7 @@ from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.names import check_names
+from torchgco.dynamics.names import controls_of, states_of
 from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
@@ -92,7 +92,8 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     Raises:
         InputError: names the method, what was expected, and what it returned.
     """
-    check_names(dynamics)
+    for named in (states_of, controls_of):  # which refuse names and units that aren't one text for each
+        named(dynamics)
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
     k = torch.arange(3, device=x0.device).clamp(max=N - 1)
@@ -312,11 +313,8 @@ def _check_axes(
 def _check_tensor(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:
     fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.dtype == dtype
     if not fits or any(want not in (None, got) for want, got in zip(shape, value.shape, strict=True)):
-        raise InputError(field, wanted, f"{describe(value)} instead of {_text(shape)}")
-
-
-def _text(shape: tuple[int | None, ...]) -> str:
-    return f"({', '.join('p' if size is None else str(size) for size in shape)}{',' if len(shape) == 1 else ''})"
+        sizes = ", ".join("p" if size is None else str(size) for size in shape)
+        raise InputError(field, wanted, f"{describe(value)} instead of ({sizes}{',' if len(shape) == 1 else ''})")
 
 
 def _check_slope(

@@ -46,7 +46,8 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
     time = problem.time
     if time is None:
         return problem
-    guess = _guess(problem) if guess is None else guess
+    guess = time.guess if guess is None else guess
+    guess = torch.clamp(torch.ones_like(time.least), time.least, time.most) if guess is None else guess
     rates = rates_of(problem)
     controls = None if rates is None else rates.controls
     before = [] if rates is None else [rates.before.expand(problem.B, -1)]
@@ -64,13 +65,6 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
     rows = tuple(_constraint(c, problem) for c in problem.constraints)
     object.__setattr__(whole, "constraints", (*rows, *_bounds(whole, time, problem.n)))
     return whole
-
-
-def _guess(problem: Problem) -> Tensor:
-    """The factors (B, S) to begin with: those that were given, else the nominal times, within the bounds."""
-    time = problem.time
-    assert time is not None
-    return time.guess if time.guess is not None else torch.clamp(torch.ones_like(time.least), time.least, time.most)
 
 
 def states_in_time(problem: Problem, X: Tensor, U: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:

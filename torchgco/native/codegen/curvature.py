@@ -36,18 +36,11 @@ def _model_code(model: DynamicsSource) -> str:
     """
 
     if isinstance(model, StagesSource):
-        return knot_source("curvature", model.stage.span, _stage_code, __file__).code
-
-    def make(_: str) -> dict[str, Any]:
-        return {"code": _step_code(*stepped(model.traced, model.n, model.m))}
-
-    key = "curvature", model.key, *makers(__file__)
-    code = store.made(key, make, f"curvature {model.traced.kin}").content["code"]
-    return emit.checked(model.traced.field, code)
-
-
-def _stage_code(knot: Knot, _: str) -> str:
-    return _step_code(knot.inputs, knot.rows, knot.calls)
+        code_of = lambda knot, _: _step_code(knot.inputs, knot.rows, knot.calls)
+        return knot_source("curvature", model.stage.span, code_of, __file__).code
+    key, traced = ("curvature", model.key, *makers(__file__)), model.traced
+    make = lambda: {"code": _step_code(*stepped(traced, model.n, model.m))}
+    return emit.checked(traced.field, store.made(key, make, f"curvature {traced.kin}").content["code"])
 
 
 def _step_code(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> str:

@@ -97,7 +97,7 @@ def trace_dynamics(
     step = lambda i, x, u: dynamics.take(i).step(x, u)
     traced = Traced("dynamics.step", step, x, u, own=own_tensors(dynamics))
     key = "model", traced.fingerprint(), *makers()
-    parts = store.made(key, lambda _: step_parts(*stepped(traced, n, m)), f"model {traced.kin}")
+    parts = store.made(key, lambda: step_parts(*stepped(traced, n, m)), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
     code, affine = emit.checked(traced.field, parts.content["code"]), parts.content["affine"]
     return DynamicsSource(n, m, traced.count, code, **lists, affine=affine, key=parts.key, traced=traced)

@@ -127,7 +127,7 @@ def knot_parts(
     """`knot_source` of parts, of which "code" is one, and these parts."""
     shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
 
-    def make(_: str) -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         import casadi as ca
 
         knot, places = _one_knot(span)
