@@ -288,7 +288,7 @@ def test_every_extension_is_shown() -> None:
     parts = (ROOT / "docs" / "extending.md").read_text().split("\n## ")[1:]
     shown = {part.splitlines()[0]: part.count("```python\n") for part in parts}
     kinds = ("A model", "A cost", "A constraint", "A kind of obstacle", "A guidance", "A solver", "A scenario")
-    assert shown == dict.fromkeys(kinds, 1) | {"A launcher": 0, "Where is what": 0}
+    assert shown == dict.fromkeys(kinds, 1) | {"Where is what": 0}
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="the figures watch native kernels")

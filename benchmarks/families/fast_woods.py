@@ -14,7 +14,7 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import markdown, share
+from benchmarks.lib.page import chosen, crossed, filed, markdown, share
 from torchgco import FreeTime, Goal, Problem
 
 STAGES = 80
@@ -22,6 +22,8 @@ DENSITIES = 0.05, 0.1, 0.15, 0.2
 GUESSES = 1.0, 2.0  # multiples of 4 s
 TIMES = FreeTime(least=0.5, most=4.0, weight=0.0)
 NEAR = 1e-2  # share of the cost
+HEAD = ("trunks per m^2", "goal", "sound, and at the goal", "duration, s", "cost", "s a wood",
+        "both within 1 % of the cost, of what either solves")  # fmt: skip
 
 
 def variants(problem: Problem) -> dict[str, Problem]:
@@ -33,7 +35,7 @@ def variants(problem: Problem) -> dict[str, Problem]:
 
 
 def text(count: int, seed: int) -> str:
-    """The table."""
+    """The filed table; how many woods are crossed, and what a free time gives."""
     rows = []
     for density in DENSITIES:
         setup = torchgco.compose(["scenario=woods", f"scenario.density={density}", f"scenario.stages={STAGES}"])
@@ -52,9 +54,9 @@ def text(count: int, seed: int) -> str:
         low, high = torch.stack(costs[-len(GUESSES) :]).aminmax(dim=0)
         alike = high.isfinite() & (high <= (1.0 + NEAR) * low)
         rows[-1].append(f"{int(alike.sum())} of {int(low.isfinite().sum())}")
-    head = ["trunks per m^2", "goal", "sound, and at the goal", "duration, s", "cost", "s a wood",
-            "both within 1 % of the cost, of what either solves"]  # fmt: skip
-    return markdown(head, [row + [""] * (len(head) - len(row)) for row in rows])
+    table = markdown(HEAD, [row + [""] * (len(HEAD) - len(row)) for row in rows])
+    free = chosen(table, (HEAD[0], *HEAD[3:6]), goal=("required, free time from 4 s",))
+    return filed("free_time-woods", table, crossed(table, "goal", HEAD[0], HEAD[2]), free)
 
 
 main = Command(

@@ -24,7 +24,7 @@ import torch
 import torchgco
 from benchmarks.lib import RESULTS
 from benchmarks.lib.command import parser_of
-from benchmarks.lib.page import chosen, filed, markdown, measured, put, share, shown
+from benchmarks.lib.page import crossed, filed, markdown, measured, put, share, shown
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.style import save
 from torchgco.scenarios import MapFile, Task
@@ -165,8 +165,8 @@ def median(values: pd.Series, form: str) -> str:
 
 
 def short(table: str) -> str:
-    """The table as a file, and these columns of it."""
-    return filed("floors-maps", table, chosen(table, ("map", "solver", "sound", "cost", "s")))
+    """The table as a file, and its costs."""
+    return filed("floors-maps", table, crossed(table, "map", "solver", "cost"))
 
 
 def map_rows(folder: Path, owned: Owned, solvers: Sequence[str]) -> list[list[Any]]:

@@ -35,7 +35,7 @@ HEAD = (
     "median seconds",
 )  # fmt: skip
 
-SHOWN = "family", "solver", "n", "reached", "success", "median cost", "median seconds"
+SHOWN = "family", "n", "reached", "success", "median cost", "median seconds"  # of one solver
 SHORT = ("Success", "Median seconds")  # of several solvers
 
 
@@ -50,7 +50,8 @@ def main(words: Sequence[str] | None = None) -> int:
     else:
         text = chosen(text, SHOWN)
     if set(asked.families) == set(FAMILIES) and asked.write:
-        name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}."
+        name, which = page_of(asked), f"`{asked.solvers[0]}`, " if len(asked.solvers) == 1 else ""
+        head = f"{source(asked, 'family')}, {which}{machine()}."
         put(ROOT / "benchmarks" / PAGES[name], name, f"{head}\n\n{text}")
     return 0
 

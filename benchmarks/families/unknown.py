@@ -134,11 +134,10 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     return markdown(HEAD, lines)
 
 
-def short(name: str, table: str, misses: str) -> str:
-    """Both tables as files, and some columns of the first."""
-    few = chosen(table, (*HEAD[:5], "flight time", "clearance"))
+def short(name: str, table: str, misses: str, *few: str) -> str:
+    """Both tables as files, and short forms of the first."""
     missed = filed(f"{name}-misses", misses) if misses.startswith("|") else misses
-    return f"{filed(name, table, few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
+    return f"{filed(name, table, *few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
 
 
 def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
@@ -159,8 +158,11 @@ def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     return markdown(head, lines) if lines else none
 
 
-def times(log: pd.DataFrame, name: str = "unknown-times") -> str:
-    """Markdown: milliseconds of the planner and of its parts, over the periods of all missions but their first."""
+def times(log: pd.DataFrame, name: str = "unknown-times", shown: bool = True) -> str:
+    """Markdown: milliseconds of the planner and of its parts, over the periods of all missions but their first.
+
+    Those of the planner are `shown` beside the file.
+    """
     later = log[log["step"] > 0]
     names = {
         "map: a scan's cells": "map_seconds", "field: distances and corridors": "field_seconds",
@@ -173,8 +175,8 @@ def times(log: pd.DataFrame, name: str = "unknown-times") -> str:
     over = int((later["planner_seconds"] > PERIOD).sum())
     head = ("milliseconds", "median", "90 %", "99 %", "longest")
     whole = markdown(head, rows)
-    few = chosen(whole, head, milliseconds=(rows[-1][0],))
-    return filed(name, whole, few, f"{over} of {len(later)} periods took longer than 50 ms.")
+    few = [chosen(whole, head, milliseconds=(rows[-1][0],))] if shown else []
+    return filed(name, whole, *few, f"{over} of {len(later)} periods took longer than 50 ms.")
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -190,9 +192,11 @@ def main(words: Sequence[str] | None = None) -> int:
     trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*flown, strict=True))
     head = f"{origin('Flown')}, seed 0, {machine()}."
     kind = "unknown-long" if asked.long else "unknown"
+    flights = table(trials, log)
+    few = [] if asked.long else [chosen(flights, (*HEAD[:5], "flight time", "clearance"))]
     blocks = {
-        "worlds": f"{head}\n\n{short(kind, table(trials, log), misses(trials, log))}",
-        "times": times(log, f"{kind}-times"),
+        "worlds": f"{head}\n\n{short(kind, flights, misses(trials, log), *few)}",
+        "times": times(log, f"{kind}-times", shown=not asked.long),
     }
     for name, text in blocks.items():
         print(text)

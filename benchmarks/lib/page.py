@@ -56,7 +56,8 @@ def moved(text: str, folder: Path) -> str:
         rows = [[cell.replace("\\|", "|") for cell in line] for line in cells_of(found[2])]
         with (folder / found[1]).open("w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
-        return f"All {len(rows) - 1} rows: [{found[1]}]({found[1]})." + "\n" * found[2].endswith("\n")
+        said = f"All {len(rows) - 1} rows" if len(rows) > 2 else "One row"
+        return f"{said}: [{found[1]}]({found[1]})." + "\n" * found[2].endswith("\n")
 
     return FILED.sub(move, text)
 

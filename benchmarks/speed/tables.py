@@ -53,30 +53,35 @@ WORDS = {
     "spheres unless the row says otherwise; more stages divide the same 5 s. The planar vehicle has n = 6.",
 }
 
-# What the page shows of a section: quantities, the only solver (empty: all), and the form: a column per quantity
-# (empty), or one quantity with a row per case (case) or per solver (solver).
+# What the page shows of a section: quantities, the only solver (empty: all), and whether there is a column per solver
+# instead of one per quantity.
+PEERS = ("FATROP", "acados", "pytorch-mppi")
 SHOWN = {
-    "targets": [(("time", "FATROP", "acados", "pytorch-mppi"), "", "")],
+    "targets": [(("time", *PEERS), "", False)],
     "families": [
-        (("seconds per problem", "reached", "median cost"), "gco", ""),
-        (("seconds, ratio",), "", "case"),
+        (("seconds per problem", "reached", "median cost"), "gco", False),
+        (("seconds, ratio",), "", True),
     ],
-    "loop": [(("median", "99 %", "solved"), "", "")],
-    "swing_up": [(("median", "99 %", "first period", "up"), "", "")],
+    "loop": [(("median", "99 %", "solved"), "", False)],
+    "endless": [
+        (("memory after 100 steps", "memory at the end", "compilers after the first step"), "", False),
+        (("steps per second",), "", False),
+    ],
+    "swing_up": [(("median", "99 %", "first period", "up"), "", False)],
     "learned": [
-        (("first solve, nothing built", "first solve, solver's objects built"), "", ""),
-        (("an iteration",), "", "case"),
-        (("training step, median",), "", "case"),
-        (("first solve",), "", "case"),
+        (("first solve, nothing built", "first solve, solver's objects built"), "", False),
+        (("an iteration",), "", True),
+        (("training step, median",), "", True),
+        (("first solve",), "", True),
     ],
-    "mppi": [(("per round",), "", "case")],
-    "share": [(("sum",), "", "solver")],
+    "mppi": [(("per round",), "", True)],
 }
 LEFT_OUT = (
     "latency",
     "own_model",
     "first_use",
     "paper",
+    "share",
     "cores",
     "batch",
     "scaling",
@@ -87,20 +92,17 @@ LEFT_OUT = (
 def section_text(rows: list[Row]) -> str:
     """What the page shows of the rows of one section."""
     tables = []
-    for quantities, solver, form in SHOWN.get(rows[0]["section"], []):
+    for quantities, solver, peers in SHOWN.get(rows[0]["section"], []):
         held = [row for row in rows if row["quantity"] in quantities and solver in ("", row["solver"])]
-        tables += [form_of(held, form)] if held else []
+        tables += [(peers_table if peers else section_table)(held)] if held else []
     return "\n\n".join(tables) or section_table(rows)
 
 
-def form_of(rows: list[Row], form: str) -> str:
-    """One table of these rows."""
-    if form == "":
-        return section_table(rows)
+def peers_table(rows: list[Row]) -> str:
+    """A row per case, a column per solver."""
     long = [[row["case"], f"`{row['solver']}`", _rounded(row["value"])] for row in rows]
-    table = markdown(["case", "solver", "value"], long)
-    table = crossed(table, form, "solver" if form == "case" else "case", "value")
-    return table.replace(f"| {form} |", f"| {_head(rows[0])} |", 1)
+    table = crossed(markdown(["case", "solver", "value"], long), "case", "solver", "value")
+    return table.replace("| case |", f"| {_head(rows[0])} |", 1)
 
 
 def section_table(rows: list[Row]) -> str:
@@ -130,9 +132,11 @@ def _head(row: Row) -> str:
 
 
 def targets_text(rows: list[Row]) -> str:
-    """The compact table with its source."""
+    """The compact table of what peers have solved, too, with its source."""
     own = [row for row in rows if row["section"] == "targets" and row["device"] == "cpu"]
-    return f"{_source(own[0])}\n{WORDS['targets']}\n\n{section_text(own)}" if own else NOT_MEASURED
+    cases = {row["case"] for row in own if row["quantity"] in PEERS}
+    own = [row for row in own if row["case"] in cases]
+    return f"{_when(own[0])}{_how(own[0])}.\n{WORDS['targets']}\n\n{section_text(own)}" if own else NOT_MEASURED
 
 
 def speed_text(rows: list[Row]) -> str:
@@ -145,23 +149,27 @@ def speed_text(rows: list[Row]) -> str:
 
 def _device_text(rows: list[Row]) -> str:
     """Tables of one device; a line on the source precedes a section where it differs from the section before."""
-    blocks, before = [], ""
+    blocks, before = [], ("", "")
     present = {row["section"] for row in rows}
     for section in [name for name in WORDS if name in present and name not in LEFT_OUT]:
         own = [row for row in rows if row["section"] == section]
-        source = _source(own[0])
-        blocks += [source] if source != before else []
+        source = when, how = _when(own[0]), _how(own[0])
+        blocks += [f"{when}{how if how != before[1] else ', all else as above'}."] if source != before else []
         blocks.append(f"### `{section}`\n\n{WORDS[section]}\n\n{section_text(own)}")
         before = source
     return "\n\n".join(blocks)
 
 
-def _source(row: Row) -> str:
+def _when(row: Row) -> str:
+    return f"Measured on {row['date']} at commit {row['commit']}"
+
+
+def _how(row: Row) -> str:
     where = "one core, one thread" if row["device"] == "cpu" else "one GPU"
     return (
-        f"Measured on {row['date']} at commit {row['commit']}, {row['processor']}, {where}; torch {row['torch']}, "
+        f", {row['processor']}, {where}; torch {row['torch']}, "
         f"CasADi {row['casadi']}, pytorch-mppi {row['pytorch_mppi']}, acados (comma-deps-acados) "
-        f"{row['acados'] or 'not installed'}."
+        f"{row['acados'] or 'not installed'}"
     )
 
 

@@ -185,8 +185,8 @@ def test_the_tables_are_rewritten_in_place(tmp_path: Path) -> None:
     page.parent.mkdir()
     for file, name in ((readme, "targets"), (page, "speed")):
         file.write_text(f"before\n<!-- {name} -->\nold\n<!-- end {name} -->\nafter\n")
-    rows = [row_of(*words) for words in (("mppi", "0.12345"), ("share", "1234.4"), ("mppi", "7", "cuda"))]
-    rows.append(row_of("targets", "39 x FATROP"))
+    rows = [row_of(*words) for words in (("mppi", "0.12345"), ("loop", "1234.4"), ("mppi", "7", "cuda"))]
+    rows += [{**row_of("targets", "39 x"), "quantity": "FATROP"}, {**row_of("targets", "12 MiB"), "case": "memory"}]
     rewrite(tmp_path, rows)
     first, second = readme.read_text(), page.read_text()
     rewrite(tmp_path, rows)
@@ -194,7 +194,7 @@ def test_the_tables_are_rewritten_in_place(tmp_path: Path) -> None:
     for text, name in ((first, "targets"), (second, "speed")):
         assert text.startswith(f"before\n<!-- {name} -->\n") and text.endswith(f"<!-- end {name} -->\nafter\n")
         assert "old" not in text
-    assert "39 x FATROP" in first and "39 x FATROP" not in second
+    assert "39 x" in first and "39 x" not in second and "12 MiB" not in first
     assert "| 0.123 |" in second and "| 1234 |" in second and "## Speed on a GPU" in second
     page.write_text("no marks")
     with pytest.raises(ValueError):

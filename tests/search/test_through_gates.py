@@ -90,8 +90,11 @@ def test_chords_are_clear_where_stages_are_long() -> None:
 
 def test_a_course_has_the_same_bits_in_any_batch() -> None:
     problem = course(DISCS, B=3)
-    found, alone = torchgco.solve(problem), torchgco.solve(problem.take(torch.tensor([1])), ids=torch.tensor([1]))
+    found = torchgco.solve(problem, record=True)
+    alone = torchgco.solve(problem.take(torch.tensor([1])), ids=torch.tensor([1]))
     assert torch.equal(found.U[1], alone.U[0]) and torch.equal(found.t[1], alone.t[0])
+    # Nothing but iterations can be recorded here: nobody is sent to ask for it once more.
+    assert "record=True" not in found.explain(1)
 
 
 def test_states_of_the_user_are_begun_from_too(monkeypatch: pytest.MonkeyPatch) -> None:

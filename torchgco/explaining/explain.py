@@ -130,7 +130,7 @@ class _One:
 def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
     solver, status = account.solver, Status(int(solved.status[b]))
     recording = getattr(solver, "recording", None)
-    could = solved.trace is None and recording is not None and recording() is not solver
+    could = solved.trace is None and recording is not None and recording() != solver
     if one is None:
         return Facts(status, solver, could_record=could)
     verdict = one.verdict()

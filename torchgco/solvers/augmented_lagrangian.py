@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Self
 
 import torch
 from torch import Tensor
@@ -58,6 +58,8 @@ class AugmentedLagrangian(Solver):
         violation_tolerance: violation (metres for lengths) up to which a trajectory counts as feasible.
         slots: problems that run at the same time; the others wait for a free slot. None: all. No result depends on it.
         record: keep the history of every problem in `solution.trace`.
+        by_kernels: violations of a solution are those that the kernels measure, as in closed loops; else PyTorch
+            evaluates all rows once more.
 
     Raises:
         InputError: a field out of its range.
@@ -73,7 +75,7 @@ class AugmentedLagrangian(Solver):
     violation_tolerance: Positive = ADMITTED
     slots: Count | None = None
     record: bool = False
-    by_kernels: ClassVar[bool] = False  # as of `Session`
+    by_kernels: bool = False
 
     def __post_init__(self) -> None:
         check_options(self, "solver")
@@ -88,8 +90,7 @@ class AugmentedLagrangian(Solver):
 
     def in_closed_loop(self, rounds: int) -> tuple[Self, Self]:
         """The same solver twice. A planner flies on what its kernels measure: rows aren't evaluated by PyTorch, too."""
-        other = replace(self)
-        object.__setattr__(other, "by_kernels", True)
+        other = replace(self, by_kernels=True)
         return other, other
 
     def run(self, call: Call) -> Solution:

@@ -25,9 +25,10 @@ class MujocoPlant(EachPlant):
     """A quadrotor in MuJoCo.
 
     Without `model` it is the vehicle of the mission (`mjcf`), whose thrusts follow their commands as a first-order lag.
-    A file of a user's says mass, inertia, rotors and limits itself; it has one free body, and four actuators without
-    bias of which each pushes along the body's z axis, one in each quadrant around the centre of mass, where opposite
-    ones turn the same way. Contacts are switched off: obstacles are the mission's, which judges contact.
+    A file of a user's says mass, inertia, rotors and limits itself. It has one free body, to which all others are
+    welded, a `timestep` that divides dt, and four actuators without bias, with `dyntype` none, filter or filterexact.
+    Each of these pushes along the body's z axis, one in each quadrant around the centre of mass, where opposite ones
+    turn the same way. Contacts are switched off: obstacles are the mission's, which judges contact.
 
     MuJoCo's motors take newtons: a commanded speed asks for the thrust that the vehicle's coefficient gives at it.
     Positions and velocities are those of the centre of mass. Where the front left rotor turns so that its torque is

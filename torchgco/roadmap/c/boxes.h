@@ -5,7 +5,7 @@
 
 
 /* Squared distances of points, and half their slopes where the points move along segments. */
-static inline V square_at(const V *half, const V *begin, const V *along, V share, V *slope) {
+static inline V square_at_share(const V *half, const V *begin, const V *along, V share, V *slope) {
     V square = SET(0.0), sum = SET(0.0);
     for (int i = 0; i < DIM; i++) {
         V away = beyond(begin[i] + share * along[i], half[i]);
@@ -25,7 +25,7 @@ static double square_from_box(const double *box, const double *p) {
     spread(box, numbers);
     for (int i = 0; i < DIM; i++) point[i] = SET(p[i]), none[i] = SET(0.0);
     seen_from(numbers, point, local);
-    return square_at(BOX_HALF(numbers), local, none, SET(0.0), &slope)[0];
+    return square_at_share(BOX_HALF(numbers), local, none, SET(0.0), &slope)[0];
 }
 
 static inline V held(V share) {
@@ -39,18 +39,18 @@ static inline V square_of_segment(const V *box, const V *start, const V *step) {
     const V *half = BOX_HALF(box);
     seen_from(box, start, begin);
     along_sides(box, step, along);
-    square_at(half, begin, along, low, &falls);
-    square_at(half, begin, along, high, &rises);
+    square_at_share(half, begin, along, low, &falls);
+    square_at_share(half, begin, along, high, &rises);
     for (int i = 0; i < DIM; i++)
         for (int side = -1; side <= 1; side += 2) {
             V share = held((SET(side) * half[i] - begin[i]) / tgco_choose(along[i] == zero, SET(1.0), along[i]));
-            square_at(half, begin, along, share, &found);
+            square_at_share(half, begin, along, share, &found);
             I left = (found < zero) & (share > low), right = (found >= zero) & (share < high);
             low = tgco_choose(left, share, low), falls = tgco_choose(left, found, falls);
             high = tgco_choose(right, share, high), rises = tgco_choose(right, found, rises);
         }
     V change = rises - falls, part = held(-falls / tgco_choose(change > SET(DBL_MIN), change, SET(DBL_MIN)));
-    return square_at(half, begin, along, tgco_choose(falls < zero, low + (high - low) * part, low), &found);
+    return square_at_share(half, begin, along, tgco_choose(falls < zero, low + (high - low) * part, low), &found);
 }
 
 /* The lower and upper bounds (2, DIM) of what lies no farther than `margin` from a box; none of an absent one. */
