@@ -17,7 +17,7 @@ from torchgco.dynamics.rollout import open_loop as by_pytorch
 from torchgco.kernels import choice, current
 from torchgco.native import compiler
 from torchgco.native.compiler import find_compiler
-from torchgco.tracing import Watch
+from torchgco.tracing import contents
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 N = 4
@@ -145,11 +145,10 @@ def test_large_tensors_leave_room_for_fewer_engines(monkeypatch: pytest.MonkeyPa
 def test_changes_of_tensors_of_any_layout_are_seen(layout: str) -> None:
     numbers = torch.arange(1.0, 7.0, dtype=D).reshape(3, 2)
     tensor = numbers[:, 1] if layout == "strided" else numbers.to_sparse()
-    watch = Watch([tensor])
-    before = watch.look()
-    assert watch.look() == before
+    before = contents([tensor])
+    assert contents([tensor]) == before
     (numbers[2:] if layout == "strided" else tensor).mul_(2.0)
-    assert before is None or watch.look() != before
+    assert before is None or contents([tensor]) != before
     assert (before is None) == (layout == "sparse")
 
 

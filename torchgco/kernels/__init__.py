@@ -4,9 +4,9 @@ from torchgco.kernels.choice import EagerWarning as EagerWarning
 from torchgco.kernels.choice import current as current
 from torchgco.kernels.choice import expect_interior as expect_interior
 from torchgco.kernels.choice import kernels_of as kernels_of
+from torchgco.kernels.choice import native as native
+from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
-from torchgco.kernels.switch import native as native
-from torchgco.kernels.switch import use_native as use_native
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_unit as cost_unit
 from torchgco.kernels.verbs import followed as followed

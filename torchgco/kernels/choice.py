@@ -12,7 +12,6 @@ from torchgco.base.errors import InputError
 from torchgco.base.gradients import is_forward
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
-from torchgco.kernels.switch import native
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
@@ -24,6 +23,24 @@ from torchgco.tracing import Facts
 
 ENGINES_KEPT = 64  # engines, the most recent ones
 CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
+
+
+_uses_native = True
+
+
+def use_native(on: bool) -> None:
+    """Use native kernels where they can be used (the default), or PyTorch's everywhere, in this process.
+
+    Native kernels solve several problems side by side; PyTorch's are the reference for them: the two differ in the last
+    bits. `device.kernels` chooses for a study.
+    """
+    global _uses_native
+    _uses_native = on
+
+
+def native() -> bool:
+    """Whether this process uses native kernels where they can be used."""
+    return _uses_native
 
 
 class EagerWarning(UserWarning):

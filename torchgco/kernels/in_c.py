@@ -18,7 +18,7 @@ from torchgco.ilqr.line_search import Rollouts
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import keep_lifted
 from torchgco.kernels.in_pytorch import InteriorKernels, Kernels, clearance_of
-from torchgco.kernels.outer import FLAGS, LAST_NUMBERS, NativeOuter, pass_end
+from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.engine import Engine, replicas_of
@@ -135,7 +135,7 @@ class NativeKernels(Kernels):
         B = lagrangian.problem.B
         for name in ITERATED:
             setattr(s, name, getattr(s, name).contiguous())
-        out = {name: _flags(B) for name in FLAGS} | {name: s.merit.new_zeros(B) for name in LAST_NUMBERS}
+        out = {name: _flags(B) for name in END_FLAGS} | {name: s.merit.new_zeros(B) for name in END_NUMBERS}
         state = {name: getattr(s, name) for name in ITERATED}
         packed = self.engine.terms(
             lagrangian, None, **state, **out, options=native_options(how), limit=limit, replicas=replicas_of(B)

@@ -18,7 +18,7 @@ from torchgco.native.structures import End, Options, Outer
 from torchgco.problem.problem import Problem
 
 # How an inner solve ended, and step length and mu_r of its last iteration.
-FLAGS, LAST_NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
+END_FLAGS, END_NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
 
 
 class NativeOuter:
@@ -47,8 +47,8 @@ class NativeOuter:
         self.engine, self.state, self.b = engine, s, problem.B
         _make_contiguous(s)
         b = problem.B
-        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in FLAGS}
-        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in LAST_NUMBERS}
+        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in END_FLAGS}
+        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in END_NUMBERS}
         self.outcome = torch.zeros(b, dtype=torch.int64)
         m, best = s.multipliers, s.best
         packed = engine.terms(
@@ -102,7 +102,7 @@ class NativeOuter:
 
 
 def pass_end(out: Mapping[str, Tensor]) -> PassEnd:
-    """What FLAGS and LAST_NUMBERS say of a pass."""
+    """What END_FLAGS and END_NUMBERS say of a pass."""
     status, ended = out["status"], out["status"] == End.ENDED
     failed = ~ended & (status != Status.RUNNING)
     why = torch.where(failed, status.long(), int(Status.RUNNING))
