@@ -15,5 +15,11 @@ compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 def engine_of(problem: Problem) -> Engine | None:
     """None where PyTorch's kernels serve the problem."""
+    kernels = in_c(problem)
+    return None if kernels is None else kernels.engine
+
+
+def in_c(problem: Problem) -> NativeKernels | None:
+    """The same kernels themselves."""
     kernels = kernels_of(problem)
-    return kernels.engine if isinstance(kernels, NativeKernels) else None
+    return kernels if isinstance(kernels, NativeKernels) else None

@@ -369,7 +369,7 @@ def test_one_thread_at_a_time_and_processes_compile_their_own() -> None:
         ({"upper": [-9.0, 1.0]}, "constraints[0].upper: expected lower bounds of at most the upper ones"),
         ({"lower": [4.0, -0.5], "upper": [3.9, 0.5]}, "constraints[0].lower: expected lower bounds of at most"),
         ({"radii": [-1.0, 1.0]}, "constraints[1].radii: expected lengths of at least 0, got -1.0"),
-        ({"Q": [[-1.0, 1, 1, 1]]}, "cost.Q: expected weights of at least 0, got -1.0"),
+        ({"Q": [[-1.0, 1, 1, 1]]}, "cost.Q: expected numbers of at least 0, got -1.0"),
         ({"x_ref": np.nan * path(0.0)}, "cost.x_ref: expected finite numbers, got NaN or infinity"),
         ({"x0": "fast"}, "x0: expected numbers, got str"),
         ({"shift": -1}, "shift: expected a number of stages, at least 0, got -1"),

@@ -183,7 +183,7 @@ WRONG: dict[str, tuple[Callable[[MPC], Any], str]] = {
     "solver": (lambda mpc: MPC(driven(), "ipopt"), 'solver: expected "gco" or "interior_point", got'),
     "status": (lambda mpc: mpc.status, "mpc: expected a step before"),
     "plan": (lambda mpc: (mpc.step(START), mpc.plan.at(np.nan)), "t: expected a time in seconds, got nan"),
-    "plan state": (lambda mpc: (mpc.step(START), mpc.plan.at(0.1, [1.0])), r"x: expected finite states \(1, 4\)"),
+    "plan state": (lambda mpc: (mpc.step(START), mpc.plan.at(0.1, [1.0])), r"x: expected shape \(1, 4\)"),
     "horizon": (lambda mpc: MPC(shortened()), "problem.horizon: expected None"),
     "stages": (lambda mpc: MPC(stretched()), "dynamics.dt: expected stages of one length"),
 }  # fmt: skip

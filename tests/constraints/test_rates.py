@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, inf
 
 import torchgco
-from tests.engines import compiled, engine_of
+from tests.engines import compiled, engine_of, in_c
 from tests.native.test_engine import DAMPED, eager, natively, running_state
 from tests.native.users import Each, GaussNewton, Smooth, Tube, user_problem
 from torchgco import (
@@ -161,7 +161,7 @@ def test_native_iterations_are_pytorchs(name: str) -> None:
     assert problem.n == 6 and engine_of(problem) is not None
     state, lagrangian = running_state(problem)
     for mine, theirs in zip(
-        engine_of(problem).value(lagrangian, state.X, state.U), lagrangian.value(state.X, state.U), strict=True
+        in_c(problem).value(lagrangian, state.X, state.U), lagrangian.value(state.X, state.U), strict=True
     ):
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
     for count in (1, 4):

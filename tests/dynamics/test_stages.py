@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from tests.engines import compiled, engine_of
+from tests.engines import compiled, engine_of, in_c
 from tests.native.users import N, with_stages
 from torchgco import ILQR, AugmentedLagrangian, FunctionCost, FunctionDynamics, InputError, Problem, Status, kernels
 from torchgco.baselines import CasADiSolver
@@ -48,8 +48,8 @@ def test_rollouts_and_derivatives_are_those_of_a_loop() -> None:
     problem = with_stages()
     U = some_controls(problem)
     expected = torch.from_numpy(np.stack([by_numpy(problem, b, U[b].numpy()) for b in range(problem.B)]))
-    engine = engine_of(problem)
-    assert engine is not None
+    kernels = in_c(problem)
+    assert kernels is not None
     for X in (rollout.open_loop(problem.dynamics, problem.x0, U), open_loop(problem, U)):
         torch.testing.assert_close(X, expected, rtol=1e-12, atol=1e-12)
     # A nominal trajectory that ends elsewhere is followed by its gains, stage by stage.
@@ -58,7 +58,7 @@ def test_rollouts_and_derivatives_are_those_of_a_loop() -> None:
     nominal[:, 0] = problem.x0
     alpha = torch.zeros(problem.B, dtype=D)
     for mine, theirs in zip(
-        engine.closed_loop(problem, nominal, U, K),
+        kernels.closed_loop(problem, nominal, U, K[..., :-1]),
         rollout.closed_loop(problem.dynamics, nominal, U, K.transpose(0, 1).contiguous(), alpha),
         strict=True,
     ):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.engines import compiled, engine_of
+from tests.engines import compiled, in_c
 from tests.obstacles.test_body import kinds
 from tests.problems import assert_same_bits, planar_batch, quadrotor_batch, random_trajectory
 from torchgco import AugmentedLagrangian, Body, InteriorPoint, Problem, kernels
@@ -46,11 +46,11 @@ def test_values_and_expansions_are_pytorchs(d: int, names: tuple[str, ...], phr:
     for part in lam:
         part[:, ::2] = 0.0  # where C leaves out what is far from all balls
     lagrangian = Lagrangian(problem, Multipliers(tuple(lam), multipliers.mu), None, phr)
-    engine = engine_of(problem)
-    assert engine is not None
-    torch.testing.assert_close(engine.value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(engine.slack(lagrangian, X, U), lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
-    slopes, H = engine.expand(problem, X, U, lagrangian)
+    kernels = in_c(problem)
+    assert kernels is not None
+    torch.testing.assert_close(kernels.value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(kernels.slack(lagrangian, X, U), lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
+    slopes, H = kernels.expand(problem, X, U, lagrangian)
     want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
     kept = [i for i in range(s + 1) if i != n]
     torch.testing.assert_close(slopes[:, :-1], want[:, :-1, kept, n], rtol=1e-10, atol=1e-9)

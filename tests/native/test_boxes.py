@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.engines import engine_of
+from tests.engines import in_c
 from tests.problems import boxed_batch, planar_batch, random_trajectory
 from torchgco import Boxes, Capsules, ControlBounds, Goal, Problem, judge
 from torchgco.baselines.casadi import CasADiSolver
@@ -37,11 +37,11 @@ def test_values_and_expansions_are_pytorchs(d: int, phr: bool, rounded: bool, pu
     (rows,) = (r for r, c in zip(lam, problem.constraints, strict=True) if c is boxes)
     assert bool(rows.any()) == (pushed != "none") and bool((rows == 0).any())
     lagrangian = Lagrangian(problem, Multipliers(tuple(lam), multipliers.mu), None, phr)
-    engine = engine_of(problem)
-    assert engine is not None and not engine.functions  # nothing is traced
-    cost, merit = engine.value(lagrangian, X, U)
+    kernels = in_c(problem)
+    assert kernels is not None and not kernels.engine.functions  # nothing is traced
+    cost, merit = kernels.value(lagrangian, X, U)
     torch.testing.assert_close((cost, merit), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
-    slopes, H = engine.expand(problem, X, U, lagrangian)
+    slopes, H = kernels.expand(problem, X, U, lagrangian)
     want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
     kept = [i for i in range(s + 1) if i != n]
     torch.testing.assert_close(slopes[:, :-1], want[:, :-1, kept, n], rtol=1e-10, atol=1e-9)
@@ -60,9 +60,9 @@ def test_slopes_on_the_axis_of_a_post_are_pytorchs(d: int) -> None:
     X, U = random_trajectory(problem, spread=0.0)
     X[0, 1:, problem.position] += torch.tensor([[0.0], [0.5], [1.0], [1.5]]).double() * along  # the last: beyond an end
     lagrangian = Lagrangian(problem, Multipliers.zero(problem, 3.0), None, True)
-    engine = engine_of(problem)
-    assert engine is not None and bool((problem.constraints[0].value(X, U)[:, :3] > 0).all())
-    slopes, _ = engine.expand(problem, X, U, lagrangian)
+    kernels = in_c(problem)
+    assert kernels is not None and bool((problem.constraints[0].value(X, U)[:, :3] > 0).all())
+    slopes, _ = kernels.expand(problem, X, U, lagrangian)
     want, n = lagrangian.expand(X, U).transpose(0, 1), problem.n
     torch.testing.assert_close(slopes[:, -1, :n], want[:, -1, :n, n], rtol=1e-10, atol=1e-9)
     torch.testing.assert_close(slopes[:, :-1, :n], want[:, :-1, :n, n], rtol=1e-10, atol=1e-9)

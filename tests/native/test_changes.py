@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from tests.engines import engine_of
+from tests.engines import in_c
 from tests.native import changes
 from tests.native.changes import CODE, INPUTS, D, Drag, number
 from torchgco import FunctionDynamics, Problem, QuadraticCost
@@ -17,7 +17,7 @@ from torchgco.dynamics.rollout import open_loop as by_pytorch
 from torchgco.kernels import choice, current
 from torchgco.native import compiler
 from torchgco.native.compiler import find_compiler
-from torchgco.tracing import Watch
+from torchgco.tracing import contents
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 N = 4
@@ -36,9 +36,9 @@ def usual() -> Any:
 def after(problem: Problem) -> tuple[Tensor, bool]:
     """The states of a rollout in C as of a solve's, which are those of PyTorch, and whether a trace was kept for it."""
     fresh = current(problem)
-    engine = engine_of(fresh)
-    assert engine is not None
-    found = engine.open_loop(fresh, U)
+    kernels = in_c(fresh)
+    assert kernels is not None
+    found, engine = kernels.open_loop(fresh, U), kernels.engine
     return found, any(engine.captured is kept.captured for kept, _ in choice._engines.values())
 
 
@@ -121,9 +121,11 @@ def test_what_is_kept_holds_no_numbers_of_problems() -> None:
 
     for drag in (0.2, 2.0):
         problem = given(drag)
-        engine = engine_of(current(problem))
-        assert engine is not None and engine.captured is [*choice._engines.values()][-1][0].captured
-        found = engine.open_loop(problem, U.repeat(B, 1, 1))
+        kernels = in_c(current(problem))
+        assert kernels is not None
+        engine = kernels.engine
+        assert engine.captured is [*choice._engines.values()][-1][0].captured
+        found = kernels.open_loop(problem, U.repeat(B, 1, 1))
         expected = by_pytorch(problem.dynamics, problem.x0, U.repeat(B, 1, 1)).detach()
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
         held = [tensor for traced in engine.captured.traces for tensor in traced._captured.values()]
@@ -143,11 +145,10 @@ def test_large_tensors_leave_room_for_fewer_engines(monkeypatch: pytest.MonkeyPa
 def test_changes_of_tensors_of_any_layout_are_seen(layout: str) -> None:
     numbers = torch.arange(1.0, 7.0, dtype=D).reshape(3, 2)
     tensor = numbers[:, 1] if layout == "strided" else numbers.to_sparse()
-    watch = Watch([tensor])
-    before = watch.look()
-    assert watch.look() == before
+    before = contents([tensor])
+    assert contents([tensor]) == before
     (numbers[2:] if layout == "strided" else tensor).mul_(2.0)
-    assert before is None or watch.look() != before
+    assert before is None or contents([tensor]) != before
     assert (before is None) == (layout == "sparse")
 
 

@@ -273,7 +273,7 @@ MISTAKES: dict[str, tuple[Callable[[], Problem], str]] = {
     ),
     "a goal per row": (
         lambda: boat(constraints=[FunctionConstraint(lambda x: x[..., :2] - GOALS.unsqueeze(1))]),
-        r"constraint.function: expected shape \(1, 25, p\), got \(2, 25, 2\)",
+        "constraint.function: expected values of a problem that depend on its own row",
     ),
     "unknown value": (lambda: boat(values={"mass": [1, 2]}), r"dynamics.values\['mass'\]: .*doesn't take"),
     "too few values": (lambda: boat(values={"drag": [1.0]}), r"dynamics.values\['drag'\]: expected shape \(2, ...\)"),

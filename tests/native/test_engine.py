@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.engines import engine_of
+from tests.engines import engine_of, in_c
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from tests.slow import mostly
 from torchgco import (
@@ -31,7 +31,7 @@ from torchgco import (
 )
 from torchgco.dynamics.rollout import open_loop
 from torchgco.ilqr import descent
-from torchgco.ilqr.riccati import BackwardPass, backward
+from torchgco.ilqr.riccati import backward
 from torchgco.ilqr.step import iterate
 from torchgco.kernels import EagerWarning, kernels_of
 from torchgco.lagrangian.expansion import linearise
@@ -182,13 +182,13 @@ def natively(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> P
 def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None, phr: bool) -> None:
     problem = PROBLEMS[name]()
     state, lagrangian = running_state(problem, guided, phr)
-    engine = engine_of(problem)
-    assert engine is not None
-    for mine, theirs in zip(engine.value(lagrangian, state.X, state.U), lagrangian.value(
+    kernels = in_c(problem)
+    assert kernels is not None
+    for mine, theirs in zip(kernels.value(lagrangian, state.X, state.U), lagrangian.value(
         state.X, state.U
     ), strict=True):  # fmt: skip
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(engine.open_loop(problem, state.U), state.X, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(kernels.open_loop(problem, state.U), state.X, rtol=1e-10, atol=1e-12)
     for inner, count in ((DAMPED, 1), (DAMPED, 4), (BRIEF, 4), (PRINTED, 4)):
         (a, first), (b, second) = running_state(problem, guided, phr), running_state(problem, guided, phr)
         ends = eager(inner, a, first, count)
@@ -219,9 +219,8 @@ def test_a_regularised_backward_pass_expects_pytorchs_change(mu_r: float) -> Non
     state, lagrangian = running_state(problem)
     mu = torch.full((5,), mu_r, dtype=torch.float64)
     want = backward(linearise(problem, state.X, state.U), lagrangian.expand_optimality(state.X, state.U), mu)
-    G, linear, quadratic, failed = engine_of(problem).gains(lagrangian, state.X, state.U, mu)
-    assert torch.equal(failed, want.failed) and not bool(failed.any())
-    mine = BackwardPass(G.transpose(0, 1), linear, quadratic, failed)
+    mine = in_c(problem).optimality_pass(lagrangian, state.X, state.U)(mu)
+    assert torch.equal(mine.failed, want.failed) and not bool(mine.failed.any())
     torch.testing.assert_close(mine.gains, want.gains, rtol=1e-8, atol=1e-8)
     for alpha in (0.25, 1.0):
         steps = torch.full_like(mu, alpha)
@@ -245,13 +244,13 @@ def test_multipliers_without_memory_are_zeros() -> None:
     assert all(torch.equal(a, b) for a, b in zip(none.lam, zero.lam, strict=True))
     some = replace(none, lam=tuple(torch.full_like(lam[:1, :1, :1], 0.3).expand_as(lam) for lam in none.lam))
     assert not any(lam.untyped_storage().nbytes() > 8 for multipliers in (none, some) for lam in multipliers.lam)
-    engine, U = engine_of(problem), 0.3 * U
-    assert engine is not None
-    X = engine.open_loop(problem, U)
+    kernels, U = in_c(problem), 0.3 * U
+    assert kernels is not None
+    X = kernels.open_loop(problem, U)
     worth = []
     for multipliers in (zero, none, some):
         lagrangian = Lagrangian(problem, multipliers, None, True)
-        values = engine.value(lagrangian, X, U)
+        values = kernels.value(lagrangian, X, U)
         torch.testing.assert_close(values, lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
         end, status = ilqr.descend(ILQR(max_iterations=6), lagrangian, U)
         worth.append((*values, end.X, end.U, end.merit, status))
@@ -365,7 +364,7 @@ def test_a_pivot_of_zero_is_a_failed_factorisation() -> None:
     native = natively(DAMPED, b, second, 1)
     assert bool(end.failed.all()) and a.regularisation.tolist() == [descent.REGULARISATION_FIRST] * 3
     assert native.used.tolist() == [descent.REGULARISATION_FIRST] * 3 and not bool(native.stuck.any())
-    assert engine_of(problem).gains(second, b.X, b.U, torch.zeros_like(b.merit))[3].all()
+    assert in_c(problem).optimality_pass(second, b.X, b.U)(torch.zeros_like(b.merit)).failed.all()
 
 
 @pytest.mark.parametrize(("times", "converges"), [(0.0, True), (1.0, True), (1.01, False)])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.engines import engine_of
+from tests.engines import in_c
 from tests.maps.test_field import random_grid
 from tests.native.lanes import drawn
 from tests.problems import assert_same_bits, planar_batch, quadrotor_batch, random_trajectory
@@ -63,15 +63,15 @@ def test_values_expansions_and_violations_are_pytorchs(d: int, interpolation: st
     X[:, 3, problem.dynamics.position] = field.origins - 7.0
     assert float(field.violation(X, U)[:-1].amax()) > 0.1 and not bool(field.violation(X, U)[-1].any())
     generator = torch.Generator().manual_seed(6)
-    engine = engine_of(problem)
-    assert engine is not None and not engine.functions  # nothing is traced
+    kernels = in_c(problem)
+    assert kernels is not None and not kernels.engine.functions  # nothing is traced
     for least in (0.5, 1.0):  # half of the multipliers aren't zero; all are
         zero = Multipliers.zero(problem, 3.0)
         lam = [torch.rand(t.shape, generator=generator, dtype=t.dtype).clamp(min=least) - least for t in zero.lam]
         lagrangian = Lagrangian(problem, Multipliers(tuple(lam), zero.mu), None, True)
-        torch.testing.assert_close(engine.value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
-        torch.testing.assert_close(engine.slack(lagrangian, X, U), lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
-        slopes, H = engine.expand(problem, X, U, lagrangian)
+        torch.testing.assert_close(kernels.value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(kernels.slack(lagrangian, X, U), lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
+        slopes, H = kernels.expand(problem, X, U, lagrangian)
         want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
         kept = [i for i in range(s + 1) if i != n]
         torch.testing.assert_close(slopes[:, :-1], want[:, :-1, kept, n], rtol=1e-10, atol=1e-9)

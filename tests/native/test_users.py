@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from tests.engines import engine_of
+from tests.engines import engine_of, in_c
 from tests.native.test_engine import DAMPED, eager, natively, normal, running_state
 from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
 from tests.problems import planar_batch, quick_gco
@@ -46,16 +46,16 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
     problem = PROBLEMS[name]()
     problem = problem.in_cost_units() if unit else problem
     state, lagrangian = running_state(problem)
-    engine, n = engine_of(problem), problem.n
-    assert engine is not None
-    values = engine.value(lagrangian, state.X, state.U)
+    kernels, n = in_c(problem), problem.n
+    assert kernels is not None
+    values = kernels.value(lagrangian, state.X, state.U)
     for mine, theirs in zip(values, lagrangian.value(state.X, state.U), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
     z = [i for i in range(n + 1 + problem.m) if i != n]
     H = lagrangian.expand(state.X, state.U).transpose(0, 1)
     expected = blocks(H[..., z, n], H[..., z, :][..., z])
     torch.testing.assert_close(
-        blocks(*engine.expand(problem, state.X, state.U, lagrangian)), expected, rtol=1e-10, atol=1e-10
+        blocks(*kernels.expand(problem, state.X, state.U, lagrangian)), expected, rtol=1e-10, atol=1e-10
     )
     for count in (1, 4):
         (a, first), (b, second) = running_state(problem), running_state(problem)
@@ -78,7 +78,7 @@ def test_at_rest_kinks_have_pytorchs_derivatives() -> None:
     X, U = torch.zeros(5, 13, 4, dtype=torch.float64), torch.zeros(5, 12, 2, dtype=torch.float64)
     H = X.new_zeros(5, 13, 7, 7)
     problem.cost.expand(X, U, H)
-    slopes, curvatures = engine_of(problem).expand(problem, X, U, None)
+    slopes, curvatures = in_c(problem).expand(problem, X, U, None)
     z = [0, 1, 2, 3, 5, 6]
     torch.testing.assert_close(blocks(slopes, curvatures), blocks(H[..., z, 4], H[..., z, :][..., z]))
 
@@ -86,23 +86,23 @@ def test_at_rest_kinks_have_pytorchs_derivatives() -> None:
 def test_a_subset_has_the_numbers_of_its_problems() -> None:
     problem = PROBLEMS["constraints"]()
     state, lagrangian = running_state(problem)
-    whole = engine_of(problem).value(lagrangian, state.X, state.U)[1]
+    whole = in_c(problem).value(lagrangian, state.X, state.U)[1]
     for rows in (torch.tensor([3]), torch.tensor([4, 0, 0, 2])):
         part = problem.take(rows)  # of a batch whose parameters are known; `alone` is of a new batch
         alone = PROBLEMS["constraints"]().take(rows)
         for some in (part, alone, part.take(torch.arange(len(rows)))):
             own = replace(lagrangian.take(rows), problem=some)
-            assert torch.equal(engine_of(some).value(own, state.X[rows], state.U[rows])[1], whole[rows])
+            assert torch.equal(in_c(some).value(own, state.X[rows], state.U[rows])[1], whole[rows])
 
 
 def test_the_library_may_be_compiled_for_one_problem_first() -> None:
     """The weight (1, 1) of one problem must not be taken for one that the whole batch shares."""
     problem, other = PROBLEMS["constraints"](), PROBLEMS["constraints"]()
     state, lagrangian = running_state(problem)
-    expected = engine_of(problem).value(lagrangian, state.X, state.U)[1]
+    expected = in_c(problem).value(lagrangian, state.X, state.U)[1]
     assert engine_of(other.take(torch.tensor([2]))) is not None
     again = replace(lagrangian, problem=other)
-    assert torch.equal(engine_of(other).value(again, state.X, state.U)[1], expected)
+    assert torch.equal(in_c(other).value(again, state.X, state.U)[1], expected)
 
 
 @pytest.mark.parametrize("name", ["per problem", "by knot", "constraints"])

@@ -131,7 +131,7 @@ BAD = {
     "vehicle": (dict(vehicle_radius=-1.0), "boxes.vehicle_radius: expected a number of at least 0 m"),
     "turn": (
         dict(rotations=[[1.0, 0, 0, 0]]),
-        "boxes.rotations: expected one set for all",
+        "boxes.rotations: expected shape \\(2, 1\\)",
     ),
     "missing rotation": (
         dict(rotations=[np.nan]),

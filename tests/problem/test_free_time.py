@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from tests.engines import compiled, engine_of
+from tests.engines import compiled, in_c
 from torchgco import (
     Body,
     Boxes,
@@ -302,10 +302,10 @@ def test_native_derivatives_of_references_are_autodiffs() -> None:
     X, U = (torch.rand(2, N + more, size, generator=draws, dtype=D) for more, size in ((1, 5), (0, 2)))
     X[..., 4] = 0.4 + 1.4 * X[..., 4]
     X[0, 3, 4], X[0, 4, 4], X[1, 2, 4] = 1.0, 2.5, -0.5  # at a row, beyond the last, before the first
-    engine = engine_of(whole)
-    assert engine is not None
+    kernels = in_c(whole)
+    assert kernels is not None
     lagrangian = Lagrangian(whole, Multipliers.zero(whole, 0.0), None, True)
-    slopes, H = engine.expand(whole, X, U, lagrangian)
+    slopes, H = kernels.expand(whole, X, U, lagrangian)
     total = lambda x, u: whole.cost.total(x, u).sum()
     dX, dU = torch.func.grad(total, (0, 1))(X, U)
     torch.testing.assert_close(slopes[..., :5], dX, rtol=1e-12, atol=1e-12)

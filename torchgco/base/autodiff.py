@@ -31,16 +31,9 @@ class WithoutReading(TorchFunctionMode):
     """
 
     READERS = (
-        "numpy",
-        "__array__",
-        "__dlpack__",
-        "tolist",
-        "data_ptr",
-        "storage",
-        "untyped_storage",
-        "__repr__",
+        "numpy", "__array__", "__dlpack__", "tolist", "data_ptr", "storage", "untyped_storage", "__repr__",
         "__format__",
-    )
+    )  # fmt: skip
     PLACED = ("tensor_split",)  # functions of PyTorch that read where to cut without any operation
 
     def __init__(self) -> None:
@@ -63,15 +56,11 @@ class WithoutReading(TorchFunctionMode):
         tensors = [value for value in values if isinstance(value, Tensor)]
         if tensors:
             self.seen.add(name)
-        if any(map(_stands_for_another, tensors)):
+        if any(is_functional(tensor) or is_functorch_wrapped_tensor(tensor) for tensor in tensors):
             found = ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
             self.refused = self.refused or found
             raise found
         self.read += tensors
-
-
-def _stands_for_another(value: Tensor) -> bool:
-    return is_functional(value) or is_functorch_wrapped_tensor(value)
 
 
 def slope_along(function: Callable[..., Tensor], args: tuple[Tensor, ...], tangents: tuple[Tensor, ...]) -> Tensor:

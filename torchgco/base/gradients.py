@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchgco.base.tree import mapped
+
 _recording: ContextVar[bool] = ContextVar("recording", default=False)
 
 
@@ -81,19 +83,9 @@ def asking(tree: Any) -> list[Tensor]:
 
 def without_gradients(tree: Any) -> Any:
     """The same numbers without gradients; parts that hold no tensor that asks for one are the same objects."""
-    if isinstance(tree, Tensor):
-        return tree.detach() if asks(tree) else tree
-    if not asking(tree):
+    if not asking(tree):  # it may hold itself
         return tree
-    parts = {name: without_gradients(part) for name, part in _parts(tree)}
-    if isinstance(tree, Mapping):
-        return parts
-    if isinstance(tree, (tuple, list)):
-        return type(tree)(*parts.values()) if hasattr(tree, "_fields") else type(tree)(parts.values())
-    twin = object.__new__(type(tree))  # a part has checked its other fields already
-    for name, part in parts.items():
-        object.__setattr__(twin, name, part)
-    return twin
+    return mapped(tree, lambda leaf: leaf.detach() if asks(leaf) else leaf)
 
 
 def _parts(tree: Any) -> list[tuple[Any, Any]]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from copy import copy
 from dataclasses import fields, is_dataclass, replace
 from functools import lru_cache
+from operator import is_
 from typing import Any, ClassVar, Self, TypeAlias
 
 import torch
@@ -37,7 +37,7 @@ class PerElement(Brief):
 
 
 def passed_on(part: str, *names: str) -> tuple[Any, ...]:
-    """Properties that are those of a part: `knots, dt = passed_on("inner", "knots", "dt")`."""
+    """Properties and methods that are those of a part: `knots, dt = passed_on("inner", "knots", "dt")`."""
     return tuple(property(lambda self, name=name: getattr(getattr(self, part), name)) for name in names)
 
 
@@ -64,18 +64,23 @@ def changed(part: Any, changes: Mapping[str, Any]) -> Any:
     """A dataclass with other values of some fields, which are checked already."""
     if not _is_plain(type(part)):
         return replace(part, **changes)
-    other = object.__new__(type(part))
+    other = object.__new__(type(part))  # each solve makes thousands
     for name in field_names(type(part)):
         object.__setattr__(other, name, changes[name] if name in changes else getattr(part, name))
     return other
 
 
 def _each(tree: Any, change: Callable[..., Any], *others: Any) -> Any:
-    """A dataclass with each of its fields changed; they are checked already."""
-    other = object.__new__(type(tree))
-    for name in field_names(type(tree)):
-        object.__setattr__(other, name, change(getattr(tree, name), *others))
-    return other
+    """A dataclass with each of its fields changed."""
+    return _made(type(tree), {name: change(getattr(tree, name), *others) for name in field_names(type(tree))})
+
+
+def _made(kind: type, values: Mapping[str, Any]) -> Any:
+    """An object with these values, which are checked and bound already."""
+    made = object.__new__(kind)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
 @lru_cache(maxsize=4096)
@@ -104,56 +109,60 @@ class LastTaken:
         return self._last[1]
 
 
-def cast(tree: Any, dtype: torch.dtype) -> Any:
-    """Every floating tensor in nested tuples and dataclasses in another precision; all else passes unchanged."""
+def mapped(tree: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """The same with change(tensor) in the place of every tensor in nested sequences, mappings and dataclasses.
+
+    Parts that hold none that it changes are the same objects.
+    """
     if isinstance(tree, Tensor):
-        return tree.to(dtype) if tree.is_floating_point() else tree
+        return change(tree)
+    if isinstance(tree, (tuple, list)):
+        leaves = [mapped(leaf, change) for leaf in tree]
+        if all(map(is_, leaves, tree)):
+            return tree
+        return type(tree)(*leaves) if hasattr(tree, "_fields") else type(tree)(leaves)
+    is_part = is_dataclass(tree) and not isinstance(tree, type)
+    if not is_part and not isinstance(tree, Mapping):
+        return tree
+    old: Any = vars(tree) if is_part else tree
+    new = {name: mapped(value, change) for name, value in old.items()}
+    if all(value is old[name] for name, value in new.items()):
+        return tree
+    return _made(type(tree), new) if is_part else new
+
+
+def cast(tree: Any, dtype: torch.dtype) -> Any:
+    """Every floating tensor in another precision."""
+    return mapped(tree, lambda leaf: leaf.to(dtype) if leaf.is_floating_point() else leaf)
+
+
+def moved(tree: Any, device: torch.device) -> Any:
+    """Every tensor on a device."""
+    return mapped(tree, lambda leaf: leaf.to(device))
+
+
+def own_mapped(tree: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """The same with change(tensor) in the place of the tensors of problems, in tuples and the fields of `PerElement`s.
+
+    All that leads to such a tensor is another object.
+    """
+    if isinstance(tree, Tensor):
+        return change(tree)
     if isinstance(tree, tuple):
-        return tuple(cast(leaf, dtype) for leaf in tree)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        other = object.__new__(type(tree))  # parts are checked and bound already
-        for name, value in vars(tree).items():
-            object.__setattr__(other, name, cast(value, dtype))
-        return other
+        leaves = (own_mapped(leaf, change) for leaf in tree)
+        return type(tree)(*leaves) if hasattr(tree, "_fields") else tuple(leaves)
+    if isinstance(tree, PerElement) and (tree.batched or tree.per_element):
+        names = (*tree.batched, *tree.per_element)
+        return _made(type(tree), vars(tree) | {name: own_mapped(getattr(tree, name), change) for name in names})
     return tree
 
 
 def apart(tree: Any) -> Any:
-    """The same with a tensor object of its own for every tensor, of the same memory, in tuples and `PerElement`s.
+    """`own_mapped` to tensor objects of its own, of the same memory.
 
     What else holds one of these tensors can then be distinguished from the tree.
     """
-    if isinstance(tree, Tensor):
-        return tree.detach()
-    if isinstance(tree, tuple):
-        leaves = (apart(leaf) for leaf in tree)
-        return type(tree)(*leaves) if hasattr(tree, "_fields") else tuple(leaves)
-    if isinstance(tree, PerElement) and (tree.batched or tree.per_element):
-        twin = copy(tree)  # parts are checked and bound already
-        for name in (*tree.batched, *tree.per_element):
-            object.__setattr__(twin, name, apart(getattr(tree, name)))
-        return twin
-    return tree
-
-
-def moved(tree: Any, device: torch.device) -> Any:
-    """Every tensor in nested tuples and dataclasses on a device; parts that are there are the same objects."""
-    if isinstance(tree, Tensor):
-        return tree.to(device)
-    if isinstance(tree, tuple):
-        leaves = [moved(leaf, device) for leaf in tree]
-        if all(new is old for new, old in zip(leaves, tree, strict=True)):
-            return tree
-        return type(tree)(*leaves) if hasattr(tree, "_fields") else tuple(leaves)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        parts = {name: moved(value, device) for name, value in vars(tree).items()}
-        if all(value is vars(tree)[name] for name, value in parts.items()):
-            return tree
-        copy = object.__new__(type(tree))  # parts are checked and bound already
-        for name, value in parts.items():
-            object.__setattr__(copy, name, value)
-        return copy
-    return tree
+    return own_mapped(tree, Tensor.detach)
 
 
 def copied(tree: Any) -> Any:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,7 +12,14 @@ from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
-from torchgco.compiled.numbers import Numbers, as_floats, numbers_of, with_numbers_as_they_are, with_own_numbers
+from torchgco.compiled.numbers import (
+    Numbers,
+    as_floats,
+    measured,
+    numbers_of,
+    with_numbers_as_they_are,
+    with_own_numbers,
+)
 from torchgco.compiled.stages import moved, stage_of, stages_between
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current
@@ -92,9 +97,7 @@ class MPPIController:
         Raises:
             InputError: states or numbers that don't fit. Nothing is changed then.
         """
-        state, (B, n) = as_floats(x, "x"), self._problem.x0.shape
-        if state.shape not in ((B, n), (n,)) or not math.isfinite(state.sum()):
-            raise InputError("x", f"finite states ({B}, {n}), or ({n},) for all vehicles", _said(state))
+        state, B = measured(x, *self._problem.x0.shape), self._problem.B
         self.numbers.write({**(numbers or {}), **named, "x0": state})
         with torch.no_grad(), torch.inference_mode(False), computing_on(CPU):
             before = moved(self.U, self._stages) if shift and self._commands else self.U
@@ -104,7 +107,3 @@ class MPPIController:
         self._commands += 1
         u = self.U[:, 0].clone()
         return u[0] if state.ndim == 1 and B == 1 else u
-
-
-def _said(state: np.ndarray) -> Any:
-    return state.shape if np.isfinite(state).all() else "NaN or infinity"

@@ -328,14 +328,10 @@ class Compiled:
                 kept.refresh_constraint(part)
         self._changed.clear()
         kept.start()
-        if kept.is_outdated:
-            self._refresh_captured(kept)
-
-    @_plainly()
-    def _refresh_captured(self, kept: Kept) -> None:
-        """Have C read what functions capture as it is now."""
-        if not kept.refresh_captured():
-            self._pack(self._now().renewed())
+        if kept.is_outdated:  # C reads what functions capture as it is now
+            with _plainly():
+                if not kept.refresh_captured():
+                    self._pack(self._now().renewed())
 
     def _now(self) -> Problem:
         """The problem with its numbers as they are, and nothing that was computed from others."""
@@ -346,7 +342,9 @@ class Compiled:
             self._refresh(shift)
         kept = self._kept
         if kept is None:
-            return self._by_solver_alone(able, shift, began, until)
+            with _plainly():
+                self._found = self._by_solver(shift if able.all() else None, until)
+                return self._answer(able & able.all(), began)
         good = late = np.zeros_like(able)
         if able.any():
             left = math.inf if until == math.inf else max(0.0, until - time.perf_counter())
@@ -359,22 +357,11 @@ class Compiled:
             kept.iterations.zero_()
         self._found = None
         if not good.all():
-            self._found = self._with_others(good, late, until)
+            with _plainly():
+                self._found, again = self._packed_solution(good), torch.from_numpy(~(good | late)).nonzero().flatten()
+                if again.numel() > 0:
+                    self._again(self._found, again, until)
         return self._answer(good, began)
-
-    @_plainly()
-    def _with_others(self, good: np.ndarray, late: np.ndarray, until: float) -> Solution:
-        """What C has found, and solves from the start of what is neither `good` nor `late`, (B,)."""
-        found, again = self._packed_solution(good), torch.from_numpy(~(good | late)).nonzero().flatten()
-        if again.numel() > 0:
-            self._again(found, again, until)
-        return found
-
-    @_plainly()
-    def _by_solver_alone(self, able: np.ndarray, shift: float, began: float, until: float) -> Answer:
-        """Where nothing is packed for C."""
-        self._found = self._by_solver(shift if able.all() else None, until)
-        return self._answer(able & able.all(), began)
 
     def _violation(self) -> Tensor:
         """The largest violations (B,) of the trajectories that C has rolled out."""

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.compiled.numbers import Floats, Number
+from torchgco.compiled.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers
 from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -136,14 +136,14 @@ def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:
     for number in found:
         if number.part == "cost" and number.name.rpartition(".")[2] in by_stage:
             number.check = partial(_steady, number, problem.N, number.check)
-    names = [name for name in ("least", "most", "weight", "guess") if getattr(time, name) is not None]
-    views = {name: getattr(time, name).numpy() for name in names}
-    joint = partial(_crossed, views)
-    checks = {"weight": _at_least_0}
-    return found + [
-        Number(f"time.{name}", (view,), "time", True, checks.get(name, _above_0), None, joint)
-        for name, view in views.items()
-    ]
+    tensors = {name: getattr(time, name) for name in ("least", "most", "weight", "guess")}
+    fields = {
+        name: (tensor, at_least_zero if name == "weight" else above_zero)
+        for name, tensor in tensors.items()
+        if tensor is not None
+    }
+    views = {name: tensor.numpy() for name, (tensor, _) in fields.items()}
+    return found + numbers("time", fields, "time", joint=partial(_crossed, views))
 
 
 def later(problem: Problem, last: Solution, shift: float) -> Solution:
@@ -184,7 +184,7 @@ def _copy(old: Any, new: Any) -> None:
             there.copy_(here)
 
 
-def _steady(number: Number, N: int, check: Any, new: Floats) -> tuple[str, Any] | None:
+def _steady(number: Number, N: int, check: Any, new: Floats) -> Wrong:
     """What is wrong with numbers by stage, which are the same at all stages where the time is free."""
     rows = np.moveaxis(new, new.ndim - len(number.shape) + 1, 0)[:N]
     if len(rows) > 1 and not (rows == rows[0]).all():
@@ -192,17 +192,7 @@ def _steady(number: Number, N: int, check: Any, new: Floats) -> tuple[str, Any] 
     return check(new)  # type: ignore[no-any-return]
 
 
-def _above_0(new: Floats) -> tuple[str, Any] | None:
-    good = np.isfinite(new).all() and (new > 0).all()
-    return None if good else ("factors of N dt above 0", new.tolist())
-
-
-def _at_least_0(new: Floats) -> tuple[str, Any] | None:
-    good = np.isfinite(new).all() and (new >= 0).all()
-    return None if good else ("a cost per second of at least 0", new.tolist())
-
-
-def _crossed(views: dict[str, Floats], new: Any) -> tuple[str, Any] | None:
+def _crossed(views: dict[str, Floats], new: Any) -> Wrong:
     own = {name: new.get(f"time.{name}", view) for name, view in views.items()}
     inner: Sequence[Floats] = [own["guess"]] if "guess" in own else []
     for low, high in zip([own["least"], *inner], [*inner, own["most"]], strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,10 +14,9 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Seconds, check_value
 from torchgco.base.status import Status
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Answer, Compiled, compile
-from torchgco.compiled.numbers import Numbers, as_floats
+from torchgco.compiled.numbers import Numbers, measured
 from torchgco.compiled.plan import Plan
-from torchgco.compiled.stages import check_loop_in_free_time, stage_of, stages_between
-from torchgco.constraints.bounds import RateBounds
+from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of, stages_between
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 
@@ -80,7 +78,7 @@ class MPC:
         self.max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
-        self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if _follows(part)]
+        self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if follows(part)]
         changes = None if changes is None else ["x0", *self._previous, *changes]
         self.compiled: Compiled = compile(problem, solver, changes, tolerance=tolerance)
         self._problem = problem
@@ -152,7 +150,7 @@ class MPC:
         Raises:
             InputError: states, a time or numbers that don't fit. Nothing is changed then.
         """
-        state, now = self._measured(x), self._time(t)
+        state, now = measured(x, *self._problem.x0.shape), self._time(t)
         if self._previous and self._u is not None and "previous" not in named:
             numbers = dict.fromkeys(self._previous, self._u) | dict(numbers or {})
         later = 0.0 if self.answer is None else self.period if t is None else now - self.t
@@ -181,14 +179,6 @@ class MPC:
         parts = answer.X, answer.U, answer.K, self._begun, self.dt, problem.dynamics, problem.control_bounds
         return Plan(*parts, answer.t)
 
-    def _measured(self, x: Any) -> np.ndarray:
-        state, (B, n) = as_floats(x, "x"), self._problem.x0.shape
-        if state.shape not in ((B, n), (n,)):
-            raise InputError("x", f"shape ({B}, {n}), or ({n},) for all vehicles", state.shape)
-        if not math.isfinite(state.sum()) and not np.isfinite(state).all():  # a sum takes a third of the time
-            raise InputError("x", "finite states", "NaN or infinity")
-        return state
-
     def _time(self, t: float | None) -> float:
         first = self.answer is None
         if t is None:
@@ -207,7 +197,3 @@ def _mixed(new: np.ndarray, plan: Plan, before: Plan) -> Plan:
     )
     knots = None if plan.knots is None else torch.where(rows.unsqueeze(-1), plan.knots, before.knots)  # type: ignore[arg-type]
     return replace(plan, X=X, U=U, K=K, start=np.where(new, plan.start, before.start), knots=knots)
-
-
-def _follows(part: Any) -> bool:
-    return isinstance(part, RateBounds) and part.previous is not None

@@ -6,26 +6,26 @@ stages stays shared.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.tree import PerElement
+from torchgco.base.tree import PerElement, own_mapped
 from torchgco.base.values import Values
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.costs.in_free_time import QuadraticInFreeTime
-from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite
+from torchgco.costs.quadratic import BoundQuadratic, check_semidefinite, unfit
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -33,6 +33,9 @@ from torchgco.problem.goal import Goal, GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
+Wrong: TypeAlias = tuple[str, Any] | None  # (expected, got); None: nothing is wrong
+Check: TypeAlias = Callable[[Floats], Wrong]
+Joint: TypeAlias = Callable[[Mapping[str, Floats]], Wrong]
 WEIGHTS = "Q", "R", "Qf"
 
 
@@ -55,9 +58,9 @@ class Number:
     views: tuple[Floats, ...]
     part: str | int
     derived: bool
-    check: Callable[[Floats], tuple[str, Any] | None]
+    check: Check
     after: Callable[[], object] | None = None
-    joint: Callable[[Mapping[str, Floats]], tuple[str, Any] | None] | None = None
+    joint: Joint | None = None
     shape: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -170,6 +173,20 @@ def as_floats(value: Any, name: str) -> Floats:
         raise InputError(name, "numbers", type(value).__name__) from None
 
 
+def measured(x: Any, B: int, n: int) -> Floats:
+    """States (B, n), or (n,) of all vehicles.
+
+    Raises:
+        InputError: another shape, no numbers, NaN or infinity.
+    """
+    state = as_floats(x, "x")
+    if state.shape not in ((B, n), (n,)):
+        raise InputError("x", f"shape ({B}, {n}), or ({n},) for all vehicles", state.shape)
+    if not math.isfinite(state.sum()) and not np.isfinite(state).all():  # a sum takes a third of the time
+        raise InputError("x", "finite states", "NaN or infinity")
+    return state
+
+
 def with_own_numbers(problem: Problem) -> Problem:
     """The same problems, with memory of its own for every number of every problem."""
     B = problem.B
@@ -198,7 +215,7 @@ def _goal_of(row: Constraint, problem: Problem) -> Goal:
 
 def numbers_of(problem: Problem) -> list[Number]:
     """The numbers of a problem that has memory of its own for each, `with_own_numbers`."""
-    found = [Number("x0", (_view(problem.x0),), "x0", False, lambda new: None)]
+    found = [Number("x0", (problem.x0.numpy(),), "x0", False, lambda new: None)]
     found += _of_cost(problem)
     found += _of_part(problem.dynamics, "dynamics", "dynamics")
     for i, part in enumerate(problem.constraints):
@@ -206,10 +223,10 @@ def numbers_of(problem: Problem) -> list[Number]:
         if isinstance(part, ControlBounds | StateBounds):
             found += _of_bounds(part, name, i)
         elif isinstance(part, GoalBall):
-            found.append(Number("goal.position", (_view(part.center[:, 0]),), i, True, _finite))
-            found.append(Number("goal.radius", (_view(part.upper[:, 0]),), i, True, _radii))
+            place, radius = part.center[:, 0], part.upper[:, 0]
+            found += numbers("goal", {"position": (place, _finite), "radius": (radius, above_zero)}, i)
         elif isinstance(part, GoalState):
-            found.append(Number("goal.state", (_view(part.state),), i, True, partial(_fixed, part)))
+            found += numbers("goal", {"state": (part.state, partial(_fixed, part))}, i)
         elif isinstance(part, GateBalls):
             found += _of_balls(part, i)
         elif isinstance(part, GateSquares):
@@ -219,16 +236,31 @@ def numbers_of(problem: Problem) -> list[Number]:
         elif isinstance(part, BoundSpheres):
             found += _of_spheres(part, name, i)
         elif isinstance(part, BoundBoxes) and not bool(part.absent.any()):
-            found.append(Number(f"{name}.centers", (_view(part.centers),), i, True, _present))
+            found += numbers(name, {"centers": (part.centers, _present)}, i)
         elif not isinstance(part, Obstacles):
             found += _of_part(part, name, i)
     return found
 
 
+def numbers(
+    where: str,
+    fields: Mapping[str, tuple[Tensor, Check]],
+    part: str | int,
+    derived: bool = True,
+    after: Callable[[], object] | None = None,
+    joint: Joint | None = None,
+) -> list[Number]:
+    """A number for each of these fields, with its check; all else as of `Number`."""
+    return [
+        Number(f"{where}.{name}", (tensor.numpy(),), part, derived, check, after, joint)
+        for name, (tensor, check) in fields.items()
+    ]
+
+
 def with_numbers_as_they_are(problem: Problem) -> Problem:
     """The same problems after numbers were written, with nothing that was computed from the previous ones."""
-    constraints = tuple(_renewed(part) for part in problem.constraints)
-    known = replace(problem.known, row_shapes=None, interior=None, packed={}, cost=(None, 0, None), lifted={})
+    constraints = tuple(c.remade() if isinstance(c, BoundSpheres) else c for c in problem.constraints)
+    known = replace(problem.known, row_shapes=None, interior=None, packed={}, lifted={})
     now = problem._with({"constraints": constraints}, known)
     if now.goal is None or now.goal.assumed:
         dims = now._dimensions(now.x0)
@@ -236,29 +268,15 @@ def with_numbers_as_they_are(problem: Problem) -> Problem:
     return now
 
 
-def _renewed(part: Any) -> Any:
-    """A part of a problem with what was derived from its numbers made again."""
-    if not isinstance(part, BoundSpheres):
-        return part
-    made = BoundSpheres.prepare(
-        part.centers, part.inflated_radii, part.velocities, part.absent, part.vehicle_radius, part.knots,
-        part.position, part.dt,
-    )  # fmt: skip
-    return replace(made, stops=part.stops)
-
-
 def _own(part: Any, B: int) -> Any:
     """A part of a problem with copies of all its numbers, one for every problem."""
-    if isinstance(part, Tensor):
-        return part.expand(B, *part.shape[1:]).clone(memory_format=torch.contiguous_format) if part.dim() else part
-    if isinstance(part, tuple):
-        return tuple(_own(leaf, B) for leaf in part)
-    if not isinstance(part, PerElement):
-        return part
-    twin = copy(part)
-    for name in (*part.batched, *part.per_element):
-        object.__setattr__(twin, name, _own(getattr(part, name), B))
-    return twin
+
+    def each(value: Tensor) -> Tensor:
+        if value.dim() == 0:
+            return value
+        return value.expand(B, *value.shape[1:]).clone(memory_format=torch.contiguous_format)
+
+    return own_mapped(part, each)
 
 
 def _of_cost(problem: Problem) -> list[Number]:
@@ -267,28 +285,28 @@ def _of_cost(problem: Problem) -> list[Number]:
         cost, after = cost.cost, cost.write
     if type(cost) is not BoundQuadratic:
         return _of_part(cost, "cost", "cost")
-    found = [Number("cost.x_ref", (_view(cost.x_ref), _view(cost.xf_ref)), "cost", False, _finite, after)]
+    found = [Number("cost.x_ref", (cost.x_ref.numpy(), cost.xf_ref.numpy()), "cost", False, _finite, after)]
     for name in ("u_ref", *WEIGHTS, "q", "r", "qf", "H"):
         tensor = getattr(cost, name)
         if tensor is not None:
-            check = _finite if name not in WEIGHTS else _weights if cost.diagonal else _matrices
+            check = _finite if name not in WEIGHTS else at_least_zero if cost.diagonal else _matrices
             joint = _semidefinite(cost) if name in ("Q", "R", "H") and cost.H is not None else None
-            found.append(Number(f"cost.{name}", (_view(tensor),), "cost", False, check, joint=joint))
+            found += numbers("cost", {name: (tensor, check)}, "cost", False, joint=joint)
     return found
 
 
-def _semidefinite(cost: BoundQuadratic) -> Callable[[Mapping[str, Floats]], None]:
+def _semidefinite(cost: BoundQuadratic) -> Joint:
     """A check of Q, R and H together: each alone may be fine, and the stage cost still fall without end."""
 
     def check(new: Mapping[str, Floats]) -> None:
-        own = {name: new.get(f"cost.{name}", _view(getattr(cost, name))) for name in (*WEIGHTS, "H")}
+        own = {name: new.get(f"cost.{name}", getattr(cost, name).numpy()) for name in (*WEIGHTS, "H")}
         check_semidefinite(**{name: torch.tensor(weights) for name, weights in own.items()})
 
     return check
 
 
 def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Number]:
-    def check(new: Floats, side: str) -> tuple[str, Any] | None:
+    def check(new: Floats, side: str) -> Wrong:
         sign = 1.0 if side == "lower" else -1.0
         bounded = np.zeros(part.lower.shape[-1], dtype=bool)
         bounded[part.below if side == "lower" else part.above] = True
@@ -296,62 +314,52 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
         if np.isnan(new).any() or (new == sign * np.inf).any():
             return f"numbers or {-sign * np.inf}", new.tolist()
         if np.isfinite(free).any():
-            return "infinity in components that were infinite when the problem was compiled; give them 1e9 then", (
-                float(free[np.isfinite(free)][0])
-            )
+            expected = "infinity in components that were infinite when the problem was compiled; give them 1e9 then"
+            return expected, float(free[np.isfinite(free)][0])
         return None
 
-    def joint(new: Mapping[str, Floats]) -> tuple[str, Any] | None:
-        lower, upper = (new.get(f"{name}.{side}", _view(getattr(part, side))) for side in ("lower", "upper"))
-        over = np.nonzero(lower > upper)
-        if not len(over[0]):
-            return None
-        return "lower bounds of at most the upper ones", f"{lower[over][0]:g} and {upper[over][0]:g}"
+    fields = {side: (getattr(part, side), partial(check, side=side)) for side in ("lower", "upper")}
+    crossed = _crossed(part, name, np.greater, "lower bounds of at most the upper ones")
+    return numbers(name, fields, i, joint=crossed)
 
-    return [
-        Number(f"{name}.{side}", (_view(getattr(part, side)),), i, True, partial(check, side=side), joint=joint)
-        for side in ("lower", "upper")
-    ]
+
+def _crossed(part: Any, name: str, is_over: Callable[..., Any], expected: str) -> Joint:
+    """A check of lower and upper bounds together."""
+
+    def check(new: Mapping[str, Floats]) -> Wrong:
+        bounds = (new.get(f"{name}.{side}", getattr(part, side).numpy()) for side in ("lower", "upper"))
+        lower, upper = np.broadcast_arrays(*bounds)
+        over = is_over(lower, upper)
+        return (expected, f"{lower[over][0]:g} and {upper[over][0]:g}") if over.any() else None
+
+    return check
 
 
 def _of_vectors(part: NormBounds | Cone, name: str, i: int) -> list[Number]:
     """Of bounds on norms and of cones; an axis may have any length above 0."""
-
-    def joint(new: Mapping[str, Floats]) -> tuple[str, Any] | None:
-        lower, upper = (new.get(f"{name}.{side}", _view(getattr(part, side))) for side in ("lower", "upper"))
-        over = np.nonzero(~(lower < upper))
-        if not len(over[0]):
-            return None
-        return "lower bounds below the upper ones", f"{(lower + 0 * upper)[over][0]:g}"
-
-    checks: dict[str, Callable[[Floats], tuple[str, Any] | None]] = {
-        "lower": _lengths, "upper": _above_zero, "center": _finite, "apex": _finite, "angle": _angles, "axis": _axes,
+    checks: dict[str, Check] = {
+        "lower": _lengths, "upper": _above_zero_or_infinite, "center": _finite, "apex": _finite, "angle": _angles,
+        "axis": _axes,
     }  # fmt: skip
     both = all(getattr(part, side, None) is not None for side in ("lower", "upper"))
-    return [
-        Number(f"{name}.{field}", (_view(getattr(part, field)),), i, True, checks[field], joint=joint if both else None)
-        for field in part.per_element
-        if field in checks and getattr(part, field) is not None
-    ]
+    crossed = _crossed(part, name, np.greater_equal, "lower bounds below the upper ones") if both else None
+    given = {field: getattr(part, field) for field in part.per_element if field in checks}
+    fields = {field: (tensor, checks[field]) for field, tensor in given.items() if tensor is not None}
+    return numbers(name, fields, i, joint=crossed)
 
 
 def _of_balls(part: GateBalls, i: int) -> list[Number]:
     """Of gates, which keep their knots."""
     centers, radii = part.centers, part.sizes
-    write = lambda: part.write(centers, radii)
-    return [
-        Number("gates.centers", (_view(centers),), i, True, _finite, write),
-        Number("gates.radius", (_view(radii),), i, True, _radii, write),
-    ]
+    fields = {"centers": (centers, _finite), "radius": (radii, above_zero)}
+    return numbers("gates", fields, i, after=lambda: part.write(centers, radii))
 
 
 def _of_squares(part: GateSquares, i: int) -> list[Number]:
     normals = part.axes[:, :, 0].clone()
-    return [
-        Number("gates.centers", (_view(part.centers),), i, True, _finite, part.write),
-        Number("gates.half_widths", (_view(part.half_widths),), i, True, _radii, part.write),
-        Number("gates.normals", (_view(normals),), i, True, _axes, lambda: part.write(normals)),
-    ]
+    fields = {"centers": (part.centers, _finite), "half_widths": (part.half_widths, above_zero)}
+    found = numbers("gates", fields, i, after=part.write)
+    return found + numbers("gates", {"normals": (normals, _axes)}, i, after=lambda: part.write(normals))
 
 
 def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
@@ -360,13 +368,11 @@ def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
     vehicle = part.vehicle_radius.unsqueeze(-1)
     radii = part.inflated_radii - vehicle
     inflate = lambda: torch.add(radii, vehicle, out=part.inflated_radii)
-    found = [
-        Number(f"{name}.centers", (_view(part.centers),), i, False, _present),
-        Number(f"{name}.radii", (_view(radii),), i, True, _lengths, inflate),
-        Number(f"{name}.vehicle_radius", (_view(part.vehicle_radius),), i, True, _lengths, inflate),
-    ]
+    found = numbers(name, {"centers": (part.centers, _present)}, i, derived=False)
+    sizes = {"radii": (radii, _lengths), "vehicle_radius": (part.vehicle_radius, _lengths)}
+    found += numbers(name, sizes, i, after=inflate)
     if part.velocities is not None:
-        found.append(Number(f"{name}.velocities", (_view(part.velocities),), i, False, _present))
+        found += numbers(name, {"velocities": (part.velocities, _present)}, i, derived=False)
     return found
 
 
@@ -375,70 +381,59 @@ def _of_part(part: Any, name: str, place: str | int) -> list[Number]:
     found = []
     for field in (*part.batched, *part.per_element) if isinstance(part, PerElement) else ():
         value = getattr(part, field)
+        tensors: dict[str, Any] = {field: value}
         if isinstance(value, Values):
             names = (*value.names, *value.knot_names)
-            for own, tensor in zip(names, (*value.rows, *value.knot_rows), strict=True):
-                if tensor.is_floating_point():
-                    found.append(Number(f"{name}.{own}", (_view(tensor),), place, True, _finite))
-        elif isinstance(value, Tensor) and value.is_floating_point() and value.dim() > 0:
-            found.append(Number(f"{name}.{field}", (_view(value),), place, True, _finite))
+            tensors = dict(zip(names, (*value.rows, *value.knot_rows), strict=True))
         elif isinstance(value, PerElement):
             found += _of_part(value, f"{name}.{field}", place)
+        for own, tensor in tensors.items():
+            if isinstance(tensor, Tensor) and tensor.is_floating_point() and tensor.dim() > 0:
+                found += numbers(name, {own: (tensor, _finite)}, place)
     return found
-
-
-def _view(tensor: Tensor) -> Floats:
-    return tensor.numpy()
 
 
 def _short(name: str) -> str:
     return name.rpartition(".")[2]
 
 
-def _finite(new: Floats) -> tuple[str, Any] | None:
+def _finite(new: Floats) -> Wrong:
     return None if np.isfinite(new).all() else ("finite numbers", "NaN or infinity")
 
 
-def _present(new: Floats) -> tuple[str, Any] | None:
+def _present(new: Floats) -> Wrong:
     return None if np.isfinite(new).all() else ("finite numbers (put an obstacle far away to be rid of it)", "others")
 
 
-def _lengths(new: Floats) -> tuple[str, Any] | None:
+def _lengths(new: Floats) -> Wrong:
     return _finite(new) or (None if (new >= 0).all() else ("lengths of at least 0", float(new.min())))
 
 
-def _radii(new: Floats) -> tuple[str, Any] | None:
-    return _finite(new) or _above_zero(new)
+def above_zero(new: Floats) -> Wrong:
+    return _finite(new) or (None if (new > 0).all() else ("numbers above 0", float(new.min())))
 
 
-def _fixed(part: GoalState, new: Floats) -> tuple[str, Any] | None:
-    free = np.isnan(_view(part.state)[0])
+def at_least_zero(new: Floats) -> Wrong:
+    return _finite(new) or (None if (new >= 0).all() else ("numbers of at least 0", float(new.min())))
+
+
+def _above_zero_or_infinite(new: Floats) -> Wrong:
+    return None if (new > 0).all() else ("numbers above 0, or infinity", float(new.min()))
+
+
+def _fixed(part: GoalState, new: Floats) -> Wrong:
+    free = np.isnan(part.state.numpy()[0])
     fits = (np.isnan(new) == free).all() and np.isfinite(new[..., ~free]).all()
     return None if fits else ("finite numbers, and NaN in the components that are free at the end", new.tolist())
 
 
-def _above_zero(new: Floats) -> tuple[str, Any] | None:
-    return None if (new > 0).all() else ("numbers above 0, or infinity", float(new.min()))
-
-
-def _angles(new: Floats) -> tuple[str, Any] | None:
+def _angles(new: Floats) -> Wrong:
     return None if ((new > 0) & (new < np.pi)).all() else ("angles in rad, above 0 and below pi", new.tolist())
 
 
-def _axes(new: Floats) -> tuple[str, Any] | None:
+def _axes(new: Floats) -> Wrong:
     return _finite(new) or (None if (np.abs(new).max(-1) > 0).all() else ("vectors other than 0", new.tolist()))
 
 
-def _weights(new: Floats) -> tuple[str, Any] | None:
-    return _finite(new) or (None if (new >= 0).all() else ("weights of at least 0", float(new.min())))
-
-
-def _matrices(new: Floats) -> tuple[str, Any] | None:
-    if (wrong := _finite(new)) is not None:
-        return wrong
-    lowest = float(np.linalg.eigvalsh(0.5 * (new + np.swapaxes(new, -1, -2))).min())
-    size = float(np.abs(new).max())
-    if float(np.abs(new - np.swapaxes(new, -1, -2)).max()) > 1e-9 * max(size, 1.0):
-        return "symmetric matrices", "unsymmetric ones"
-    semidefinite = lowest >= -1e-9 * max(size, 1.0)
-    return None if semidefinite else ("positive semidefinite weights", f"an eigenvalue of {lowest:.3g}")
+def _matrices(new: Floats) -> Wrong:
+    return _finite(new) or unfit(torch.from_numpy(new))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import CPU, computing_on
-from torchgco.compiled.numbers import as_floats
+from torchgco.compiled.numbers import measured
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.problem.between import between
@@ -120,10 +120,7 @@ class Plan:
 
     def _states(self, x: Any) -> Tensor:
         B, _, n = self.X.shape
-        given = as_floats(x, "x")
-        if given.shape not in ((B, n), (n,)) or not np.isfinite(given).all():
-            raise InputError("x", f"finite states ({B}, {n})", shown(given.shape))
-        return torch.from_numpy(given).expand(B, n)
+        return torch.from_numpy(measured(x, B, n)).expand(B, n)
 
     def _states_at(self, k: np.ndarray, share: np.ndarray) -> Tensor:
         """The states (B, n) after shares (B,) of the stages k (B,)."""

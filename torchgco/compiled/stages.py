@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -42,9 +44,14 @@ def check_loop_in_free_time(problem: Problem, period: float) -> None:
     shortest = dt * time.least[:, time.of_stages(problem.N)].sum(-1)
     if bool((shortest < period * (1.0 - STAGE_ROUNDING)).any()):
         raise InputError("time.least", f"a shortest duration of at least a period, {period:g} s", float(shortest.min()))
-    if any(isinstance(part, RateBounds) and part.previous is not None for part in problem.constraints):
+    if any(map(follows, problem.constraints)):
         expected = "None in a loop in free time, whose stages aren't its periods"
         raise InputError("rate_bounds.previous", expected, "controls")
+
+
+def follows(part: Any) -> bool:
+    """Whether a constraint counts from the controls before."""
+    return isinstance(part, RateBounds) and part.previous is not None
 
 
 def _check_no_gates(problem: Problem) -> None:

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
-from torchgco.base.errors import InputError, shown, theirs, undefined
-from torchgco.base.mixing import foreign, why
+from torchgco.base.errors import InputError, shown, undefined
 from torchgco.base.options import check_options
-from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
+from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.costs.base import add_blocks
@@ -108,14 +107,11 @@ class WrappedConstraint(Constraint):
     keeps_rows: ClassVar[bool] = False  # whether rows, and by how much they are violated, are those of the other one
 
     sense, geometric, knots = passed_on("constraint", "sense", "geometric", "knots")
-    bare, row_radii = passed_on("constraint", "bare", "row_radii")
+    bare, row_radii, start_is_clear = passed_on("constraint", "bare", "row_radii", "start_is_clear")
     calls_function = property(lambda self: is_users(self.constraint))
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, constraint=self.constraint.grown(by))
-
-    def start_is_clear(self, x0: Tensor) -> Tensor:
-        return self.constraint.start_is_clear(x0)
 
 
 def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
@@ -123,11 +119,6 @@ def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: 
     H[:, knots, at, n] += gradient
     H[:, knots, n, at] += gradient
     H[:, knots, at, at] += hessian
-
-
-def innermost(constraint: Constraint) -> Constraint:
-    """The constraint within all that wraps it."""
-    return innermost(constraint.constraint) if isinstance(constraint, WrappedConstraint) else constraint
 
 
 def count_of(index: slice | Tensor, of: int) -> int:
@@ -204,23 +195,10 @@ class FunctionConstraint(Constraint):
             raise InputError(f"{self.name}.geometric", "a function of x alone", f"of={self.of!r}")
         last, first = (dims.N, 1) if self.of == "x" else (dims.N - 1, 0)
         knots = resolve_knots(self.knots, last, f"{self.name}.knots", dims.like.device, first)
-        where = f"{self.name}.function"
         if not callable(self.function):
-            raise InputError(where, f"a function of {' and '.join(self.of)}", shown(self.function))
+            raise InputError(f"{self.name}.function", f"a function of {' and '.join(self.of)}", shown(self.function))
         values = bound_values(self.values, self.knot_values, (self.function,), dims, self.name)
-        bound = replace(self, knots=knots, values=values)
-        one = bound.take(slice(0, 1))  # a whole batch may be large; `Problem` tries two problems
-        zeros = [dims.like.new_zeros(1, *size) for size in ((last + 1, dims.n), (dims.N, dims.m))]
-        try:
-            rows = one.value(*zeros)
-        except MISTAKES as error:
-            got = why(error, one.value, *zeros)
-            raise InputError(where, f"a function of {' and '.join(self.of)}", got) from theirs(error)
-        check_shape(rows, (1, count_of(knots, last + 1), "p"), where)
-        if rows.dtype != dims.like.dtype:
-            got = foreign(dims.like.dtype, one.value, *zeros) or str(rows.dtype)
-            raise InputError(where, f"rows of {dims.like.dtype} as x0", got)
-        return bound
+        return replace(self, knots=knots, values=values)
 
     @property
     def reads_knots(self) -> bool:

@@ -51,10 +51,10 @@ class _Bounds(Constraint):
             lower, upper = (bound if bound.dim() == 3 else bound.unsqueeze(1) for bound in (lower, upper))
         if bool((lower > upper).any()):
             raise InputError(f"{name}.lower", "at most the upper bound", f"{lower.tolist()} over {upper.tolist()}")
-        above, below = (torch.isfinite(bound).flatten(0, -2).any(dim=0).nonzero().flatten() for bound in (upper, lower))
-        if above.numel() + below.numel() == 0:
+        above, below = map(_bounded, (upper, lower))
+        if count_of(above, size) + count_of(below, size) == 0:
             raise InputError(name, "at least one finite bound", "none")
-        return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
+        return replace(self, lower=lower, upper=upper, knots=knots, above=above, below=below)
 
     @property
     def _first_knot(self) -> int:
@@ -154,8 +154,9 @@ class _Bounds(Constraint):
             H[:, self.knots, at, at] += torch.diag_embed(diagonal)
 
 
-def _range(components: Tensor) -> slice | Tensor:
-    """Components as a slice where they are adjacent: indexing then makes a view, not a copy."""
+def _bounded(bound: Tensor) -> slice | Tensor:
+    """The bounded components, as a slice where they are adjacent: indexing then makes a view, not a copy."""
+    components = torch.isfinite(bound).flatten(0, -2).any(dim=0).nonzero().flatten()
     first, count = int(components[0]) if components.numel() else 0, components.numel()
     adjacent = components.tolist() == list(range(first, first + count))
     return slice(first, first + count) if adjacent else components
@@ -179,8 +180,7 @@ def joined_bounds(parts: Sequence[ControlBounds], N: int) -> ControlBounds | Non
     lower, upper = zip(*(part.over(N) for part in parts), strict=True)
     upper = reduce(torch.minimum, upper)
     lower = torch.minimum(reduce(torch.maximum, lower), upper)
-    above, below = (torch.isfinite(bound).flatten(0, -2).any(dim=0).nonzero().flatten() for bound in (upper, lower))
-    ends = {"above": _range(above), "below": _range(below)}
+    ends = {"above": _bounded(upper), "below": _bounded(lower)}
     return replace(parts[0], lower=lower.contiguous(), upper=upper.contiguous(), knots=slice(0, N), **ends)
 
 
@@ -240,6 +240,12 @@ class RateBounds(_Bounds):
         """Which controls are bounded, (r,) int64."""
         every = torch.arange(self.upper.shape[-1], device=self.upper.device)
         return torch.cat((every[self.above], every[self.below])).unique()
+
+    @property
+    def before(self) -> Tensor:
+        """The bounded controls of the stage before the first, (B|1, r), in a solver: 0 where they are free."""
+        every = self.upper.new_zeros(1, self.upper.shape[-1]) if self.previous is None else self.previous
+        return every[:, self.controls]
 
     def with_states_from(self, first: int) -> Self:
         """The same rows for a solver's states, of which those from `first` on are the bounded controls of k - 1."""

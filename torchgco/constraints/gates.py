@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
-from torchgco.constraints.base import Constraint, innermost, whole
+from torchgco.constraints.base import Constraint, whole
 from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
 
 
@@ -199,7 +199,7 @@ def has_gates(problem: Any) -> bool:
 
 def gates_of(problem: Any) -> GateBalls | GateSquares | None:
     """The first gates that a trajectory has to pass; None where there are none."""
-    bare = (innermost(part) for part in problem.constraints)
+    bare = (part.bare for part in problem.constraints)
     return next((part for part in bare if isinstance(part, GateBalls | GateSquares)), None)
 
 
@@ -207,8 +207,8 @@ def _given(knots: Any, dims: Dimensions, G: int, gap: int, ends: Tensor) -> Tens
     """Knots (B, G), given so or as (G,)."""
     name, expected = "gates.knots", f"{G} whole numbers, or {dims.B} rows of them"
     try:
-        rows = [[whole(k) for k in row] for row in knots] if _nested(knots) else [[whole(k) for k in knots]] * dims.B
-        found = torch.tensor(rows, device="cpu")
+        rows = knots if len(knots) and hasattr(knots[0], "__len__") else [knots] * dims.B
+        found = torch.tensor([[whole(k) for k in row] for row in rows], device="cpu")
     except (TypeError, ValueError):
         raise InputError(name, expected, shown(knots)) from None
     if tuple(found.shape) != (dims.B, G):
@@ -219,10 +219,6 @@ def _given(knots: Any, dims: Dimensions, G: int, gap: int, ends: Tensor) -> Tens
     if bool((found < 1).any() | (found > ends.unsqueeze(-1)).any()):
         raise InputError(name, f"knots within 1..{int(ends.min())}", found.tolist())
     return found.to(dims.like.device)
-
-
-def _nested(knots: Any) -> bool:
-    return len(knots) > 0 and hasattr(knots[0], "__len__")
 
 
 def _by_length(centers: Tensor, dims: Dimensions, gap: int, ends: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.base.shapes import Dimensions, lead
-from torchgco.base.tree import PerElement, is_users
+from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import whole_numbers_become
 
 
@@ -89,13 +89,7 @@ class WrappedCost(Cost):
     cost: Cost
 
     calls_function = property(lambda self: is_users(self.cost))
-    reads_knots = property(lambda self: self.cost.reads_knots)
-
-    def rest_controls(self, like: Tensor) -> Tensor:
-        return self.cost.rest_controls(like)
-
-    def goal(self, x0: Tensor) -> Tensor | None:
-        return self.cost.goal(x0)
+    reads_knots, rest_controls, goal = passed_on("cost", "reads_knots", "rest_controls", "goal")
 
 
 @dataclass(frozen=True)
@@ -127,18 +121,14 @@ class ShiftedCost(WrappedCost):
 
     batched: ClassVar[tuple[str, ...]] = ("cost", "shift")
 
+    terminal, expand = passed_on("cost", "terminal", "expand")
+
     def scaled(self, factor: Tensor) -> ShiftedCost:
         return ShiftedCost(self.cost.scaled(factor), self.shift * factor)
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         value = self.cost.stage(x, u, k)
         return value - lead(self.shift, value)
-
-    def terminal(self, x: Tensor) -> Tensor:
-        return self.cost.terminal(x)
-
-    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
-        self.cost.expand(X, U, H)
 
 
 def add_blocks(

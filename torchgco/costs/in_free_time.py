@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base.tree import passed_on
 from torchgco.costs.base import Cost, WrappedCost
 
 
@@ -31,6 +32,8 @@ class QuadraticInFreeTime(WrappedCost):
     batched: ClassVar[tuple[str, ...]] = ("cost",)
     per_element: ClassVar[tuple[str, ...]] = ("along", "rests")
 
+    stage, terminal = passed_on("cost", "stage", "terminal")
+
     @classmethod
     def of(cls, cost: Any) -> QuadraticInFreeTime | None:
         """That of a BoundQuadratic; None where no reference of states differs from stage to stage."""
@@ -47,12 +50,6 @@ class QuadraticInFreeTime(WrappedCost):
         """The cost of what states differ by from references."""
         zero = torch.zeros_like(self.cost.xf_ref[:1])
         return replace(self.cost, x_ref=zero.unsqueeze(1), xf_ref=zero)
-
-    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        return self.cost.stage(x, u, k)
-
-    def terminal(self, x: Tensor) -> Tensor:
-        return self.cost.terminal(x)
 
     def stage_at(self, x: Tensor, u: Tensor, k: int | Tensor, tau: Tensor) -> Tensor:
         """`stage` where stages last tau (...) times as long."""

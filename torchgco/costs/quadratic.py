@@ -45,7 +45,7 @@ class QuadraticCost(Cost):
         B, N, n, m = dims.B, dims.N, dims.n, dims.m
         Q, R = _weight(self.Q, "Q", n, B, N, dims.like), _weight(self.R, "R", m, B, N, dims.like)
         Qf = _weight(self.Qf, "Qf", n, B, None, dims.like)
-        H = None if self.H is None else _cross(self.H, m, n, B, N, dims.like)
+        H = None if self.H is None else _shaped(tensor(self.H, "cost.H", dims.like), "H", (m, n), B, N)
         check_semidefinite(Q.detach(), R.detach(), Qf.detach(), None if H is None else H.detach())
         x_ref = _vector(self.x_ref, "x_ref", n, B, N + 1, dims.like)
         weights = (self.Q, Q), (self.R, R), (self.Qf, Qf)
@@ -184,47 +184,30 @@ class BoundQuadratic(Cost):
 def _weight(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor:
     """A weight as (B|1, N|1, size, size), without the stage axis where N is None."""
     W = tensor(value, f"cost.{field}", like)
-    if W.dim() == 1:
-        W = torch.diag(W)
-    if N is None:
-        W = W.unsqueeze(0) if W.dim() == 2 else W
-        check_shape(W, (_one_of(W, 0, B), size, size), f"cost.{field}")
-    else:
-        W = W[(None,) * (4 - W.dim())] if W.dim() < 4 else W
-        check_shape(W, (_one_of(W, 0, B), _one_of(W, 1, N), size, size), f"cost.{field}")
-    return W
-
-
-def _cross(value: Any, m: int, n: int, B: int, N: int, like: Tensor) -> Tensor:
-    H = tensor(value, "cost.H", like)
-    H = H[(None,) * (4 - H.dim())] if H.dim() < 4 else H
-    check_shape(H, (_one_of(H, 0, B), _one_of(H, 1, N), m, n), "cost.H")
-    return H
+    return _shaped(torch.diag(W) if W.dim() == 1 else W, field, (size, size), B, N)
 
 
 def _vector(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor:
     """A reference or linear term as (B|1, N|1, size), without the stage axis where N is None."""
     v = tensor(value, f"cost.{field}", like)
-    v = v.expand(size) if v.dim() == 0 else v
-    if N is None:
-        v = v.unsqueeze(0) if v.dim() == 1 else v
-        check_shape(v, (_one_of(v, 0, B), size), f"cost.{field}")
-    else:
-        v = v[(None,) * (3 - v.dim())] if v.dim() < 3 else v
-        check_shape(v, (_one_of(v, 0, B), _one_of(v, 1, N), size), f"cost.{field}")
+    v = _shaped(v.expand(size) if v.dim() == 0 else v, field, (size,), B, N)
     check_finite(v, f"cost.{field}")
     return v
+
+
+def _shaped(value: Tensor, field: str, own: tuple[int, ...], B: int, N: int | None) -> Tensor:
+    """Values (B|1, N|1, *own) with axes of length 1 where there are none, without the stage axis where N is None."""
+    lengths = (B,) if N is None else (B, N)
+    value = value[(None,) * (len(lengths) + len(own) - value.dim())]
+    shared = (1 if value.dim() > i and value.shape[i] == 1 else length for i, length in enumerate(lengths))
+    check_shape(value, (*shared, *own), f"cost.{field}")
+    return value
 
 
 def _optional(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor | None:
     """A linear term, None where it is zero throughout, and no gradient is asked for, which needn't be."""
     v = _vector(value, field, size, B, N, like)
     return v if asks(v) or bool((v != 0).any()) else None
-
-
-def _one_of(value: Tensor, axis: int, length: int) -> int:
-    """The length that an axis may have: 1 (shared) or `length`."""
-    return 1 if value.dim() > axis and value.shape[axis] == 1 else length
 
 
 def _is_diagonal(given: Any, W: Tensor) -> bool:
@@ -243,10 +226,14 @@ def check_semidefinite(Q: Tensor, R: Tensor, Qf: Tensor, H: Tensor | None) -> No
         blocks["H"] = torch.cat((torch.cat((Q, H.mT), -1), torch.cat((H, R), -1)), -2)
     for field, W in blocks.items():
         check_finite(W, f"cost.{field}")
-        scale = float(W.abs().max()) if W.numel() else 0.0
-        if float((W - W.mT).abs().max()) > 1e-9 * max(scale, 1.0):
-            raise InputError(f"cost.{field}", "a symmetric matrix", "an unsymmetric one")
-        lowest = float(torch.linalg.eigvalsh(W).min())
-        if lowest < -1e-9 * max(scale, 1.0):
-            what = "a weight [[Q, H'], [H, R]]" if field == "H" else "a weight"
-            raise InputError(f"cost.{field}", f"{what} that is positive semidefinite", f"an eigenvalue of {lowest:.3g}")
+        if (wrong := unfit(W, "a weight [[Q, H'], [H, R]]" if field == "H" else "a weight")) is not None:
+            raise InputError(f"cost.{field}", *wrong)
+
+
+def unfit(W: Tensor, what: str = "a weight") -> tuple[str, str] | None:
+    """What is wrong with finite matrices (..., n, n) as weights, (expected, got); None: nothing."""
+    rounding = 1e-9 * max(float(W.abs().max()) if W.numel() else 0.0, 1.0)
+    if float((W - W.mT).abs().max()) > rounding:
+        return "a symmetric matrix", "an unsymmetric one"
+    lowest = float(torch.linalg.eigvalsh(W).min())
+    return (f"{what} that is positive semidefinite", f"an eigenvalue of {lowest:.3g}") if lowest < -rounding else None

@@ -21,12 +21,6 @@ class Quantity(NamedTuple):
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-def check_names(dynamics: Dynamics) -> None:
-    """Raise InputError unless names and units of a model, where it has any, are one text for each."""
-    for named in (states_of, controls_of):
-        named(dynamics)
-
-
 def states_of(dynamics: Dynamics) -> list[Quantity]:
     """The n states: by the model's own names, else coordinates of the position by letter and others by number.
 

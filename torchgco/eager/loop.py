@@ -42,7 +42,6 @@ from torchgco.eager.state import (
     residuals,
     settle,
 )
-from torchgco.problem.problem import Problem
 
 
 def solve(
@@ -50,8 +49,10 @@ def solve(
 ) -> dict[str, Tensor]:
     """As `native.interior.InteriorEngine.solve`, for any device and dtype."""
     problem, how = model.problem, How(**options)
-    flat = _flat(problem, multipliers, X)
-    equality = _of_rows(problem, X, [part.sense == "equality" for part in problem.constraints])
+    flat = torch.cat([X.new_zeros(problem.B, 0), *(lam.flatten(1) for lam in multipliers)], dim=-1)  # (B, R)
+    equality = torch.zeros(flat.shape[1], dtype=torch.bool, device=X.device)
+    for group in model.groups:
+        equality[group.place.rows] = group.part.sense == "equality"
     kinds = Kinds(equality, how, how.constant, how.least_cost, barrier.clone(), problem.N, problem.n)
     B, until = problem.B, time.monotonic() + how.seconds
     out = {
@@ -94,19 +95,6 @@ def solve(
     return out
 
 
-def _flat(problem: Problem, multipliers: tuple[Tensor, ...], X: Tensor) -> Tensor:
-    """Multipliers of all rows, (B, R)."""
-    return torch.cat([X.new_zeros(problem.B, 0), *(lam.flatten(1) for lam in multipliers)], dim=-1)
-
-
-def _of_rows(problem: Problem, X: Tensor, flags: list[bool]) -> Tensor:
-    """A flag of each constraint, of each of its rows (R,)."""
-    found = [torch.zeros(0, dtype=torch.bool, device=X.device)]
-    for flag, (knots, rows) in zip(flags, problem.row_shapes, strict=True):
-        found.append(torch.full((knots * rows,), flag, device=X.device))
-    return torch.cat(found)
-
-
 def begin(kinds: Kinds, model: Model, t: State) -> None:
     """The scale of the cost, slacks and multipliers."""
     how = kinds.how
@@ -140,10 +128,15 @@ def gains(kinds: Kinds, model: Model, t: State) -> Tensor:
     return _factors(kinds, model, t, t.shift).K.transpose(0, 1)
 
 
+def _expanded(model: Model, t: State) -> Derivatives:
+    """The derivatives at the iterate, with its multipliers."""
+    objective = column(t.objective)
+    return model.expand(t.X, t.U, t.scale * t.objective, objective.unsqueeze(-1) * t.y, objective * t.z)
+
+
 def _factors(kinds: Kinds, model: Model, t: State, shift: Tensor) -> riccati.Factors:
     """The factors at the iterate with shifts (b,)."""
-    at = model.expand(t.X, t.U, t.scale * t.objective, column(t.objective).unsqueeze(-1) * t.y,
-                      column(t.objective) * t.z)  # fmt: skip
+    at = _expanded(model, t)
     H = curvature(kinds, at, t)
     return riccati.factor(at.F, H, shift, kinds.how.pivot, model.problem.free_start)
 
@@ -164,7 +157,7 @@ class _Loop:
         every = torch.ones_like(t.watching)
         readmit(kinds, model, t, every, how.highest)  # beyond which no residual is accepted
         relax(kinds, model, t)
-        at, r = self._expanded(), residuals(kinds, t, t.c, t.s)
+        at, r = _expanded(model, t), residuals(kinds, t, t.c, t.s)
         test = errors(kinds, at, t, r, model.problem.free_start)
         status = torch.full_like(t.made, int(Status.RUNNING))
         astray = t.watching & ~torch.isfinite(test.whole)
@@ -174,7 +167,7 @@ class _Loop:
         solved = find_solved(kinds, t, test, ~astray)
         again = readmit(kinds, model, t, solved, how.violation)
         if bool(again.any()):
-            at, r = self._expanded(), residuals(kinds, t, t.c, t.s)
+            at, r = _expanded(model, t), residuals(kinds, t, t.c, t.s)
         over = t.made >= how.max_iterations
         limit = torch.where(small, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
         ended = torch.where(over, limit, status)
@@ -186,10 +179,6 @@ class _Loop:
             lower_barrier(kinds, t, test, running)
             self._move(status, running, small, at, r)
         return status, test.whole
-
-    def _expanded(self) -> Derivatives:
-        t, objective = self.t, column(self.t.objective)
-        return self.model.expand(t.X, t.U, t.scale * t.objective, objective.unsqueeze(-1) * t.y, objective * t.z)
 
     def _move(self, status: Tensor, running: Tensor, small: Tensor, at: Derivatives, r: Tensor) -> None:
         """A step of the problems `running`; the statuses of those that end, in place."""

@@ -101,19 +101,11 @@ class Model:
 
     def cost_model(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes (b, N+1, S) and curvature (b, N+1, S, S) of the cost."""
-        n, m = self.problem.n, self.problem.m
-        blocks = X.new_empty(*X.shape[:2], n + 1 + m, n + 1 + m)
+        n, s = self.problem.n, self.problem.n + 1 + self.problem.m
+        blocks = X.new_empty(*X.shape[:2], s, s)
         _expand_exactly(self.problem.cost, X, U, blocks)
-        return (
-            torch.cat((blocks[..., :n, n], blocks[..., n + 1 :, n]), dim=-1),
-            torch.cat(
-                (
-                    torch.cat((blocks[..., :n, :n], blocks[..., :n, n + 1 :]), dim=-1),
-                    torch.cat((blocks[..., n + 1 :, :n], blocks[..., n + 1 :, n + 1 :]), dim=-1),
-                ),
-                dim=-2,
-            ),
-        )
+        z = [i for i in range(s) if i != n]
+        return blocks[..., z, n], blocks[..., z, :][..., z]
 
     def slopes(self, X: Tensor, U: Tensor) -> Derivatives:
         """First derivatives, of the rows and the dynamics; `H` is that of the cost alone."""

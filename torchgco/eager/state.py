@@ -7,7 +7,7 @@ that coincide. Rows without a part in either stay out (`fixed.py`). s is 1 where
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import torch
@@ -74,12 +74,11 @@ class State:
 
     def take(self, index: Tensor) -> State:
         """The problems at places `index`."""
-        return State(**{f.name: take_rows(getattr(self, f.name), index) for f in fields(self)})
+        return take_rows(self, index)
 
     def put(self, index: Tensor, some: State) -> None:
         """Write the problems at places `index`."""
-        for f in fields(self):
-            put_rows(getattr(self, f.name), index, getattr(some, f.name))
+        put_rows(self, index, some)
 
 
 STATE_FIELDS = "X", "U", "y", "gap", "cost", "c", "s", "z"

@@ -89,9 +89,8 @@ class GCO:
             holds = part.cost.total(X_safe, plan[rows]).abs() <= DIVERGED * part.N * cost_unit(part)
             if self.start_from_sample:
                 taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1) & holds
-            attracted = guide_along(
-                take(region, rows), X_safe, knots[rows] & holds.unsqueeze(-1), _radius(problem, X)[rows]
-            )
+            near = torch.where(knots[rows] & holds.unsqueeze(-1), _radius(problem, X)[rows].unsqueeze(-1), torch.inf)
+            attracted = replace(take(region, rows), center=X_safe[..., region.position], radius=near)
             put(region, rows[~taken[rows]], take(attracted, (~taken[rows]).nonzero().flatten()))
         return Advice(region, plan, taken)
 
@@ -103,12 +102,3 @@ def _radius(problem: Problem, X: Tensor) -> Tensor:
     at = problem.position
     ends = X[:, 1:, at] if problem.goal is None else problem.goal.position.unsqueeze(1)
     return R_GUIDE * (ends - problem.x0[:, None, at]).square().sum(-1).sqrt().amax(-1)
-
-
-def guide_along(guide: GuideRegion, X_safe: Tensor, caught: Tensor, radius: Tensor) -> GuideRegion:
-    """Balls of `radius` (B,) around X_safe (B, N+1, n) at the caught knots (B, N+1), none elsewhere."""
-    return replace(
-        guide,
-        center=X_safe[..., guide.position],
-        radius=torch.where(caught, radius.unsqueeze(-1), torch.inf),
-    )

@@ -32,7 +32,9 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
     sampler.check(problem)
     if kernels_of(problem).compiled:
         return sampler, None  # natively it samples the same traced functions that the solver runs
-    own, wanted, why = _tried(_sample, problem, sampler.dtype)
+    own = problem.x0.dtype
+    wanted = own if sampler.dtype is None else getattr(torch, sampler.dtype)
+    why = failure(_sample, problem, wanted)
     if why is None:
         return sampler, None
     if wanted != own and failure(_sample, problem, own) is None:
@@ -52,15 +54,6 @@ def warn_of_losses(losses: list[str], solved_without: bool) -> None:
     if losses:
         effect = "solved without guidance" if solved_without else "guided in part"
         warnings.warn(f"{effect}: {'; '.join(dict.fromkeys(losses))}", GuidanceWarning, stacklevel=6)
-
-
-def _tried(
-    trial: Callable[[Problem], None], problem: Problem, dtype: str | None
-) -> tuple[torch.dtype, torch.dtype, str | None]:
-    """The problem's own precision, the requested one, and why the trial fails in the latter."""
-    own = problem.x0.dtype
-    wanted = own if dtype is None else getattr(torch, dtype)
-    return own, wanted, failure(trial, problem, wanted)
 
 
 def failure(trial: Callable[[Problem], None], problem: Problem, dtype: torch.dtype) -> str | None:

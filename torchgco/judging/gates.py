@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Constraint, innermost
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.judging.distances import segment_distance
 from torchgco.obstacles.base import ADMITTED
@@ -26,7 +26,7 @@ def passes(constraint: Constraint, X: Tensor) -> Passes | None:
     A ball is passed on the straight lines from the knot before its own to the knot after it, a square on the one from
     its knot to the next.
     """
-    gates = innermost(constraint)
+    gates = constraint.bare
     if isinstance(gates, GateBalls):
         return _balls(gates, X[..., gates.components])
     return _squares(gates, X[..., gates.components]) if isinstance(gates, GateSquares) else None

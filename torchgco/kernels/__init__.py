@@ -1,12 +1,12 @@
-"""What solvers compute with: one interface (`base.Kernels`), in C and in PyTorch, chosen once per form of problems."""
+"""What solvers compute with: in PyTorch (`in_pytorch.Kernels`) and in C, chosen once per form of problems."""
 
 from torchgco.kernels.choice import EagerWarning as EagerWarning
 from torchgco.kernels.choice import current as current
 from torchgco.kernels.choice import expect_interior as expect_interior
 from torchgco.kernels.choice import kernels_of as kernels_of
+from torchgco.kernels.choice import native as native
+from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
-from torchgco.kernels.switch import native as native
-from torchgco.kernels.switch import use_native as use_native
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_scale as cost_scale
 from torchgco.kernels.verbs import cost_unit as cost_unit

@@ -10,10 +10,8 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import is_forward
-from torchgco.kernels.base import Kernels
 from torchgco.kernels.in_c import NativeKernels
-from torchgco.kernels.in_pytorch import TorchKernels
-from torchgco.kernels.switch import native
+from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
@@ -25,6 +23,24 @@ from torchgco.tracing import Facts
 
 ENGINES_KEPT = 64  # engines, the most recent ones
 CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
+
+
+_uses_native = True
+
+
+def use_native(on: bool) -> None:
+    """Use native kernels where they can be used (the default), or PyTorch's everywhere, in this process.
+
+    Native kernels solve several problems side by side; PyTorch's are the reference for them: the two differ in the last
+    bits. `device.kernels` chooses for a study.
+    """
+    global _uses_native
+    _uses_native = on
+
+
+def native() -> bool:
+    """Whether this process uses native kernels where they can be used."""
+    return _uses_native
 
 
 class EagerWarning(UserWarning):
@@ -58,7 +74,7 @@ def kernels_of(problem: Problem) -> Kernels:
             return known.in_c
     if known.in_pytorch is None:
         _check_eager(problem)
-        known.in_pytorch = TorchKernels()
+        known.in_pytorch = Kernels()
     return known.in_pytorch
 
 
@@ -90,7 +106,7 @@ def _warn(warned: set[str], error: Exception) -> None:
 
 def used(problem: Problem) -> str:
     """The name of the kernels that have worked on problems of this form."""
-    return NativeKernels.name if problem.known.in_c and native() else TorchKernels.name
+    return NativeKernels.name if problem.known.in_c and native() else Kernels.name
 
 
 def expect_interior(problem: Problem) -> None:

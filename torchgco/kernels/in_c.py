@@ -17,17 +17,15 @@ from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.line_search import Rollouts
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import keep_lifted
-from torchgco.kernels.base import InteriorKernels
-from torchgco.kernels.in_pytorch import TorchKernels, clearance_of
-from torchgco.kernels.outer import NativeOuter
+from torchgco.kernels.in_pytorch import InteriorKernels, Kernels, clearance_of
+from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import InnerState, PassEnd, State
-from torchgco.native.engine import Engine
+from torchgco.native.engine import Engine, replicas_of
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
-from torchgco.native.structures import End, Options
+from torchgco.native.structures import Options
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
@@ -36,8 +34,8 @@ AMPLIFIED = 1e6  # times CONTROL_NUDGE: where the states change by less, differe
 ITERATED = "X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"
 
 
-class NativeKernels:
-    """See `kernels.base.Kernels`.
+class NativeKernels(Kernels):
+    """See `Kernels`.
 
     Args:
         engine: the library of the problems' form.
@@ -49,70 +47,118 @@ class NativeKernels:
     compiled = True
 
     def __init__(self, engine: Engine, B: int, warn: Callable[[Exception], None]) -> None:
-        self.engine, self.B, self._warn = engine, B, warn
+        self.engine, self.B, self._warn, self.affine = engine, B, warn, engine.model.affine
         self._samplers: dict[Hashable, Sampler] = {}
 
-    @property
-    def affine(self) -> bool:
-        return self.engine.model.affine
-
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
-        return self.engine.open_loop(problem, U)
+        X = U.new_empty(problem.B, problem.N + 1, problem.n)
+        X[:, 0] = problem.x0
+        self.engine.run("tgco_open_loop", problem.B, self.engine.rolled(problem, X=X, U=U.contiguous()))
+        return X
 
     def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-        return self.engine.closed_loop(problem, X, U, torch.nn.functional.pad(K, (0, 1)))
+        X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
+        gains = torch.nn.functional.pad(K, (0, 1)).contiguous()
+        self.engine.run("tgco_closed_loop", problem.B, self.engine.rolled(problem, X=X, U=U, gains=gains))
+        return X, U
 
     def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-        return self.engine.value(lagrangian, X, U)
+        B = lagrangian.problem.B
+        cost, merit = X.new_empty(B), X.new_empty(B)
+        packed = self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=cost, merit=merit)
+        self.engine.run("tgco_value", B, packed)
+        return cost, merit
 
     def scale(self, problem: Problem) -> None:
         if self.engine.cost is not None:
-            slopes, H = self.engine.expand(problem, *problem.at_rest)
+            slopes, H = self.expand(problem, *problem.at_rest)
             object.__setattr__(problem, "cost_scale", problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1)))
 
+    def expand(
+        self, problem: Problem, X: Tensor, U: Tensor, lagrangian: Lagrangian | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M; of J_var without a Lagrangian.
+
+        Only the upper triangles of the Hessians are filled.
+        """
+        B, N, size = problem.B, problem.N, problem.n + problem.m
+        slopes, H, none = X.new_empty(B, N + 1, size), X.new_empty(B, N + 1, size, size), X.new_zeros(B)
+        values = {"X": X.contiguous(), "U": U.contiguous(), "cost": none, "merit": none}
+        if lagrangian is None:
+            packed = self.engine.packed(problem, **values, mu=none, constraints=0)
+        else:
+            packed = self.engine.terms(lagrangian, None, **values)
+        packed.slopes, packed.curvatures = slopes, H
+        self.engine.run("tgco_expand", B, packed)
+        return slopes, H
+
     def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
-        if self.engine.measures:
-            return self.engine.violation(problem, X, U, obstacles)
-        return violation(problem.geometric if obstacles else problem.constraints, X, U)
+        if not self.engine.measures:
+            return super().violation(problem, X, U, obstacles)
+        worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
+        self.engine.run(name, problem.B, self.engine.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
+        return worst
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float) -> Tensor:
         parts = [c.bare for c in problem.constraints]
         others = [part for part in parts if type(part) is not BoundSpheres]
-        of_spheres = None if len(others) == len(parts) else self.engine.chords(problem, X, 1.0 - share)
-        return clearance_of(others, X, share, of_spheres)
+        if len(others) == len(parts):
+            return clearance_of(others, X, share)
+        U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
+        packed = self.engine.packed(problem, X=X.contiguous(), U=U, merit=least, gain=1.0 - share)
+        self.engine.run("tgco_chords", problem.B, packed)
+        return clearance_of(others, X, share, least)
 
     def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
-        return self.engine.slack(lagrangian, X, U)
+        B, found = lagrangian.problem.B, X.new_zeros(lagrangian.problem.B)
+        packed = self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=found, merit=found)
+        self.engine.run("tgco_slack", B, packed)
+        return found
 
     def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
+        B, problem = lagrangian.problem.B, lagrangian.problem
+
         def backward(mu: Tensor) -> BackwardPass:
-            G, linear, quadratic, failed = self.engine.gains(lagrangian, X, U, mu)
-            return BackwardPass(G.transpose(0, 1), linear, quadratic, failed)
+            G, status = X.new_empty(B, problem.N, problem.m, problem.n + 1), _flags(B)
+            linear, quadratic = torch.zeros_like(mu), torch.zeros_like(mu)
+            packed = self.engine.terms(
+                lagrangian, X=X.contiguous(), U=U.contiguous(), regularisation=mu.contiguous(), cost=linear,
+                merit=quadratic, gains=G, status=status, optimality=True,
+            )  # fmt: skip
+            self.engine.run("tgco_gains", B, packed)
+            return BackwardPass(G.transpose(0, 1), linear, quadratic, status != Status.RUNNING)
 
         return backward
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
-        state = {name: getattr(s, name).contiguous() for name in ITERATED}
-        for name, part in state.items():
-            setattr(s, name, part)
-        out = self.engine.inner_solve(lagrangian, state, native_options(how), limit)
-        status = out["status"]
-        ended, converged, stuck = status == End.ENDED, out["converged"] != 0, out["refused"] != 0
-        failed = ~ended & (status != Status.RUNNING)
+        B = lagrangian.problem.B
+        for name in ITERATED:
+            setattr(s, name, getattr(s, name).contiguous())
+        out = {name: _flags(B) for name in END_FLAGS} | {name: s.merit.new_zeros(B) for name in END_NUMBERS}
+        state = {name: getattr(s, name) for name in ITERATED}
+        packed = self.engine.terms(
+            lagrangian, None, **state, **out, options=native_options(how), limit=limit, replicas=replicas_of(B)
+        )
+        self.engine.run("tgco_ilqr", B, packed)
+        end = pass_end(out)
         if out["lost"].any():
             rows = out["lost"].nonzero().flatten()
             won = rows[keep_lifted(s, rows, self.lifted(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]))]
-            ended[won] = s.inner[won] >= how.max_iterations
+            end.ended[won] = s.inner[won] >= how.max_iterations
             s.regularisation[won] = 0.0
-        status = torch.where(failed, status.long(), int(Status.RUNNING))
-        return PassEnd(ended, converged, stuck, status, out["alpha"], out["used"], failed)
+        return end
 
     def lifted(self, lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
         """`ilqr.lifted.lifted_search` in C."""
         given = {"X": X, "U": U, "cost": merit, "merit": merit}
         state = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in given.items()}
-        accepted = self.engine.lift(lagrangian, state, lifted.LIFTED_STEPS, lifted.GAIN)
-        return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted)
+        accepted, mu_r = _flags(lagrangian.problem.B), torch.zeros_like(merit)
+        packed = self.engine.terms(
+            lagrangian, None, **state, converged=accepted, regularisation=mu_r, limit=lifted.LIFTED_STEPS,
+            gain=lifted.GAIN,
+        )  # fmt: skip
+        self.engine.run("tgco_lift", lagrangian.problem.B, packed)
+        return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted != 0)
 
     def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:
         return KeptDescent(self.engine, problem, native_options(how), phr) if self.engine.measures else None
@@ -125,7 +171,7 @@ class NativeKernels:
             return InteriorEngine(self.engine, self.B)
         except InputError as error:  # second derivatives whose code would be too long
             self._warn(error)
-            return TorchKernels().interior(problem)
+            return super().interior(problem)
 
     def sample(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
         if how.dtype not in self._samplers:  # compiled at the first call: most solves never sample
@@ -134,7 +180,7 @@ class NativeKernels:
 
     def differing(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         start = problem.held_at(X[:, 0])
-        other = self.engine.open_loop(start, U + CONTROL_NUDGE * U.abs().amax(dim=1, keepdim=True))
+        other = self.open_loop(start, U + CONTROL_NUDGE * U.abs().amax(dim=1, keepdim=True))
         scale = X.abs().flatten(1).amax(-1).clamp(min=CONTROL_NUDGE)
         return (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * CONTROL_NUDGE * scale)).nonzero().flatten()
 
@@ -157,3 +203,7 @@ def native_options(how: Descent) -> Options:
 @lru_cache(maxsize=64)
 def _numbers(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
+
+
+def _flags(B: int) -> Tensor:
+    return torch.zeros(B, dtype=torch.int32)

@@ -1,9 +1,9 @@
-"""Kernels in PyTorch: any device, any dtype, any code that PyTorch can differentiate."""
+"""What solvers compute with, in PyTorch: any device, any dtype, any code that PyTorch can differentiate."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -15,67 +15,98 @@ from torchgco.eager.kernels import EagerInterior
 from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.riccati import BackwardPass, backward
 from torchgco.ilqr.step import iterate
-from torchgco.kernels.base import InteriorKernels
+from torchgco.kernels.outer import NativeOuter
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import InnerState, PassEnd, State
+from torchgco.native.interior import InteriorEngine
+from torchgco.native.kept_descent import KeptDescent
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 
+InteriorKernels: TypeAlias = InteriorEngine | EagerInterior
 
-class TorchKernels:
-    """See `kernels.base.Kernels`."""
+
+class Kernels:
+    """Everything that solvers compute with, for the problems of one form.
+
+    Here in PyTorch; `kernels.in_c.NativeKernels` computes the same in C, up to rounding. `kernels.choice.kernels_of`
+    chooses once per form of problems. Trajectories are X (B, N+1, n), U (B, N, m).
+
+    Attributes:
+        name: "native" or "pytorch", as solutions and tables say it.
+        compiled: the problem's functions are compiled from a trace: all that is asked of them works, in any precision,
+            without autodiff and its memory; they may differ from the user's code.
+        affine: whether the dynamics are known to be affine in states and controls.
+    """
 
     name = "pytorch"
     compiled = False
     affine = False
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
+        """X from the problem's start and controls U."""
         return rollout.open_loop(problem.dynamics, problem.x0, U)
 
     def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+        """The rollout of U + K (x - X) from the first knots of X; gains K (B, N, m, n)."""
         G = torch.nn.functional.pad(K, (0, 1)).transpose(0, 1).contiguous()
         return rollout.closed_loop(problem.dynamics, X, U, G, torch.zeros_like(X[:, 0, 0]))
 
     def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """J_var (B,) and L_M (B,)."""
         return lagrangian.value(X, U)
 
     def scale(self, problem: Problem) -> None:
-        """Its property computes it when it is asked for."""
+        """Have the problem keep its `cost_scale`, where that can be computed without autodiff."""
 
     def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
+        """The largest violation (B,), of all constraints or of `obstacles` alone (geometric ones)."""
         return violation(problem.geometric if obstacles else problem.constraints, X, U)
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float) -> Tensor:
+        """See `kernels.chord_clearance`."""
         return clearance_of([c.bare for c in problem.constraints], X, share)
 
     def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
+        """See `Lagrangian.slack`."""
         return lagrangian.slack(X, U)
 
     def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
+        """The backward pass on J_var + lam'c, for regularisations mu_r (B,)."""
         F, H = linearise(lagrangian.problem, X, U), lagrangian.expand_optimality(X, U)
         return lambda mu: backward(F, H, mu)
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
+        """Iterations of every problem's inner solve, in place: one at least, `limit` at most."""
         return iterate(how, s, lagrangian)
 
-    def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> None:
+    def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:
+        """Inner solves of problems that stay packed; None: the caller makes them from `descend`."""
         return None
 
-    def outer_passes(self, problem: Problem, s: State, how: Descent, **limits: Any) -> None:
+    def outer_passes(self, problem: Problem, s: State, how: Descent, **limits: Any) -> NativeOuter | None:
+        """Whole passes of the outer loop; None: the caller makes them from `descend`."""
         return None
 
     def interior(self, problem: Problem) -> InteriorKernels:
+        """The interior point.
+
+        Raises:
+            InputError: rows that join knots.
+        """
         known = problem.known
         if known.interior is None:
             known.interior = EagerInterior.of(problem)
         return known.interior
 
     def sample(self, problem: Problem, U: Tensor, how: sampling.Sampling) -> Tensor:
+        """Controls (B, N, m): the weighted mean of the last round's samples, the first drawn around U."""
         return sampling.sample(problem, U, how)
 
     def differing(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+        """Problems (b,) of which rounding may decide where a rollout of U by PyTorch ends, for these X."""
         return torch.zeros(0, dtype=torch.int64, device=X.device)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -11,11 +13,12 @@ from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
 from torchgco.lagrangian.state import PassEnd, State
 from torchgco.native.codegen.source import LANES
-from torchgco.native.engine import Engine
+from torchgco.native.engine import Engine, run
 from torchgco.native.structures import End, Options, Outer
 from torchgco.problem.problem import Problem
 
-OUTER_FLAGS, OUTER_NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
+# How an inner solve ended, and step length and mu_r of its last iteration.
+END_FLAGS, END_NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
 
 
 class NativeOuter:
@@ -44,8 +47,8 @@ class NativeOuter:
         self.engine, self.state, self.b = engine, s, problem.B
         _make_contiguous(s)
         b = problem.B
-        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in OUTER_FLAGS}
-        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in OUTER_NUMBERS}
+        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in END_FLAGS}
+        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in END_NUMBERS}
         self.outcome = torch.zeros(b, dtype=torch.int64)
         m, best = s.multipliers, s.best
         packed = engine.terms(
@@ -81,11 +84,7 @@ class NativeOuter:
         """One iteration of every problem's inner solve, without the outer iteration of those that end with it."""
         self.packed.limit = 1
         self._run(passes=1, solves=1, updates=0)
-        status, ended = self.out["status"], self.ended
-        failed = ~ended & (status != Status.RUNNING)
-        why = torch.where(failed, status.long(), int(Status.RUNNING))
-        out = self.out
-        return PassEnd(ended, out["converged"] != 0, out["refused"] != 0, why, out["alpha"], out["used"], failed)
+        return pass_end(self.out)
 
     def update(self) -> None:
         """The outer iterations of the problems whose inner solve has ended."""
@@ -99,7 +98,15 @@ class NativeOuter:
     def _run(self, **fields: int) -> None:
         for name, value in fields.items():
             setattr(self.outer, name, value)
-        self.engine.outer_loop(self.outer, self.b)
+        run(self.engine.library.tgco_outer, self.b, LANES, self.outer)
+
+
+def pass_end(out: Mapping[str, Tensor]) -> PassEnd:
+    """What END_FLAGS and END_NUMBERS say of a pass."""
+    status, ended = out["status"], out["status"] == End.ENDED
+    failed = ~ended & (status != Status.RUNNING)
+    why = torch.where(failed, status.long(), int(Status.RUNNING))
+    return PassEnd(ended, out["converged"] != 0, out["refused"] != 0, why, out["alpha"], out["used"], failed)
 
 
 def _make_contiguous(s: State) -> None:

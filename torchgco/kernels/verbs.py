@@ -11,8 +11,8 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics import rollout
-from torchgco.kernels.base import InteriorKernels
 from torchgco.kernels.choice import kernels_of
+from torchgco.kernels.in_pytorch import InteriorKernels
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.obstacles.base import TOUCH
 from torchgco.problem.problem import Problem

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import scattered
 from torchgco.dynamics.rollout import open_loop
 from torchgco.problem.problem import Problem
 
@@ -27,7 +28,7 @@ def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
         knots = torch.arange(problem.N + 1, device=X.device)[part.knots]
         broken = broken | bad.flatten(1).any(-1)
         later = later or bool(bad[:, knots > 0].any())
-    wave = torch.arange(1.0, U[0].numel() + 1, dtype=U.dtype, device=U.device).mul(1.618).cos().view_as(U[0])
+    wave = scattered(U[0])
     for way in (wave, torch.ones_like(wave), -torch.ones_like(wave)):
         for size in CHANGE_SIZES:
             other = U + size * (1.0 + U.abs()) * way

@@ -322,7 +322,9 @@ def _ending(started: Sequence[subprocess.Popen[str]]) -> Iterator[None]:
         with _ending_by_sigterm(started):
             yield
     except BaseException:
-        _end_all(started)
+        for one in _kill_all(started):
+            one.wait()
+        _begun.clear()
         raise
 
 
@@ -336,12 +338,6 @@ def _held() -> Iterator[None]:
     finally:
         for number in came:
             signal.raise_signal(number)
-
-
-def _end_all(started: Sequence[subprocess.Popen[str]]) -> None:
-    for one in _kill_all(started):
-        one.wait()
-    _begun.clear()
 
 
 def _kill_all(started: Sequence[subprocess.Popen[str]]) -> list[subprocess.Popen[str]]:
@@ -359,9 +355,8 @@ def _ending_by_sigterm(started: Sequence[subprocess.Popen[str]]) -> Iterator[Non
     """In this block a SIGTERM that nobody handles, as in a study's workers, ends what is started by then first."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        _kill_all(
-            started
-        )  # a handler may not wait: what it interrupts may hold the lock of a process that is waited for
+        # A handler may not wait: what it interrupts may hold the lock of a process that is waited for.
+        _kill_all(started)
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
@@ -380,13 +375,8 @@ def _find_compiler(named: str | None, usual: str | None, path: str | None, furth
         if place is None:
             continue
         try:
-            version = subprocess.run(
-                [place, *words[1:], "--version"],
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                errors="replace",
-            )
+            asked, quiet = [place, *words[1:], "--version"], subprocess.DEVNULL
+            version = subprocess.run(asked, stdin=quiet, capture_output=True, text=True, errors="replace")
         except OSError:
             continue
         if version.returncode == 0:

@@ -15,13 +15,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.status import Status
-from torchgco.constraints.base import Constraint, WrappedConstraint, innermost
+from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.norms import NormBounds
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
-from torchgco.native.codegen.body import trace_lift
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
@@ -69,13 +67,16 @@ class Engine:
         self.cost = trace_cost(problem) if quadratic is None else None
         parts = problem.constraints
         traced = (i for i, part in enumerate(parts) if is_lifted(part) or kind_of(part) is Kind.FUNCTION)
-        sources = ((i, trace_lift(problem, i) if is_lifted(parts[i]) else trace_rows(problem, i)) for i in traced)
+        sources = ((i, trace_rows(problem, i)) for i in traced)
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
         self.measures = all(kind_of(part) is not Kind.FUNCTION or _measured(part) for part in parts)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
         self.captured = Captured(self.model, self.cost, self.functions)
-        self.shared = self._first_shared()
+        first = self.captured.read()
+        if first is None:  # changed since the functions were traced, by another thread
+            raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
+        self.shared = first
         lifted = frozenset(i for i in self.functions if is_lifted(parts[i]))
         self.form = Form(self.model, at, self.cost, dense, functions, lifted)
         if ahead is not None:
@@ -101,12 +102,6 @@ class Engine:
         other.shared = shared
         return other
 
-    def _first_shared(self) -> Shared:
-        found = self.captured.read()
-        if found is None:  # changed since the functions were traced, by another thread
-            raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
-        return found
-
     def computes_as(self, other: Engine, problem: Problem) -> bool:
         """Whether another engine computes the same for `problem`."""
         if self.form.units() != other.form.units() or not self.shared.is_same(other.shared):
@@ -121,116 +116,8 @@ class Engine:
         functions = self.functions.items()
         return found + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
 
-    def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
-        """X (B, N+1, n) from U (B, N, m)."""
-        X = U.new_empty(problem.B, problem.N + 1, problem.n)
-        X[:, 0] = problem.x0
-        self._run("tgco_open_loop", problem.B, self._rolled(problem, X=X, U=U.contiguous()))
-        return X
-
-    def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, G: Tensor) -> tuple[Tensor, Tensor]:
-        """X and U of a rollout of U + K (x - X) from the first knots of X; G = [K d] (B, N, m, n+1), d isn't used."""
-        X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
-        self._run("tgco_closed_loop", problem.B, self._rolled(problem, X=X, U=U, gains=G.contiguous()))
-        return X, U
-
-    def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-        """J_var (B,) and L_M (B,) of trajectories."""
-        B = lagrangian.problem.B
-        cost, merit = X.new_empty(B), X.new_empty(B)
-        packed = self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=cost, merit=merit)
-        self._run("tgco_value", B, packed)
-        return cost, merit
-
-    def gains(
-        self, lagrangian: Lagrangian, X: Tensor, U: Tensor, mu_r: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gains G = [K d] (B, N, m, n+1) for J_var + lam'c, the two sums of its expected change, (B,) each, and where
-        the backward pass failed, (B,) bool; mu_r (B,) is the regularisation.
-        """
-        problem = lagrangian.problem
-        G, status = X.new_empty(problem.B, problem.N, problem.m, problem.n + 1), _flags(problem.B)
-        linear, quadratic = torch.zeros_like(mu_r), torch.zeros_like(mu_r)
-        packed = self.terms(
-            lagrangian, X=X.contiguous(), U=U.contiguous(), regularisation=mu_r.contiguous(), cost=linear,
-            merit=quadratic, gains=G, status=status, optimality=True,
-        )  # fmt: skip
-        self._run("tgco_gains", problem.B, packed)
-        return G, linear, quadratic, status != Status.RUNNING
-
-    def expand(
-        self, problem: Problem, X: Tensor, U: Tensor, lagrangian: Lagrangian | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M; of J_var without a Lagrangian.
-
-        Only the upper triangles of the Hessians are filled.
-        """
-        B, N, size = problem.B, problem.N, problem.n + problem.m
-        slopes, H, none = X.new_empty(B, N + 1, size), X.new_empty(B, N + 1, size, size), X.new_zeros(B)
-        values = {"X": X.contiguous(), "U": U.contiguous(), "cost": none, "merit": none}
-        if lagrangian is None:
-            packed = self.packed(problem, **values, mu=none, constraints=0)
-        else:
-            packed = self.terms(lagrangian, None, **values)
-        packed.slopes, packed.curvatures = slopes, H
-        self._run("tgco_expand", B, packed)
-        return slopes, H
-
-    def lift(self, lagrangian: Lagrangian, state: dict[str, Tensor], rounds: int, gain: float) -> Tensor:
-        """Up to `rounds` steps in states and controls together, in place in `state`; where one gave a better rollout.
-
-        Args:
-            state: X, U, cost, merit, all contiguous.
-            gain: share of L_M by which a rollout must lower it.
-        """
-        B = lagrangian.problem.B
-        found, mu_r = _flags(B), torch.zeros_like(state["merit"])
-        packed = self.terms(lagrangian, None, **state, converged=found, regularisation=mu_r, limit=rounds, gain=gain)
-        self._run("tgco_lift", B, packed)
-        return found != 0
-
-    def inner_solve(
-        self, lagrangian: Lagrangian, state: dict[str, Tensor], options: c.Options, limit: int
-    ) -> dict[str, Tensor]:
-        """Up to `limit` iterations of every problem's inner solve, in place in `state`.
-
-        Args:
-            state: X, U, cost, merit, regularisation; inner, iterations, rung (int64): all contiguous.
-
-        Returns:
-            status, a `Status` or `End`; converged, refused, lost (int32); alpha and used: step length and mu_r of the
-            last iteration.
-        """
-        B = lagrangian.problem.B
-        out = {name: _flags(B) for name in ("status", "converged", "refused", "lost")}
-        out |= {name: torch.zeros(B, dtype=torch.float64) for name in ("alpha", "used")}
-        packed = self.terms(lagrangian, None, **state, **out, options=options, limit=limit, replicas=replicas_of(B))
-        self._run("tgco_ilqr", B, packed)
-        return out
-
-    def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
-        """The largest violation (B,) of trajectories, of problems that the library `measures`; of obstacles alone?"""
-        worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
-        self._run(name, problem.B, self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
-        return worst
-
-    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
-        """`Lagrangian.slack`, (B,)."""
-        B, found = lagrangian.problem.B, X.new_zeros(lagrangian.problem.B)
-        self._run("tgco_slack", B, self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=found, merit=found))
-        return found
-
-    def chords(self, problem: Problem, X: Tensor, scale: float) -> Tensor:
-        """The smallest distance (B,) of the lines between knots from spheres with radii times `scale`; or infinity."""
-        U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
-        self._run("tgco_chords", problem.B, self.packed(problem, X=X.contiguous(), U=U, merit=least, gain=scale))
-        return least
-
-    def outer_loop(self, outer: c.Outer, B: int) -> None:
-        """Passes of the outer loop, in place in the tensors that `outer` names."""
-        run(self.library.tgco_outer, B, LANES, outer)
-
-    def _run(self, name: str, B: int, packed: c.Problem) -> None:
+    def run(self, name: str, B: int, packed: c.Problem) -> None:
+        """Call a function of the library on B problems."""
         run(getattr(self.library, name), B, LANES, packed)
 
     def packed(self, problem: Problem, **values: Any) -> c.Problem:
@@ -240,7 +127,7 @@ class Engine:
         packed.fill(values)
         return packed
 
-    def _rolled(self, problem: Problem, **values: Any) -> c.Problem:
+    def rolled(self, problem: Problem, **values: Any) -> c.Problem:
         """The model alone, and further fields: what rollouts read. Many problems are rolled out and not solved."""
         packed = self._model(problem).copy()
         packed.fill(values)
@@ -281,49 +168,43 @@ class Engine:
         return vars(problem)["packed"]
 
     def _model(self, problem: Problem) -> c.Problem:
-        """The model's part of it; that of the last problem where this one has the same dynamics."""
+        """The model's part of it."""
         if problem.one is not None:
             return self._model(problem.one)
         if "model_packed" not in vars(problem):
-            known, B, packed = problem.known.model
-            if known is not problem.dynamics or B != problem.B:  # what problems share stays the same object in a subset
-                packed = c.Problem(N=problem.N, **shared_fields(self.shared))
-                if self.model.count > 0 and problem.B > 0:
-                    numbers = self.model.numbers(problem.B, problem.dynamics, self.shared.model)
-                    packed.parameters = array(numbers, knots=True)
-                problem.known.model = problem.dynamics, problem.B, packed
+            packed = _of_last(problem, "dynamics", problem.dynamics, lambda: self._model_made(problem))
             object.__setattr__(problem, "model_packed", packed)
         return vars(problem)["model_packed"]
+
+    def _model_made(self, problem: Problem) -> c.Problem:
+        return c.Problem(N=problem.N, parameters=self.model_numbers(problem), **shared_fields(self.shared))
+
+    def model_numbers(self, problem: Problem) -> c.Array:
+        """The model's numbers of each problem."""
+        if self.model.count == 0 or problem.B == 0:
+            return c.Array()
+        return array(self.model.numbers(problem.B, problem.dynamics, self.shared.model), knots=True)
 
     def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
-        rows, packed = self._constraints(problem), self._model(problem).copy()
+        rows = [self._row(problem, i) for i in range(len(problem.constraints))]
+        packed = self._model(problem).copy()
         packed.constraints, packed.constraint = len(rows), rows
-        packed.cost_data, packed.bounded = self._cost(problem)
+        make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
+        packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, make)
         return packed, rows
 
-    def _cost(self, problem: Problem) -> tuple[list[c.Array], int]:
-        """The cost's arrays, and whether it is `bounded`; those of the last problem where this one has the same."""
-        known, B, own = problem.known.cost
-        if known is not problem.cost or B != problem.B:
-            if self.cost is None:
-                own = quadratic_arrays(problem.cost), int(is_bounded(problem.cost))
-            else:
-                own = cost_arrays(problem, self.cost, self.shared.cost), 0
-            problem.known.cost = problem.cost, problem.B, own
-        return own
+    def cost_numbers(self, problem: Problem) -> list[c.Array]:
+        """The cost's arrays."""
+        if self.cost is None:
+            return quadratic_arrays(problem.cost)
+        return cost_arrays(problem, self.cost, self.shared.cost)
 
-    def _constraints(self, problem: Problem) -> list[c.Constraint]:
-        """The rows without multipliers; of each constraint those of the last problem where this one has the same."""
-        packed, rows = problem.known.packed, []
-        for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
-            known, B, row = packed.get(i, (None, 0, None))
-            if known is not constraint or B != problem.B:
-                row = constraint_of(constraint, shape, self.row_numbers(problem, i), problem)
-                packed[i] = constraint, problem.B, row
-            rows.append(row)
-        return rows
+    def _row(self, problem: Problem, i: int) -> c.Constraint:
+        """Constraint i without multipliers."""
+        make = lambda: constraint_of(problem, i, self.row_numbers(problem, i))
+        return _of_last(problem, i, problem.constraints[i], make)
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
         """The fields of a `Constraint` in C that hold the numbers of constraint i."""
@@ -333,6 +214,18 @@ class Engine:
         shared = self.shared.rows[i]
         own = numbers_of(constraint, rows_numbers(problem, i, source, shared), problem)
         return {**own, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
+
+
+def _of_last(problem: Problem, name: str | int, part: Any, make: Callable[[], Any]) -> Any:
+    """What was made of a part for the last problem of the form, where this one has the same part, else made now.
+
+    What problems share stays the same object in a subset.
+    """
+    known, B, made = problem.known.packed.get(name, (None, 0, None))
+    if known is not part or B != problem.B:
+        made = make()
+        problem.known.packed[name] = part, problem.B, made
+    return made
 
 
 def replicas_of(B: int) -> int:
@@ -385,11 +278,7 @@ os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child has none of 
 def _measured(part: Constraint) -> bool:
     """Whether violations are what the base class says of rows, or C finds them from these."""
     if part.row_radii is not None:
-        return type(innermost(part)).violation in (NormBounds.violation, SpheresInFreeTime.violation)
+        return type(part.bare).violation in (NormBounds.violation, SpheresInFreeTime.violation)
     while isinstance(part, WrappedConstraint) and part.keeps_rows:
         part = part.constraint
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
-
-
-def _flags(B: int) -> Tensor:
-    return torch.zeros(B, dtype=torch.int32)

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
 from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, KktSolve, RightSides
+from torchgco.native import structures
 from torchgco.native.codegen.source import INTERIOR, LANES
 from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
@@ -55,22 +56,12 @@ class InteriorEngine:
             status, iterations (B,); error of the end test, theta, the sum of residuals, and whether the cost falls to
             second order, 0 or 1, (B,); gains (B, N, m, n+1).
         """
-        B, N = problem.B, problem.N
-        out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
-        out["gains"] = X.new_zeros(B, N, problem.m, problem.n + 1)
-        free = problem.free_start
+        B = problem.B
+        packed, out = self._packed(problem, X, U, multipliers)
         ends = {name: X.new_zeros(B) for name in ("error", "theta", "falls")}
-        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
-        for row, lam in zip(rows, multipliers, strict=True):
-            row.lam = lam
-        packed = self.engine.packed(problem, X=X, U=U, constraint=rows, **out)
-        run(
-            self.library.tgco_interior, B, self.lanes,
-            Interior.complete(
-                of=packed, barrier=barrier, free_start=None if free is None else free.double().contiguous(),
-                **ends, **options,
-            ),
-        )  # fmt: skip
+        free = free_components(problem)
+        how = Interior.complete(of=packed, barrier=barrier, free_start=free, **ends, **options)
+        run(self.library.tgco_interior, B, self.lanes, how)
         return out | ends
 
     def kkt(
@@ -87,13 +78,9 @@ class InteriorEngine:
             give: D (B, R) of the rows that hold; None: 0.
             K: gains (B, N, m, n), with which unstable dynamics don't magnify the rounding of costates; None: 0.
         """
-        B, n, free = problem.B, problem.n, problem.free_start
-        out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
-        out["gains"] = X.new_zeros(B, problem.N, problem.m, n + 1)
-        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
-        for row, lam in zip(rows, multipliers, strict=True):
-            row.lam = lam.contiguous()
-        packed = self.engine.packed(problem, X=X.contiguous(), U=U.contiguous(), constraint=rows, **out)
+        B, n = problem.B, problem.n
+        multipliers = tuple(lam.contiguous() for lam in multipliers)
+        packed, out = self._packed(problem, X.contiguous(), U.contiguous(), multipliers)
         sides = {"a": right.a, "b": right.b, "c": right.c}
         sides = {name: part.clone(memory_format=torch.contiguous_format) for name, part in sides.items()}
         costates, left = X.new_zeros(B, problem.N + 1, n), X.new_zeros(right.a.shape[0], B)
@@ -101,12 +88,28 @@ class InteriorEngine:
             self.library.tgco_kkt, B, self.lanes,
             Kkt.complete(
                 of=packed, active=active.double().contiguous(), give=give, K=None if K is None else K.contiguous(),
-                y=costates, left=left, **sides, problems=B,
-                free_start=None if free is None else free.double().contiguous(), count=right.a.shape[0],
+                y=costates, left=left, **sides, problems=B, free_start=free_components(problem), count=right.a.shape[0],
                 rounds=CLOSING_ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=LEAST_PIVOT,
             ),
         )  # fmt: skip
         return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, out["status"] == Status.CONVERGED)
+
+    def _packed(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...]
+    ) -> tuple[structures.Problem, dict[str, Tensor]]:
+        """The problem with these iterates, and the tensors that status, iterations and gains are written to."""
+        out = {"status": torch.zeros(problem.B, dtype=torch.int32)}
+        out["iterations"] = torch.zeros(problem.B, dtype=torch.int64)
+        out["gains"] = X.new_zeros(problem.B, problem.N, problem.m, problem.n + 1)
+        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
+        for row, lam in zip(rows, multipliers, strict=True):
+            row.lam = lam
+        return self.engine.packed(problem, X=X, U=U, constraint=rows, **out), out
+
+
+def free_components(problem: Problem) -> Tensor | None:
+    """1 where a component of the start is free, else 0, (B, n); None where none is."""
+    return None if problem.free_start is None else problem.free_start.double().contiguous()
 
 
 def begin_interior(engine: Engine, B: int) -> None:

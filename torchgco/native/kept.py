@@ -15,7 +15,7 @@ from torchgco.lagrangian.lagrangian import later
 from torchgco.native import structures as c
 from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import run
-from torchgco.native.interior import InteriorEngine
+from torchgco.native.interior import InteriorEngine, free_components
 from torchgco.native.kept_problem import KeptProblem
 from torchgco.problem.problem import Problem
 
@@ -53,7 +53,7 @@ class Kept(KeptProblem):
         self._follow = self.packed.copy()
         self._follow.fill({"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst})
         ends = {name: like.new_zeros(B) for name in ("error", "theta", "falls")}
-        free = None if problem.free_start is None else problem.free_start.double().contiguous()
+        free = free_components(problem)
         self.how = c.Interior.complete(of=self.packed, barrier=self.barrier, free_start=free, **ends, **options)
 
     def solve(self, rows: np.ndarray, mu: float, **options: float) -> None:

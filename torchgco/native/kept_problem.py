@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
 
 from torchgco.native import structures as c
-from torchgco.native.codegen.cost import cost_arrays
 from torchgco.native.engine import Engine
-from torchgco.native.packing import constraint_of, kind_of, quadratic_arrays, shared_fields
+from torchgco.native.packing import constraint_of, kind_of, shared_fields
 from torchgco.native.shared import Shared
 from torchgco.native.structures import Kind
 from torchgco.problem.problem import Problem
@@ -37,11 +35,12 @@ class KeptProblem:
         self._read: Shared | None = None  # what functions have captured, when C was last given it
         self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
         self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
-        self._numbers = [self._own_numbers(i) for i in range(len(problem.constraints))]
-        rows = [self._row(i, numbers) for i, numbers in enumerate(self._numbers)]
+        self._numbers = [engine.row_numbers(problem, i) for i in range(len(problem.constraints))]
+        rows = [constraint_of(problem, i, numbers) for i, numbers in enumerate(self._numbers)]
+        for row, lam in zip(rows, self.lam, strict=True):
+            row.lam = lam
         self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(engine.shared))
-        self._model = self._model_array()
-        self._cost = self._cost_arrays()
+        self._model, self._cost = engine.model_numbers(problem), engine.cost_numbers(problem)
         self.packed.fill({"parameters": self._model, "cost_data": self._cost, "X": self.X, "U": self.U})
         self._copied = {i: found for i in engine.functions if (found := self._copies(i)) is not None}
 
@@ -70,17 +69,17 @@ class KeptProblem:
             there, here, places = self._copied[i]
             there[:] = here[:, places]
             return
-        new = self._own_numbers(i)
+        new = self.engine.row_numbers(self.problem, i)
         arrays = [name for name, value in new.items() if isinstance(value, c.Array)]
         _copy([self._numbers[i][name] for name in arrays], [new[name] for name in arrays])
 
     def refresh_cost(self) -> None:
         """The same of the cost."""
-        _copy(self._cost, self._cost_arrays())
+        _copy(self._cost, self.engine.cost_numbers(self.problem))
 
     def refresh_model(self) -> None:
         """The same of the dynamics."""
-        _copy([self._model], [self._model_array()])
+        _copy([self._model], [self.engine.model_numbers(self.problem)])
 
     def _copies(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Of traced rows all of whose numbers are some of one tensor's: where C reads them (B, K|1, count), the tensor
@@ -98,25 +97,6 @@ class KeptProblem:
                 return (there.numpy(), own.reshape(len(own), -1).numpy(), (picks - first).numpy()) if fits else None
             first += size
         return None
-
-    def _row(self, i: int, numbers: dict[str, Any]) -> c.Constraint:
-        problem = self.problem
-        row = constraint_of(problem.constraints[i], problem.row_shapes[i], numbers, problem)
-        row.lam = self.lam[i]
-        return row
-
-    def _own_numbers(self, i: int) -> dict[str, Any]:
-        return self.engine.row_numbers(self.problem, i)
-
-    def _cost_arrays(self) -> list[c.Array]:
-        cost, problem = self.engine.cost, self.problem
-        return quadratic_arrays(problem.cost) if cost is None else cost_arrays(problem, cost, self.engine.shared.cost)
-
-    def _model_array(self) -> c.Array:
-        model, problem = self.engine.model, self.problem
-        if model.count == 0:
-            return c.Array()
-        return c.array(model.numbers(problem.B, problem.dynamics, self.engine.shared.model), knots=True)
 
 
 def _copy(old: list[c.Array], new: list[c.Array]) -> None:

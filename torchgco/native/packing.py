@@ -27,7 +27,6 @@ KIND_OF = {
     BoundField: Kind.FIELD,
 }  # fmt: skip
 SOLIDS = BoundSpheres, BoundBoxes, BoundField
-REACH_SLACK = 1.0 + 1e-4  # as below
 BOUND_SLACK = 1.0 + 1e-4  # so that rounding, in single precision too, can't make a row active beyond its box's bounds
 
 
@@ -49,11 +48,9 @@ def shared_fields(shared: Shared) -> dict[str, Any]:
     return {"shared": shared.model, "stage_shared": stage, "last_shared": last}
 
 
-def constraint_of(
-    constraint: Constraint, shape: tuple[int, int], own: dict[str, Any], problem: Problem
-) -> c.Constraint:
-    """A constraint without multipliers, with knots and rows as `shape` says, and the fields that `numbers_of` gives."""
-    knots, rows = shape
+def constraint_of(problem: Problem, i: int, own: dict[str, Any]) -> c.Constraint:
+    """Constraint i without multipliers, with the fields that `numbers_of` gives."""
+    constraint, (knots, rows) = problem.constraints[i], problem.row_shapes[i]
     place = torch.full((problem.N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
         place[constraint.knots] = torch.arange(knots, dtype=torch.int32)
@@ -155,6 +152,6 @@ def _field(parts: Sequence[BoundField]) -> dict[str, Any]:
 def _field_numbers(field: BoundField) -> Tensor:
     h, d, R, like = field.field.spacing, field.origins.shape[-1], field.vehicle_radius, field.origins
     factors = torch.where(field.absent[:, 0], ABSENT, field.factors)
-    reach = REACH_SLACK * (R + 1.5 * h * d**0.5)  # nodes read for a point lie within h sqrt(d) of the nearest one
+    reach = BOUND_SLACK * (R + 1.5 * h * d**0.5)  # nodes read for a point lie within h sqrt(d) of the nearest one
     columns = [like.new_full((len(R),), 1.0 / h), like.new_full((len(R),), h * h), R.square(), factors, field.cores]
     return torch.cat((field.origins, torch.stack([*columns, field.limits, reach], dim=-1)), dim=-1)

@@ -29,26 +29,19 @@ class Sampler:
         self.library = engine.further(dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]))
 
     def improve(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
-        """See `kernels.base.Kernels.sample`."""
+        """See `kernels.in_pytorch.Kernels.sample`."""
         mean = U.clone(memory_format=torch.contiguous_format)
-        rounds = _structure(problem, how)
-        rounds.of = self.engine.packed(problem, X=repeated(problem.x0, problem.N + 1))
-        rounds.geometric = torch.tensor([int(c.geometric) for c in problem.constraints], dtype=torch.int32)
-        rounds.mean = mean
+        wide = problem.x0.new_full((1, 1, 1, problem.m), torch.inf)
+        lower, upper = (array(bound.squeeze(2).transpose(0, 1), knots=True) for bound in how.bounds or (-wide, wide))
+        rounds = structures.Sampling(
+            of=self.engine.packed(problem, X=repeated(problem.x0, problem.N + 1)), mean=mean,
+            samples=how.samples, rounds=how.rounds, knots=how.noise_knots, decay=how.decay, elite=how.elite,
+            temperature=how.temperature, collision_penalty=how.collision_penalty, dwell_cost=how.dwell_cost,
+            keys=torch.stack([words(how.key, i) for i in range(how.rounds)], dim=-1),
+            deviation=array(how.sigma.sqrt(), knots=True), lower=lower, upper=upper,
+            geometric=torch.tensor([int(c.geometric) for c in problem.constraints], dtype=torch.int32),
+        )  # fmt: skip
+        if how.left is not None and how.share is not None:
+            rounds.left, rounds.share = how.left.to(torch.int32), how.share.double()
         run(self.library.tgco_sample, problem.B, 1, rounds)
         return mean
-
-
-def _structure(problem: Problem, how: Sampling) -> structures.Sampling:
-    """All fields but `of`, `geometric` and `mean`."""
-    wide = problem.x0.new_full((1, 1, 1, problem.m), torch.inf)
-    lower, upper = (array(bound.squeeze(2).transpose(0, 1), knots=True) for bound in how.bounds or (-wide, wide))
-    rounds = structures.Sampling(
-        samples=how.samples, rounds=how.rounds, knots=how.noise_knots, decay=how.decay, elite=how.elite,
-        temperature=how.temperature, collision_penalty=how.collision_penalty, dwell_cost=how.dwell_cost,
-        keys=torch.stack([words(how.key, i) for i in range(how.rounds)], dim=-1),
-        deviation=array(how.sigma.sqrt(), knots=True), lower=lower, upper=upper,
-    )  # fmt: skip
-    if how.left is not None and how.share is not None:
-        rounds.left, rounds.share = how.left.to(torch.int32), how.share.double()
-    return rounds

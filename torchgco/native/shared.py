@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.native.codegen.cost import CostSource
 from torchgco.native.codegen.dynamics import DynamicsSource
 from torchgco.native.codegen.knot import KnotSource
-from torchgco.tracing import Traced, Watch
+from torchgco.tracing import Traced, contents
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Captured:
         self.traces: list[Traced] = [model.traced]
         self.traces += () if cost is None else (part.span.traced for part in cost.parts)
         self.traces += (rows.span.traced for rows in functions.values())
-        self._watch = Watch(tensor for traced in self.traces for tensor in traced.outside)
+        self._outside = list({id(tensor): tensor for traced in self.traces for tensor in traced.outside}.values())
         self._last: tuple[tuple[Hashable, ...] | None, Shared | None] = None, None
 
     @property
@@ -64,19 +64,19 @@ class Captured:
     @property
     def nbytes(self) -> int:
         """The size of all these tensors, of sparse ones as if they were dense."""
-        return sum(tensor.numel() * tensor.element_size() for tensor in self._watch.tensors)
+        return sum(tensor.numel() * tensor.element_size() for tensor in self._outside)
 
     def is_still(self, last: Shared | None) -> bool:
         """Whether `read` would give what it gave before, `last`; done without PyTorch's operations."""
         then, known = self._last
-        return then is not None and last is known and self._watch.look() == then
+        return then is not None and last is known and contents(self._outside) == then
 
     def read(self) -> Shared | None:
         """The numbers as they are now, not to be written to; None where a function is to be traced again.
 
         The same object as at the last call where nothing has changed.
         """
-        seen, (then, last) = self._watch.look(), self._last
+        seen, (then, last) = contents(self._outside), self._last
         if seen is None or seen != then:
             last = self._read()
             self._last = seen, last  # seen before it was read: what changes meanwhile is read at the next call

@@ -54,13 +54,13 @@ class Made(NamedTuple):
 _made: dict[tuple[str, str], Made] = {}
 
 
-def made(parts: Sequence[str], make: Callable[[str], dict[str, Any]], kin: str = "") -> Made:
+def made(parts: Sequence[str], make: Callable[[], dict[str, Any]], kin: str = "") -> Made:
     """What `make` generates for the key of `parts`: of this process, else from the folder, else made now and stored."""
     key, place = key_of(parts, kin), str(folder())
     if (key, place) not in _made:
         known = read(key, ".json")
         if known is None:
-            known = json.dumps(make(key)).encode()
+            known = json.dumps(make()).encode()
             save(key, ".json", known)
         _made[key, place] = Made(key, json.loads(known))
         trim(_made, FILES)

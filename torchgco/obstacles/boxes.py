@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_finite, check_shape
+from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.obstacles.attitude import in_plane
 from torchgco.obstacles.base import ABSENT, OwnKind, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
-from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
+from torchgco.obstacles.inputs import dimension, own_radii, points, rows, vehicle_radii
 
 BOX_GAPS_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
@@ -56,8 +56,6 @@ class Boxes(Constraint):
     rotations: Any = None
     radii: Any = None
     knots: Any = None
-
-    geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
         if isinstance(self.vehicle_radius, Body):
@@ -190,12 +188,9 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
     if rotations is None:
         return straight.contiguous()
     if d == 2:
-        angle = per_problem(rotations, "boxes.rotations", 2, dims)
-        check_shape(angle, tuple(absent.shape), "boxes.rotations")
-        axes = in_plane(angle).mT
+        axes = in_plane(per_row(rotations, "boxes.rotations", dims, absent.shape[1])).mT
     else:
-        turns = per_problem(rotations, "boxes.rotations", 3, dims)
-        check_shape(turns, (*absent.shape, 4), "boxes.rotations")
+        turns = per_row(rotations, "boxes.rotations", dims, absent.shape[1], 4)
         length = turns.square().sum(-1, keepdim=True).sqrt()
         wrong = ((length - 1.0).abs() > UNIT_WITHIN).squeeze(-1) & ~absent
         if bool(wrong.any()):

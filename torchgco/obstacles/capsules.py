@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,8 +41,6 @@ class Capsules(Constraint):
     radii: Any
     vehicle_radius: Any = 0.0
     knots: Any = None
-
-    geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
         if isinstance(self.vehicle_radius, Body):

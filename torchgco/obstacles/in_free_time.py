@@ -33,6 +33,8 @@ class SpheresInFreeTime(Obstacles):
 
     absent, vehicle_radius, position = passed_on("spheres", "absent", "vehicle_radius", "position")
     dt, knots, margins, moving = passed_on("spheres", "dt", "knots", "margins", "moving")
+    row_shape, start_is_clear = passed_on("spheres", "row_shape", "start_is_clear")
+    signed_distance, segment_clearance = passed_on("spheres", "signed_distance", "segment_clearance")
 
     def bind(self, dims: Dimensions) -> Self:
         return self
@@ -45,9 +47,6 @@ class SpheresInFreeTime(Obstacles):
         """The same for the factor of the first states of X (B, N+1, n), which all others have where X obeys the
         dynamics."""
         return self.at_factor(X[:, 0, self.factor])
-
-    def row_shape(self, N: int) -> tuple[int, int]:
-        return self.spheres.row_shape(N)
 
     @property
     def row_radii(self) -> Tensor:
@@ -81,20 +80,11 @@ class SpheresInFreeTime(Obstacles):
         add[..., own.unsqueeze(-1), own] = J.mT @ (h.unsqueeze(-1) * J)
         H[:, self.knots] += add
 
-    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
-        return self.spheres.signed_distance(p, t)
-
     def distances(self, X: Tensor) -> Tensor:
         return self.along(X).distances(X)
 
-    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        return self.spheres.segment_clearance(a, b)
-
     def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
         return self.along(X).chord_clearance(X, share)
-
-    def start_is_clear(self, x0: Tensor) -> Tensor:
-        return self.spheres.start_is_clear(x0)
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, spheres=self.spheres.grown(by))

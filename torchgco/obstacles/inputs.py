@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
 
 
 def dimension(dims: Dimensions, name: str) -> int:
@@ -43,10 +43,10 @@ def rows(value: Any, name: str, d: int, dims: Dimensions) -> Tensor:
     """Numbers per obstacle and coordinate, (B, M, ...); an empty list stands for none of d coordinates.
 
     Raises:
-        InputError: as `per_problem`.
+        InputError: as `per_row`.
     """
     given = tensor(value, name, dims.like)
-    return per_problem(given.reshape(0, d) if tuple(given.shape) == (0,) else given, name, 3, dims)
+    return per_row(given.reshape(0, d) if tuple(given.shape) == (0,) else given, name, dims, "M", "d").contiguous()
 
 
 def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor:
@@ -57,8 +57,7 @@ def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor
     """
     given = tensor(value, name, dims.like)
     given = torch.where(absent, torch.nan, given) if given.dim() == 0 else given
-    radii = per_problem(given, name, 2, dims)
-    check_shape(radii, tuple(absent.shape), name)
+    radii = per_row(given, name, dims, absent.shape[1])
     if bool((torch.isnan(radii) != absent).any()):
         raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")
     wrong = ~absent & ~((radii >= 0) & torch.isfinite(radii))
@@ -82,17 +81,3 @@ def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:
     if not bool((radius >= 0).all()):
         raise InputError(name, "a number of at least 0 m", float(radius.min()))
     return radius.reshape(-1).expand(dims.B).contiguous()
-
-
-def per_problem(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
-    """`value` with its batch axis, repeated for every problem where it came without one.
-
-    Raises:
-        InputError: not numbers, another number of axes than `dim` or `dim` - 1, or another batch.
-    """
-    given = tensor(value, name, dims.like)
-    if given.dim() == dim - 1:
-        given = given.unsqueeze(0).expand(dims.B, *given.shape)
-    if given.dim() != dim or given.shape[0] != dims.B:
-        raise InputError(name, f"one set for all, or {dims.B} sets", f"shape {tuple(given.shape)}")
-    return given.contiguous()

@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_finite, check_shape
+from torchgco.base.shapes import Dimensions, check_finite, per_row
 from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ABSENT, TOUCH, OwnKind, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, segment_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
-from torchgco.obstacles.inputs import per_problem
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,6 @@ class OscillatingBoxes(Constraint):
     rates: Any
     phases: Any
 
-    geometric: ClassVar[bool] = True
-
     def bind(self, dims: Dimensions) -> Constraint:
         if isinstance(self.boxes.vehicle_radius, Body):
             return self.boxes.vehicle_radius.around(self, dims)
@@ -49,12 +46,10 @@ class OscillatingBoxes(Constraint):
         assert isinstance(boxes, BoundBoxes)
         if dims.dt is None:
             raise InputError("boxes.amplitudes", "dynamics with a time step dt", "dynamics without one")
-        B, M, d = boxes.centers.shape
+        _, M, d = boxes.centers.shape
         sines: list[Tensor] = []
         for name in ("amplitudes", "rates", "phases"):
-            part = per_problem(getattr(self, name), f"boxes.{name}", 4, dims)
-            check_shape(part, (B, M, part.shape[2], d), f"boxes.{name}")
-            check_shape(part, tuple(sines[0].shape) if sines else tuple(part.shape), f"boxes.{name}")
+            part = per_row(getattr(self, name), f"boxes.{name}", dims, M, sines[0].shape[2] if sines else "S", d)
             part = torch.where(boxes.absent[..., None, None], 0.0, part)
             check_finite(part, f"boxes.{name}", "finite numbers for every box that is there")
             sines.append(part)

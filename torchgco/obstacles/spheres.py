@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of
+from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of
 from torchgco.constraints.base import Constraint, add_at, resolve_knots
 from torchgco.obstacles.base import TOUCH, OwnKind, Solids, least, picked
 from torchgco.obstacles.body import Body
-from torchgco.obstacles.inputs import own_radii, per_problem, points, vehicle_radii
+from torchgco.obstacles.inputs import own_radii, points, vehicle_radii
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,6 @@ class Spheres(Constraint):
     velocities: Any = None
     knots: Any = None
 
-    geometric: ClassVar[bool] = True
-
     def bind(self, dims: Dimensions) -> Constraint:
         if isinstance(self.vehicle_radius, Body):
             return self.vehicle_radius.around(self, dims)
@@ -56,8 +54,7 @@ class Spheres(Constraint):
         vehicle = vehicle_radii(self.vehicle_radius, "obstacles.vehicle_radius", dims)
         velocities = None
         if self.velocities is not None:
-            velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
-            check_shape(velocities, tuple(centers.shape), "obstacles.velocities")
+            velocities = per_row(self.velocities, "obstacles.velocities", dims, *centers.shape[1:])
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
             check_finite(velocities, "obstacles.velocities", "finite velocities of every sphere")
             if dims.dt is None:
@@ -172,11 +169,11 @@ class BoundSpheres(OwnKind):
         return replace(self, inflated_radii=radii, vehicle_radius=self.vehicle_radius + by, weights=weights)
 
     def later(self, t: float) -> BoundSpheres:
-        return self if self.velocities is None else self._with(centers=self.centers + t * self.velocities)
+        return self if self.velocities is None else self.remade(centers=self.centers + t * self.velocities)
 
     def paced(self, factor: Tensor) -> BoundSpheres:
         """The same spheres, which move `factor` (B,) times as far from knot to knot."""
-        return self if self.velocities is None else self._with(velocities=factor.view(-1, 1, 1) * self.velocities)
+        return self if self.velocities is None else self.remade(velocities=factor.view(-1, 1, 1) * self.velocities)
 
     def chosen(self, at: Tensor) -> BoundSpheres:
         absent = (at < 0) | picked(self.absent, at)
@@ -185,10 +182,10 @@ class BoundSpheres(OwnKind):
             for part in (self.centers, self.velocities)
         )
         radii = torch.where(absent, 0.0, picked(self.inflated_radii, at))
-        return self._with(centers=centers, inflated_radii=radii, velocities=velocities, absent=absent)
+        return self.remade(centers=centers, inflated_radii=radii, velocities=velocities, absent=absent)
 
-    def _with(self, **changes: Tensor | None) -> BoundSpheres:
-        """The same with other numbers, and the matrices of these."""
+    def remade(self, **changes: Tensor | None) -> BoundSpheres:
+        """The same with other numbers, and matrices of the numbers as they are."""
         names = "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "knots", "position", "dt"
         numbers: dict[str, Any] = {name: getattr(self, name) for name in names} | changes
         return replace(self.prepare(**numbers), stops=self.stops)

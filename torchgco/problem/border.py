@@ -17,13 +17,15 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
 from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError, theirs
-from torchgco.base.mixing import why
-from torchgco.base.shapes import MISTAKES, Dimensions, describe
+from torchgco.base.mixing import foreign, why
+from torchgco.base.options import Seconds, check_value
+from torchgco.base.shapes import MISTAKES, Dimensions, check_tensor, describe
 from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint, FunctionConstraint, innermost
+from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.names import check_names
+from torchgco.dynamics.integrators import Integrator
+from torchgco.dynamics.names import controls_of, states_of
 from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
@@ -43,6 +45,43 @@ ONE_KNOT = (
 Given: TypeAlias = tuple[Any, Any]  # a part as the user gave it, and bound to a problem
 # The parts that have passed, by identity, and for which problems.
 _passed: MutableMapping[Any, set[Hashable]] = WeakIdKeyDictionary()
+
+
+def check_model(dynamics: Dynamics, x0: Tensor) -> None:
+    """Check a model's time step, position, parameters and first step, for starts x0 (B, n).
+
+    Raises:
+        InputError: names what is at fault.
+    """
+    check_value(getattr(dynamics, "dt", None), Seconds | None, "dynamics.dt")
+    if type(dynamics).step is Dynamics.step:
+        check_value(dynamics.integrator, Integrator, "dynamics.integrator")
+    where, n = dynamics.position, dynamics.n
+    if where is not None and where not in [slice(i, j) for j in range(1, n + 1) for i in range(j)]:
+        raise InputError("dynamics.position", f"a slice of states within 0..{n}, or None", repr(where))
+    for name in dynamics.per_element:
+        _check_parameter(getattr(dynamics, name), f"dynamics.{name}", x0)
+    step, start = dynamics.at(0).step, (x0, x0.new_zeros(x0.shape[0], dynamics.m))
+    expected = f"a step for {x0.dtype} states {tuple(x0.shape)}, as x0"
+    try:
+        after = step(*start)
+    except MISTAKES as error:
+        raise InputError("dynamics.step", expected, why(error, step, *start)) from theirs(error)
+    if not isinstance(after, Tensor) or after.shape != x0.shape or after.dtype != x0.dtype:
+        got = foreign(x0.dtype, step, *start) if isinstance(after, Tensor) else None
+        raise InputError("dynamics.step", f"{x0.dtype} states {tuple(x0.shape)}", got or describe(after))
+
+
+def _check_parameter(value: object, field: str, x0: Tensor) -> None:
+    B = x0.shape[0]
+    if not isinstance(value, Tensor):
+        check_value(value, float, field)
+    elif value.dim() > 0:
+        if tuple(value.shape) not in ((B,), (1,)):
+            raise InputError(field, f"a number or a tensor ({B},)", tuple(value.shape))
+        if value.dtype != x0.dtype or value.device != x0.device:
+            raise InputError(field, f"{x0.dtype} on {x0.device} as x0", f"{value.dtype} on {value.device}")
+        check_tensor(value, field)
 
 
 def check_code(
@@ -92,7 +131,8 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     Raises:
         InputError: names the method, what was expected, and what it returned.
     """
-    check_names(dynamics)
+    for named in (states_of, controls_of):  # which refuse names and units that aren't one text for each
+        named(dynamics)
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
     k = torch.arange(3, device=x0.device).clamp(max=N - 1)
@@ -242,7 +282,7 @@ def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint
     if is_users(cost):
         _called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
     for i, constraint in enumerate(constraints):
-        if is_users(constraint) and type(innermost(constraint)).accumulate is not Constraint.accumulate:
+        if is_users(constraint) and type(constraint.bare).accumulate is not Constraint.accumulate:
             part = constraint.take(first)
             zero = torch.zeros_like(_called(f"constraints[{i}].value", wanted, part.value, X, U))
             _called(f"constraints[{i}].value", wanted, part.accumulate, X, U, zero, zero, _blocks(X, U)[first])
@@ -312,11 +352,8 @@ def _check_axes(
 def _check_tensor(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:
     fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.dtype == dtype
     if not fits or any(want not in (None, got) for want, got in zip(shape, value.shape, strict=True)):
-        raise InputError(field, wanted, f"{describe(value)} instead of {_text(shape)}")
-
-
-def _text(shape: tuple[int | None, ...]) -> str:
-    return f"({', '.join('p' if size is None else str(size) for size in shape)}{',' if len(shape) == 1 else ''})"
+        sizes = ", ".join("p" if size is None else str(size) for size in shape)
+        raise InputError(field, wanted, f"{describe(value)} instead of ({sizes}{',' if len(shape) == 1 else ''})")
 
 
 def _check_slope(

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import lead
+from torchgco.base.tree import passed_on
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint, WrappedConstraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
@@ -175,6 +176,8 @@ class _Stages(WrappedCost):
 
     batched: ClassVar[tuple[str, ...]] = ("cost", "running", "resting", "weight")
 
+    (terminal,) = passed_on("cost", "terminal")
+
     def rest_controls(self, like: Tensor) -> Tensor:
         return torch.where(self.running.unsqueeze(-1) > 0, self.cost.rest_controls(like), self.resting)
 
@@ -185,9 +188,6 @@ class _Stages(WrappedCost):
             rest = rest.unsqueeze(1) if isinstance(k, int) else rest
         held = 0.5 * (weight * (u - rest).square()).sum(-1)
         return torch.where(_of_stages(self.running, k, value) > 0, value, held)
-
-    def terminal(self, x: Tensor) -> Tensor:
-        return self.cost.terminal(x)
 
 
 class _OwnExpansion(_Stages):

@@ -17,18 +17,17 @@ from torch.nn.functional import pad
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, lead
-from torchgco.constraints.base import Constraint, WrappedConstraint
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.dynamics.integrators import INTEGRATORS
-from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.problem import Problem
-from torchgco.problem.rates import IN_PLACE
+from torchgco.problem.rates import FirstRows, on_first, rates_of
 
 FREE_TIME_FORM = "in free time"  # what is kept with the form of the problem for this one
 HELD_FORM = "at held times"  # the same, where obstacles move
@@ -47,10 +46,12 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
     time = problem.time
     if time is None:
         return problem
-    guess = _guess(problem) if guess is None else guess
-    rates = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
+    guess = time.guess if guess is None else guess
+    guess = torch.clamp(torch.ones_like(time.least), time.least, time.most) if guess is None else guess
+    rates = rates_of(problem)
     controls = None if rates is None else rates.controls
-    x0 = _start(problem, problem.x0, guess[:, :1], rates)
+    before = [] if rates is None else [rates.before.expand(problem.B, -1)]
+    x0 = torch.cat((problem.x0, guess[:, :1], *before), dim=-1)
     free = problem.free_start
     free = torch.zeros_like(problem.x0, dtype=torch.bool) if free is None else free
     parts: dict[str, object] = {
@@ -66,22 +67,14 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
     return whole
 
 
-def _guess(problem: Problem) -> Tensor:
-    """The factors (B, S) to begin with: those that were given, else the nominal times, within the bounds."""
-    time = problem.time
-    assert time is not None
-    return time.guess if time.guess is not None else torch.clamp(torch.ones_like(time.least), time.least, time.most)
-
-
 def states_in_time(problem: Problem, X: Tensor, U: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n), U (B, N, m) with the factors (B, S), as states and controls of the problem `in_time`."""
     time, N = problem.time, problem.N
     assert time is not None
     along = factors[:, time.of_stages(N)]
     parts = [X, torch.cat((along, along[:, -1:]), dim=1).unsqueeze(-1)]
-    rates = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
-    if rates is not None:
-        first = _start(problem, X[:, 0], factors[:, :1], rates)[:, problem.n + 1 :]
+    if (rates := rates_of(problem)) is not None:
+        first = rates.before.expand(len(X), -1)
         parts.append(torch.cat((first.unsqueeze(1), U[..., rates.controls]), dim=1))
     if time.count == 1:
         return torch.cat(parts, dim=-1), U
@@ -189,15 +182,6 @@ def at_times(problem: Problem, X: Tensor, U: Tensor, times: Any) -> tuple[Proble
         return problem, X, U
     factors = factors_of(problem, times)
     return in_time(problem, factors), *states_in_time(problem, X, U, factors)
-
-
-def _start(problem: Problem, x0: Tensor, factor: Tensor, rates: RateBounds | None) -> Tensor:
-    """Starts x0 (B, n) with the factor (B, 1) of the first segment and the controls before."""
-    parts = [x0, factor]
-    if rates is not None:
-        before = x0.new_zeros(1, problem.m) if rates.previous is None else rates.previous
-        parts.append(before[:, rates.controls].expand(len(x0), -1))
-    return torch.cat(parts, dim=-1)
 
 
 def _switches(time: FreeTime, N: int) -> Tensor | None:
@@ -334,40 +318,13 @@ def _constraint(constraint: Constraint, problem: Problem) -> Constraint:
                        upper=pad(constraint.upper, (0, 1), value=torch.inf))  # fmt: skip
     if isinstance(constraint, BoundSpheres) and constraint.moving:
         return SpheresInFreeTime(constraint, n)
-    if isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE:
-        return constraint
-    return _Rows(constraint, n, m)
+    return on_first(constraint, n, m, _Rows)
 
 
-@dataclass(frozen=True)
-class _Rows(WrappedConstraint):
-    """A constraint on the first n states and m controls."""
+class _Rows(FirstRows):
+    """Rows of the first states and controls that kernels in C measure, too."""
 
-    n: int
-    m: int
-
-    batched: ClassVar[tuple[str, ...]] = ("constraint",)
     keeps_rows: ClassVar[bool] = True
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.value(X[..., : self.n], U[..., : self.m])
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.violation(X[..., : self.n], U[..., : self.m])
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        return self.constraint.at(x[..., : self.n], k)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, m, s = self.n, self.m, self.n + 1 + self.m
-        blocks = H.new_zeros(*H.shape[:2], s, s)
-        self.constraint.accumulate(X[..., :n], U[..., :m], g, h, blocks)
-        one = X.shape[-1]
-        own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
-        H[..., own.unsqueeze(-1), own] += blocks
-
-    def start_is_clear(self, x0: Tensor) -> Tensor:
-        return self.constraint.start_is_clear(x0[:, : self.n])
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ class Known:
         interior: of the interior point in PyTorch: it knows the shapes of rows.
         expects_interior: the interior point will be asked for.
         warned: reasons for PyTorch's kernels that a warning has named.
-        packed: by place, the constraint that was packed for C last, of how many problems, and its structure.
-        model, cost: the same of the dynamics, and of the cost with its arrays.
+        packed: of "dynamics", "cost" and constraints by their place: the part that was packed for C last, of how many
+            problems, and what was made of it.
         lifted: what is known of problems with further states, by their kind: see `horizons` and `rates`.
     """
 
@@ -31,9 +31,7 @@ class Known:
     interior: Any = None
     expects_interior: bool = False
     warned: set[str] = field(default_factory=set)
-    packed: dict[int, tuple[Any, int, Any]] = field(default_factory=dict)
-    model: tuple[Any, int, Any] = (None, 0, None)
-    cost: tuple[Any, int, Any] = (None, 0, None)
+    packed: dict[str | int, tuple[Any, int, Any]] = field(default_factory=dict)
     lifted: dict[str, Known] = field(default_factory=dict)
 
     def of_lifted(self, kind: str) -> Known:

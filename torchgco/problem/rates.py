@@ -6,6 +6,7 @@ knot; all other parts see the first n states.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -33,19 +34,23 @@ def with_controls_before(problem: Problem) -> Problem:
 
     Constraints keep their places, rows and knots, and so multipliers their shapes.
     """
-    bounds = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
+    bounds = rates_of(problem)
     if bounds is None:
         return problem
-    n, controls, x0, free = problem.n, bounds.controls, problem.x0, problem.free_start
-    before = x0.new_zeros(1, problem.m) if bounds.previous is None else bounds.previous
+    n, m, controls, x0, free = problem.n, problem.m, bounds.controls, problem.x0, problem.free_start
     parts: dict[str, object] = {
         "dynamics": _Dynamics(problem.dynamics, controls),
         "cost": _cost(problem.cost, n, len(controls)),
-        "constraints": tuple(_constraint(c, n) for c in problem.constraints),
-        "x0": torch.cat((x0, before[:, controls].expand(problem.B, -1)), dim=-1),
+        "constraints": tuple(_constraint(c, n, m) for c in problem.constraints),
+        "x0": torch.cat((x0, bounds.before.expand(problem.B, -1)), dim=-1),
         "free_start": None if free is None else torch.nn.functional.pad(free, (0, len(controls))),
     }
     return problem._with(parts, known=problem.known.of_lifted(RATES_FORM))
+
+
+def rates_of(problem: Problem) -> RateBounds | None:
+    """The bounds on rates, of which a problem has one at most; None where there are none."""
+    return next((part for part in problem.constraints if isinstance(part, RateBounds)), None)
 
 
 @dataclass(frozen=True)
@@ -113,10 +118,8 @@ class _OwnExpansion(_FirstStates):
     """Where the cost has its own `expand`."""
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
-        blocks = _blocks(H, self.n, U.shape[-1])
-        self.cost.expand(X[..., : self.n], U, blocks)
         H.zero_()
-        _add(H, blocks, self.n)
+        _add_first(H, X, self.n, U.shape[-1], lambda blocks: self.cost.expand(X[..., : self.n], U, blocks))
 
 
 class _OwnTotal(_OwnExpansion):
@@ -126,49 +129,48 @@ class _OwnTotal(_OwnExpansion):
         return self.cost.total(X[..., : self.n], U)
 
 
-def _constraint(constraint: Constraint, n: int) -> Constraint:
+def _constraint(constraint: Constraint, n: int, m: int) -> Constraint:
     if isinstance(constraint, RateBounds):
         return constraint.with_states_from(n)
+    return on_first(constraint, n, m, FirstRows)
+
+
+def on_first(constraint: Constraint, n: int, m: int, kind: type[FirstRows]) -> Constraint:
+    """The constraint where further states and controls follow the first n and m."""
     in_place = isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE
-    return constraint if in_place else _Rows(constraint, n)
+    return constraint if in_place else kind(constraint, n, m)
 
 
 @dataclass(frozen=True)
-class _Rows(WrappedConstraint):
-    """A constraint on the first n states."""
+class FirstRows(WrappedConstraint):
+    """A constraint on the first n states and m controls."""
 
     n: int
+    m: int
 
     batched: ClassVar[tuple[str, ...]] = ("constraint",)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.value(X[..., : self.n], U)
+        return self.constraint.value(X[..., : self.n], U[..., : self.m])
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.violation(X[..., : self.n], U)
+        return self.constraint.violation(X[..., : self.n], U[..., : self.m])
 
     def at(self, x: Tensor, k: int) -> Tensor:
         return self.constraint.at(x[..., : self.n], k)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        blocks = _blocks(H, self.n, U.shape[-1])
-        self.constraint.accumulate(X[..., : self.n], U, g, h, blocks)
-        _add(H, blocks, self.n)
+        X_own, U_own = X[..., : self.n], U[..., : self.m]
+        _add_first(H, X, self.n, self.m, lambda blocks: self.constraint.accumulate(X_own, U_own, g, h, blocks))
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         return self.constraint.start_is_clear(x0[:, : self.n])
 
 
-def _blocks(H: Tensor, n: int, m: int) -> Tensor:
-    """Homogeneous blocks (B, N+1, s, s) of zeros for n states and m controls."""
-    s = n + 1 + m
-    return H.new_zeros(*H.shape[:2], s, s)
-
-
-def _add(H: Tensor, blocks: Tensor, n: int) -> None:
-    """Add homogeneous blocks of the first n states to H, whose other states come between them and the controls."""
-    last = blocks.shape[-1] - n
-    H[..., :n, :n] += blocks[..., :n, :n]
-    H[..., :n, -last:] += blocks[..., :n, n:]
-    H[..., -last:, :n] += blocks[..., n:, :n]
-    H[..., -last:, -last:] += blocks[..., n:, n:]
+def _add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
+    """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
+    blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
+    write(blocks)
+    one = X.shape[-1]
+    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
+    H[..., own.unsqueeze(-1), own] += blocks

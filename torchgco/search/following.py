@@ -13,7 +13,6 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Below, Count, NonNegative, Positive, check_options
 from torchgco.base.shapes import check_shape, repeated, tensor
 from torchgco.base.tree import take
-from torchgco.constraints.base import innermost
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.gates import GateBalls, GateSquares, gates_of
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
@@ -233,7 +232,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor)
 
 def limits_states(problem: Problem) -> bool:
     """Whether rows besides obstacles and control bounds may limit how fast a vehicle is."""
-    others = (part for part in problem.constraints if not isinstance(innermost(part), AT_PLACES))
+    others = (part for part in problem.constraints if not isinstance(part.bare, AT_PLACES))
     return any(part.sense == "inequality" for part in others)
 
 

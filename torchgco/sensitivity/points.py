@@ -76,7 +76,7 @@ class Points:
 
 def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> Points:
     """The points of solutions, with every reason against derivatives; with smoothing, mu in units of the cost."""
-    result = copied(_bare(solution))
+    result = copied(replace(solution, trace=None, search=None, account=None))
     solved = (solution.status == Status.CONVERGED) | (solution.status == Status.FEASIBLE)
     reason = torch.full_like(solution.status, int(Why.NOT_SOLVED))
     growth = torch.zeros_like(solution.cost)
@@ -98,11 +98,6 @@ def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> P
     for where, why in ((~(found.left.amax(0) <= LEFT_OPEN), Why.DEPENDENT_ROWS), (~found.definite, Why.NOT_STRICT)):
         reason[where & (reason == Why.DIFFERENTIABLE)] = int(why)
     return Points(result, problem, growth, active, found.costates, reason, give, gap)
-
-
-def _bare(solution: Solution) -> Solution:
-    """The solution without what isn't copied."""
-    return replace(solution, trace=None, search=None, account=None)
 
 
 def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, reason: Tensor, smoothing: float) -> None:

@@ -63,19 +63,14 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
             expected = "a problem with one horizon, a fixed time and no RateBounds, for a prediction"
             got = "RateBounds" if one.time is None else "a free time"
             raise InputError("problem", expected, got if one.horizon is None else "horizons per problem")
-    _check_same(before, changed)
+    was, now = ((one.B, one.N, one.n, one.m, one.row_shapes) for one in (before, changed))
+    if was != now:
+        raise InputError("changed", f"a problem with B, N, n, m, rows as before, {was}", now)
     with torch.no_grad(), computing_on(changed.x0.device):
         points = points_of(current(before), solution.detach())
         live = changed.grown(points.growth) if bool((points.growth > 0).any()) else changed
         of = residual(live, points.solution.X, points.solution.U, points.costates, points.lam)
         return _stepped(changed, points, of)
-
-
-def _check_same(before: Problem, changed: Problem) -> None:
-    """Raise InputError unless both problems have the same numbers of states, stages and rows."""
-    was, now = ((one.B, one.N, one.n, one.m, one.row_shapes) for one in (before, changed))
-    if was != now:
-        raise InputError("changed", f"a problem with B, N, n, m, rows as before, {was}", now)
 
 
 def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:

@@ -14,7 +14,7 @@ from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive, check
 from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import kernels_of, measured, open_loop, value
-from torchgco.kernels.base import OuterPasses
+from torchgco.kernels.outer import NativeOuter
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, update_and_raise_penalty
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import is_preferred
@@ -139,7 +139,7 @@ class OuterLoop:
     by_arrival: bool
     stopped: int = 0  # problems that guidance has stopped
     _result: SolveEnd | None = None
-    _passes: OuterPasses | None = None  # of the running problems
+    _passes: NativeOuter | None = None  # of the running problems
 
     def __post_init__(self) -> None:
         # As printed, only the outer limit ends a solve, mu always grows, and inequalities have the printed form.
@@ -200,7 +200,7 @@ class OuterLoop:
             status[status == Status.RUNNING] = Status.TIME_LIMIT
         return status
 
-    def _whole_passes(self, s: State) -> OuterPasses | None:
+    def _whole_passes(self, s: State) -> NativeOuter | None:
         """Passes over the running problems by their kernels; None where these make single iterations alone."""
         solver, stop = self.solver, self.guidance if isinstance(self.guidance, StopWhenCaught) else None
         if self._passes is None or self._guided:  # guidance may have replaced tensors of the state
@@ -220,7 +220,7 @@ class OuterLoop:
         """Whether guidance is asked after every pass."""
         return self.guidance is not None and not isinstance(self.guidance, StopWhenCaught)
 
-    def _by_passes(self, passes: OuterPasses, s: State) -> Tensor:
+    def _by_passes(self, passes: NativeOuter, s: State) -> Tensor:
         """As `advance`: with one call of the kernels for all of it where nothing else has to look on."""
         if self.recorder is not None:
             self.recorder.add(self.problem, self.call.rows[s.rows], s, passes.iterate())

@@ -15,7 +15,7 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.fixed import GOLDEN, ROUNDINGS
 from torchgco.eager.kernels import least_violation
 from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
-from torchgco.kernels.base import InteriorKernels
+from torchgco.kernels.in_pytorch import InteriorKernels
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd

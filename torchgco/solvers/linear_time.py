@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.shapes import MISTAKES
-from torchgco.constraints.base import innermost
 from torchgco.constraints.bounds import StateBounds
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.goal import GoalBall
@@ -129,8 +128,8 @@ def _asked(problem: Problem, end: Tensor) -> Tensor:
     """What is asked of the end (B, n), as rows (B, p, n): those of the last knot, else the position, else all."""
     n, where = problem.n, problem.dynamics.position
     parts = [c for c in problem.constraints if c.holds_at(problem.N) and not isinstance(c, Obstacles | StateBounds)]
-    ball = any(isinstance(innermost(part), GoalBall) for part in parts)  # whose row has no slope in its middle
-    parts = [part for part in parts if not isinstance(innermost(part), GoalBall)]
+    ball = any(isinstance(part.bare, GoalBall) for part in parts)  # whose row has no slope in its middle
+    parts = [part for part in parts if not isinstance(part.bare, GoalBall)]
     rows = [jacobian(lambda z, part=part: last_rows(part, problem, z), end)[0] for part in parts]
     if not rows or ball:
         every = torch.eye(n, dtype=end.dtype, device=end.device)

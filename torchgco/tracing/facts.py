@@ -254,21 +254,18 @@ class Facts:
         done = set[tuple[int, str]]()
         while True:
             names = sorted(self._names)
-            pairs = [(self._of_module, module, name) for module in self._modules for name in (*names, "__getattr__")]
-            pairs += [(self._of_library, module, name) for module in self._libraries for name in names]
-            new = [pair for pair in pairs if (id(pair[1]), pair[2]) not in done]
+            pairs = [(module, name, False) for module in self._modules for name in (*names, "__getattr__")]
+            pairs += [(module, name, True) for module in self._libraries for name in names]
+            new = [pair for pair in pairs if (id(pair[0]), pair[1]) not in done]
             if not new:
                 break
-            for walk, module, name in new:
+            for module, name, of_library in new:
                 done.add((id(module), name))
                 if name in vars(module):
                     self.note(name)
-                    walk(name, vars(module)[name])
+                    self._of_library(name, vars(module)[name]) if of_library else self.walk(vars(module)[name])
         if self._names & ELSEWHERE or (self._modules and self._names & BY_NAME):
             raise Unseen(f"one of {sorted(self._names & (ELSEWHERE | BY_NAME))}")
-
-    def _of_module(self, name: str, value: Any) -> None:
-        self.walk(value)
 
     def _of_library(self, name: str, value: Any) -> None:
         """What stands under a name in a trusted package, where a program may have put another thing."""

@@ -169,10 +169,8 @@ class Traced:
 
     def parameters(self, index: Tensor) -> np.ndarray:
         """The numbers (count,) that differ between problems, for the problem that index (1,) int64 selects."""
-        if not self._own:
-            return np.zeros(0)
         computed = self._computed(index)
-        return torch.cat([computed[slot].double().flatten() for slot in self._own]).detach().cpu().numpy()
+        return _flat([computed[slot] for slot in self._own]).numpy()
 
     def parameters_of(self, index: Tensor) -> Tensor:
         """`parameters` for many problems at once: (B, count) float64 for index (B,) int64, on its device.

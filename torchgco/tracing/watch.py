@@ -9,26 +9,21 @@ import torch
 from torch import Tensor
 
 
-class Watch:
-    """Tensors whose content, shape, type and place are compared with those of another time.
+def contents(tensors: Iterable[Tensor]) -> tuple[Hashable, ...] | None:
+    """Content, shape, type and place of tensors, to be compared with those of another time.
 
-    Much quicker than PyTorch's operations on a few numbers each.
+    None where nothing is known of a tensor's memory, as of a sparse one's. Much quicker than PyTorch's operations on a
+    few numbers each.
     """
-
-    def __init__(self, tensors: Iterable[Tensor]) -> None:
-        self.tensors = list({id(tensor): tensor for tensor in tensors}.values())
-
-    def look(self) -> tuple[Hashable, ...] | None:
-        """What can be compared; None where nothing is known of a tensor's memory, as of a sparse one's."""
-        seen = list[Hashable]()
-        for tensor in self.tensors:
-            if tensor.layout is not torch.strided or tensor.device.type != "cpu":
-                return None
-            place, size = tensor.data_ptr(), tensor.nbytes
-            if not tensor.is_contiguous():
-                seen.append(tensor.stride())
-                if size > 0:  # all from the first number to the last: strides are never negative
-                    steps = ((count - 1) * by for count, by in zip(tensor.shape, tensor.stride(), strict=True))
-                    size = (sum(steps) + 1) * tensor.element_size()
-            seen += place, tensor.shape, tensor.dtype, ctypes.string_at(place, size)
-        return tuple(seen)
+    seen = list[Hashable]()
+    for tensor in tensors:
+        if tensor.layout is not torch.strided or tensor.device.type != "cpu":
+            return None
+        place, size = tensor.data_ptr(), tensor.nbytes
+        if not tensor.is_contiguous():
+            seen.append(tensor.stride())
+            if size > 0:  # all from the first number to the last: strides are never negative
+                steps = ((count - 1) * by for count, by in zip(tensor.shape, tensor.stride(), strict=True))
+                size = (sum(steps) + 1) * tensor.element_size()
+        seen += place, tensor.shape, tensor.dtype, ctypes.string_at(place, size)
+    return tuple(seen)

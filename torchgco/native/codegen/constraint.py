@@ -24,10 +24,17 @@ def trace_rows(problem: Problem, i: int) -> KnotSource:
         tgco_KEY_rows(x, u, p, w, c)
         tgco_KEY_add(x, u, p, w, by_c, by_cc, g, H)     g += c_z' by_c,  H += c_z' diag(by_cc) c_z, its upper triangle
 
+    Of a body, whose rows C knows, it is the centers c (P DIM) of the balls:
+
+        tgco_KEY_rows(x, u, p, w, c)
+        tgco_KEY_slopes(x, u, p, w, e)    c_z (P DIM, COUNT) by the columns of z = [x, u] that it reads
+        tgco_KEY_count, tgco_KEY_columns  how many these are, and which, rising
+
     Raises:
         InputError: the rows can't be traced, hold an operation without a counterpart, or join several knots.
     """
-    return knot_source("rows", span_of_rows(problem, i), _code, __file__)
+    kind, code = ("lift", _lift_code) if is_lifted(problem.constraints[i]) else ("rows", _code)
+    return knot_source(kind, span_of_rows(problem, i), code, __file__)
 
 
 def rows_numbers(problem: Problem, i: int, source: KnotSource, shared: Tensor) -> Tensor:
@@ -69,20 +76,46 @@ def _code(knot: Knot, name: str) -> str:
     inputs = knot.inputs
     ahead = calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
     slopes = ahead.jacobian(knot.rows)
-    rows, columns = slopes.sparsity().get_triplet()
-    nonzeros: list[Any] = slopes.nonzeros()
+    places, nonzeros = places_of(slopes), slopes.nonzeros()
     code = [
         calls.emit_staged(f"tgco_{name}_rows", inputs, [knot.rows], calls.values(knot.calls)),
         calls.emit_staged(f"tgco_{name}_slopes", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)], ahead.stages),
         f"static inline void tgco_{name}_add(",
         "    const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc, V *g, V *H) {",
-        f"    V e[{max(1, len(rows))}];",
+        f"    V e[{max(1, len(places))}];",
         f"    tgco_{name}_slopes(x, u, p, w, e);",
     ]
-    places = sorted(zip(rows, columns, range(len(rows)), strict=True))
-    for row, column, i in places:
-        code.append(f"    ADD(g[{column}], e[{i}], by_c[{row}]);")
-        for other, later, j in places:
-            if other == row and later >= column:
-                code.append(f"    ADD(H[{column} * (NX + NU) + {later}], e[{i}] * by_cc[{row}], e[{j}]);")
-    return "\n".join([*code, "}"])
+    code += [f"    ADD(g[{column}], e[{i}], by_c[{row}]);" for row, column, i in places]
+    return "\n".join([*code, *squares(places, "by_cc"), "}"])
+
+
+def places_of(slopes: Any) -> list[tuple[int, int, int]]:
+    """Row, column and number of each nonzero, row by row."""
+    rows, columns = slopes.sparsity().get_triplet()
+    return sorted(zip(rows, columns, range(len(rows)), strict=True))
+
+
+def squares(places: list[tuple[int, int, int]], weights: str) -> list[str]:
+    """C that adds c_z' diag(weights) c_z to the upper triangle of H, of slopes e at these places."""
+    pairs = ((one, other) for one in places for other in places if other[0] == one[0] and other[1] >= one[1])
+    return [
+        f"    ADD(H[{column} * (NX + NU) + {later}], e[{i}] * {weights}[{row}], e[{j}]);"
+        for (row, column, i), (_, later, j) in pairs
+    ]
+
+
+def _lift_code(knot: Knot, name: str) -> str:
+    import casadi as ca
+
+    ahead = calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
+    slopes = ahead.jacobian(knot.rows)
+    columns = sorted(set(slopes.sparsity().get_triplet()[1]))
+    dense: Any = ca.densify(ca.vec(slopes[:, columns].T))  # row by row
+    return "\n".join(
+        [
+            calls.emit_staged(f"tgco_{name}_rows", knot.inputs, [knot.rows], calls.values(knot.calls)),
+            calls.emit_staged(f"tgco_{name}_slopes", knot.inputs, [dense], ahead.stages),
+            f"static const int tgco_{name}_count = {len(columns)};",
+            f"static const int tgco_{name}_columns[] = {{{', '.join(map(str, columns))}}};",
+        ]
+    )

@@ -7,6 +7,7 @@ from typing import Any
 
 from torchgco.native import store
 from torchgco.native.codegen import calls, emit
+from torchgco.native.codegen.constraint import places_of, squares
 from torchgco.native.codegen.dynamics import DynamicsSource, computed_entries, makers, stepped
 from torchgco.native.codegen.knot import Knot, KnotSource, knot_source
 from torchgco.native.codegen.stages import StagesSource
@@ -35,18 +36,11 @@ def _model_code(model: DynamicsSource) -> str:
     """
 
     if isinstance(model, StagesSource):
-        return knot_source("curvature", model.stage.span, _stage_code, __file__).code
-
-    def make(_: str) -> dict[str, Any]:
-        return {"code": _step_code(*stepped(model.traced, model.n, model.m))}
-
-    key = "curvature", model.key, *makers(__file__)
-    code = store.made(key, make, f"curvature {model.traced.kin}").content["code"]
-    return emit.checked(model.traced.field, code)
-
-
-def _stage_code(knot: Knot, _: str) -> str:
-    return _step_code(knot.inputs, knot.rows, knot.calls)
+        code_of = lambda knot, _: _step_code(knot.inputs, knot.rows, knot.calls)
+        return knot_source("curvature", model.stage.span, code_of, __file__).code
+    key, traced = ("curvature", model.key, *makers(__file__)), model.traced
+    make = lambda: {"code": _step_code(*stepped(traced, model.n, model.m))}
+    return emit.checked(traced.field, store.made(key, make, f"curvature {traced.kin}").content["code"])
 
 
 def _step_code(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> str:
@@ -68,30 +62,25 @@ def _rows_code(knot: Knot, name: str) -> str:
 
     inputs, ahead = knot.inputs, calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
     slopes = ahead.jacobian(knot.rows)
-    rows, columns = slopes.sparsity().get_triplet()
-    nonzeros: list[Any] = slopes.nonzeros()
-    places = sorted(zip(rows, columns, range(len(rows)), strict=True))
-    lam = ca.SX.sym("lam", knot.rows.numel())
-    column = ca.vertcat(ca.SX(0, 1), *nonzeros)
+    places, lam = places_of(slopes), ca.SX.sym("lam", knot.rows.numel())
+    column = ca.vertcat(ca.SX(0, 1), *slopes.nonzeros())
     lines = [
         _curves(f"tgco_{name}_bend", [*inputs, lam], ca.dot(lam, knot.rows), ahead, column if knot.calls else None),
         calls.emit_staged(f"tgco_{name}_slants", inputs, [column], ahead.stages),
         f"static inline void tgco_{name}_model(const V *x, const V *u, const V *p, const double *w, const V *by,",
         "    const V *cc, const V *lam, V *const *g, V *H) {",
-        f"    V e[{max(1, len(rows))}];",
+        f"    V e[{max(1, len(places))}];",
         f"    tgco_{name}_bend(x, u, p, w, lam, e, H);" if knot.calls else f"    tgco_{name}_slants(x, u, p, w, e);",
     ]
     for row, column, i in places:
         lines.append(f"    for (int a = 0; a < PARTS; a++) ADD(g[a][{column}], e[{i}], by[a * MAX_ROWS + {row}]);")
-        for other, later, j in places:
-            if other == row and later >= column:
-                lines.append(f"    ADD(H[{column} * (NX + NU) + {later}], e[{i}] * cc[{row}], e[{j}]);")
     lines += [
+        *squares(places, "cc"),
         *([] if knot.calls else [f"    tgco_{name}_bend(x, u, p, w, lam, H);"]),
         "}",
         f"static inline void tgco_{name}_along(",
         "    const V *x, const V *u, const V *p, const double *w, const V *z, V *out) {",
-        f"    V e[{max(1, len(rows))}];",
+        f"    V e[{max(1, len(places))}];",
         f"    tgco_{name}_slants(x, u, p, w, e);",
         f"    for (int j = 0; j < {knot.rows.numel()}; j++) out[j] = SET(0.0);",
         *(f"    ADD(out[{row}], e[{i}], z[{column}]);" for row, column, i in places),
@@ -158,34 +147,21 @@ def _has_hidden_pole(function: Any, poles: Container[int] = ()) -> bool:
 
     A pole that is needed without any branch, too, makes the value itself infinite or NaN, in either mode.
     """
-    import casadi as ca
-
-    smooth = {getattr(ca, f"OP_{name}") for name in SMOOTH_OPERATIONS}
-    written: dict[int, int] = {}  # by which instruction each place of the work vector was written last
-    needs: list[list[int]] = []
-    outputs = []
-    for i in range(function.n_instructions()):
-        if function.instruction_id(i) in (ca.OP_INPUT, ca.OP_CONST):
-            needs.append([])
-        else:
-            needs.append([written[place] for place in function.instruction_input(i)])
-        if function.instruction_id(i) == ca.OP_OUTPUT:
-            outputs.append(i)
-        else:
-            written[function.instruction_output(i)[0]] = i
-    always, ever = (_reached(function, needs, outputs, through) for through in (False, True))
-    hidden = [(function.instruction_id(i), function.instruction_input(i)) for i in ever - always]
-    return any(what not in smooth or (what == ca.OP_INPUT and read[0] in poles) for what, read in hidden)
+    at, (operations, needs) = emit.codes(), emit.instructions(function)
+    smooth = {at[name] for name in SMOOTH_OPERATIONS}
+    always, ever = (_reached(operations, needs, through) for through in (False, True))
+    hidden = [(operations[i], function.instruction_input(i)) for i in ever - always]
+    return any(what not in smooth or (what == at["INPUT"] and read[0] in poles) for what, read in hidden)
 
 
-def _reached(function: Any, needs: list[list[int]], outputs: list[int], through: bool) -> set[int]:
-    """The instructions that `outputs` need; those of branches, too, with `through`."""
-    import casadi as ca
-
-    found, open_ = set(outputs), list(outputs)
+def _reached(operations: list[int], needs: list[list[int]], through: bool) -> set[int]:
+    """The instructions that outputs need; those of branches, too, with `through`."""
+    at = emit.codes()
+    open_ = [i for i, operation in enumerate(operations) if operation == at["OUTPUT"]]
+    found = set(open_)
     while open_:
         i = open_.pop()
-        branch = function.instruction_id(i) == ca.OP_IF_ELSE_ZERO and not through
+        branch = operations[i] == at["IF_ELSE_ZERO"] and not through
         for j in needs[i][:1] if branch else needs[i]:
             if j not in found:
                 found.add(j)
@@ -209,13 +185,7 @@ def _switches(rows: Iterable[tuple[int, KnotSource]]) -> str:
     for i, source in rows:
         models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, w, by, cc, lam, g, H); break;")
         alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, w, z, out); break;")
-    return "\n".join(
-        [
-            "static inline void tgco_model_rows(int i, const V *x, const V *u, const V *p, const double *w,",
-            "    const V *by, const V *cc, const V *lam, V *const *g, V *H) {",
-            "    switch (i) {", *models, "    }", "}",
-            "static inline void tgco_along_rows(",
-            "    int i, const V *x, const V *u, const V *p, const double *w, const V *z, V *out) {",
-            "    switch (i) {", *alongs, "    }", "}",
-        ]
-    )  # fmt: skip
+    given = "int i, const V *x, const V *u, const V *p, const double *w"
+    of_model = f"void tgco_model_rows({given},\n    const V *by, const V *cc, const V *lam, V *const *g, V *H)"
+    along = f"void tgco_along_rows(\n    {given}, const V *z, V *out)"
+    return f"{emit.switch(of_model, models)}\n{emit.switch(along, alongs)}"

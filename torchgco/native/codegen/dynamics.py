@@ -97,15 +97,10 @@ def trace_dynamics(
     step = lambda i, x, u: dynamics.take(i).step(x, u)
     traced = Traced("dynamics.step", step, x, u, own=own_tensors(dynamics))
     key = "model", traced.fingerprint(), *makers()
-    parts = store.made(key, lambda _: _made(traced, n, m), f"model {traced.kin}")
+    parts = store.made(key, lambda: step_parts(*stepped(traced, n, m)), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
     code, affine = emit.checked(traced.field, parts.content["code"]), parts.content["affine"]
     return DynamicsSource(n, m, traced.count, code, **lists, affine=affine, key=parts.key, traced=traced)
-
-
-def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
-    """The parts of a DynamicsSource that take CasADi to make."""
-    return step_parts(*stepped(traced, n, m))
 
 
 def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any, list[Call]]:
@@ -154,7 +149,7 @@ def _is_affine(inputs: Sequence[Any], step: Any, changing: Any) -> bool:
     import casadi as ca
 
     function = ca.Function("step", list(inputs), [step])
-    rational = {getattr(ca, f"OP_{name}") for name in RATIONAL}
+    rational = {emit.codes()[name] for name in RATIONAL}
     smooth = all(function.instruction_id(i) in rational for i in range(function.n_instructions()))
     return smooth and not ca.depends_on(changing, ca.vertcat(*inputs[:2]))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,7 +77,7 @@ def checked(field: str, code: str) -> str:
 
 def _statements(function: ca.Function, shared: int | None) -> tuple[list[str], int]:
     """A line for each instruction but for products that a sum takes, and how many variables w these lines have."""
-    operations, reads = _read(function)
+    operations, reads = instructions(function)
     sums = _sums(operations, reads)
     taken = {product for product, *_ in sums.values()}
     needs = [list(sums[k][2]) if k in sums else read for k, read in enumerate(reads)]
@@ -87,7 +88,7 @@ def _statements(function: ca.Function, shared: int | None) -> tuple[list[str], i
             continue
         given = [names[one] for one in read]
         free += [names.pop(one) for one in dict.fromkeys(read) if last[one] == k]
-        if operations[k] == _codes()["OUTPUT"]:
+        if operations[k] == codes()["OUTPUT"]:
             place, entry = function.instruction_output(k)
             lines.append(f"out{place}[{entry}] = {given[0]};")
             continue
@@ -100,9 +101,9 @@ def _statements(function: ca.Function, shared: int | None) -> tuple[list[str], i
     return lines, size
 
 
-def _read(function: ca.Function) -> tuple[list[int], list[list[int]]]:
+def instructions(function: ca.Function) -> tuple[list[int], list[list[int]]]:
     """The operations of all instructions, and the instructions that have made what each of them reads."""
-    at, operations, reads = _codes(), [], []
+    at, operations, reads = codes(), [], []
     written: dict[int, int] = {}
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
@@ -118,7 +119,7 @@ def _sums(operations: list[int], reads: list[list[int]]) -> dict[int, tuple[int,
     """Sums and differences that take a product nobody else reads, which is rounded once with them: the product's
     instruction, and text and operands of both together.
     """
-    at, uses = _codes(), Counter(one for read in reads for one in read)
+    at, uses = codes(), Counter(one for read in reads for one in read)
     found: dict[int, tuple[int, str, list[int]]] = {}
     for k, operation in enumerate(operations):
         if operation not in (at["ADD"], at["SUB"]):
@@ -136,7 +137,7 @@ def _sums(operations: list[int], reads: list[list[int]]) -> dict[int, tuple[int,
 
 def _value(function: ca.Function, k: int, read: list[str], shared: int | None) -> str:
     """What an instruction makes of the variables that it reads."""
-    at, operation = _codes(), function.instruction_id(k)
+    at, operation = codes(), function.instruction_id(k)
     if operation == at["INPUT"]:
         place, entry = function.instruction_input(k)
         value = f"in{place}[{entry}]"
@@ -147,6 +148,11 @@ def _value(function: ca.Function, k: int, read: list[str], shared: int | None) -
         return _templates()[operation].format(*read)
     (meant,) = (word for word, code in at.items() if code == operation)
     raise ValueError(f"{function.name()}: no counterpart in C for CasADi's operation {meant}")
+
+
+def switch(head: str, cases: Iterable[str], *end: str) -> str:
+    """A function of C that chooses by its argument i."""
+    return "\n".join((f"static inline {head} {{", "    switch (i) {", *cases, "    }", *end, "}"))
 
 
 def literal(value: float) -> str:
@@ -170,7 +176,7 @@ _OPERATORS = {
 
 
 @cache
-def _codes() -> dict[str, int]:
+def codes() -> dict[str, int]:
     """CasADi's numbers for operations."""
     import casadi
 
@@ -179,4 +185,4 @@ def _codes() -> dict[str, int]:
 
 @cache
 def _templates() -> dict[Any, str]:
-    return {code: _OPERATORS[name] for name, code in _codes().items() if name in _OPERATORS}
+    return {code: _OPERATORS[name] for name, code in codes().items() if name in _OPERATORS}

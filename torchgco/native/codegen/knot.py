@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -127,7 +127,7 @@ def knot_parts(
     """`knot_source` of parts, of which "code" is one, and these parts."""
     shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
 
-    def make(_: str) -> dict[str, Any]:
+    def make() -> dict[str, Any]:
         import casadi as ca
 
         knot, places = _one_knot(span)
@@ -135,12 +135,12 @@ def knot_parts(
         function = ca.Function("knot", [*knot.inputs, *made], [knot.rows, *(call.inputs for call in knot.calls)])
         form = span.n, span.m, *_form(function), *(NetSource(call.net, 0).key for call in knot.calls)
         name = store.key_of((kind, str(form), *makers(__file__, *files)))[:16]
-        return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "places": places}
+        return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "numbers_at": places}
 
     key = kind, shape, span.traced.fingerprint(), *makers(__file__, *files)
     _, parts = store.made(key, make, f"{kind} {shape} {span.traced.kin}")
     emit.checked(span.traced.field, parts["code"])
-    places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
+    places = torch.tensor(parts["numbers_at"], dtype=torch.int64).reshape(len(parts["numbers_at"]), -1)
     return KnotSource(parts["code"], parts["name"], parts["size"], places, span), parts
 
 
@@ -249,7 +249,7 @@ def _names(expression: Any) -> set[int]:
 
 def _form(function: Any) -> tuple[list[tuple], list[int]]:
     """The instructions of a function (x, u, numbers), its numbers renamed in order of first use, and that order."""
-    reads, holds = _operations()
+    reads, holds = (emit.codes()[name] for name in ("INPUT", "CONST"))
     turn: dict[int, int] = {}
     form: list[tuple] = []
     for i in range(function.n_instructions()):
@@ -259,11 +259,3 @@ def _form(function: Any) -> tuple[list[tuple], list[int]]:
         constant = function.instruction_constant(i) if operation == holds else 0.0
         form.append((operation, read, tuple(function.instruction_output(i)), np.float64(constant).tobytes()))
     return form, list(turn)
-
-
-@cache
-def _operations() -> tuple[int, int]:
-    """CasADi's numbers for reading an input and for a constant."""
-    import casadi
-
-    return casadi.OP_INPUT, casadi.OP_CONST

@@ -67,11 +67,11 @@ class NetSource:
     @cached_property
     def _text(self) -> str:
         parts = [*self._functions(), self._value()]
-        if self.d:
-            parts += [self._structure(), self._forward(), self._backward(), *self._lanes_derived()]
-        else:
-            parts.append(self._lanes_value())
-        return "\n".join(parts)
+        parts += [self._structure(), self._forward(), self._backward(), _LANES_DERIVED] if self.d else [_LANES_VALUE]
+        text, sizes = "\n".join(parts), {"K": self.net.k, "R": self.net.size, "D": self.d, "E": self._even}
+        for name, value in sizes.items():
+            text = text.replace(f"COUNT_{name}", str(value))
+        return text
 
     # The function of a layer's neurons
 
@@ -237,18 +237,6 @@ class NetSource:
             part = f"net_counted(v{i}[i], {self._slope(i, j, 'i') or '1'})"
             lines.append(f"    for (int i = 0; i < {layer.h}; i++) v{source}[i] += {part};")
         return lines
-
-    # All lanes
-
-    def _lanes_value(self) -> str:
-        return _LANES_VALUE.replace("COUNT_K", str(self.net.k)).replace("COUNT_R", str(self.net.size))
-
-    def _lanes_derived(self) -> list[str]:
-        sizes = {"COUNT_K": self.net.k, "COUNT_R": self.net.size, "COUNT_D": self.d, "COUNT_E": self._even}
-        text = _LANES_DERIVED
-        for name, value in sizes.items():
-            text = text.replace(name, str(value))
-        return [text]
 
 
 def _affine(i: int, layer: Linear) -> str:

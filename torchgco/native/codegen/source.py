@@ -6,14 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 from torchgco.native.codegen.cost import CostSource
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource
-from torchgco.native.codegen.emit import PRELUDE, literal
+from torchgco.native.codegen.emit import PRELUDE, literal, switch
 from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes
 from torchgco.native.declarations import defines, head
@@ -74,6 +73,7 @@ SOLVER_LIBRARY = Library(PASS_SOURCES, (), (*ROWS, "passes.h", "knot.c", "ilqr.c
 SAMPLER = Library(("model.c",), (), (*ROWS, "normal.c", "mppi.c"))
 # The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
 INTERIOR = Library(PASS_SOURCES, RICCATI, (*ROWS, "interior.h", *(f"interior{phase}.c" for phase in PHASES)))
+COST_KINDS = {"quadratic.c": Quadratic, "traced.c": TracedCost}  # the arrays that a cost's file reads
 SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
 
 
@@ -125,15 +125,11 @@ class Form:
 
     def _text(self, sizes: dict[str, Any], generated: list[str], *files: str) -> str:
         """The C file of a unit."""
-        costs = () if "quadratic.c" not in files and "traced.c" not in files else (self._cost,)
+        costs = [kind for name, kind in COST_KINDS.items() if name in files]
         shared = head(STRUCTURES, (*ENUMERATIONS, *costs), CONSTANTS)
         texts = [(C / name).read_text() for name in (*HEADS, *files)]
         begin, end = texts[: len(HEADS)], texts[len(HEADS) :]
         return "\n".join((defines({**sizes, "COST_ARRAYS": COST_ARRAYS}), shared, PRELUDE, *begin, *generated, *end))
-
-    @property
-    def _cost(self) -> type[IntEnum]:
-        return Quadratic if self.cost is None else TracedCost
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
@@ -199,16 +195,11 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
             slopes.append(f"        *columns = {name}_columns; return {name}_count;")
         else:
             adds.append(f"    case {i}: {name}_add(x, u, p, w, by_c, by_cc, g, H); break;")
+    given = "int i, const V *x, const V *u, const V *p, const double *w"
     return "\n".join(
-        [
-            "static inline void tgco_rows(int i, const V *x, const V *u, const V *p, const double *w, V *c) {",
-            "    switch (i) {", *values, "    }", "}",
-            "static inline void tgco_add_rows(",
-            "    int i, const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc,",
-            "    V *g, V *H) {",
-            "    switch (i) {", *adds, "    }", "}",
-            "static inline int tgco_slopes(",
-            "    int i, const V *x, const V *u, const V *p, const double *w, V *e, const int **columns) {",
-            "    switch (i) {", *slopes, "    }", "    return 0;", "}",
-        ]
-    )  # fmt: skip
+        (
+            switch(f"void tgco_rows({given}, V *c)", values),
+            switch(f"void tgco_add_rows(\n    {given}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
+            switch(f"int tgco_slopes(\n    {given}, V *e, const int **columns)", slopes, "    return 0;"),
+        )
+    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torchgco.base.values import whole_numbers_become
 from torchgco.dynamics import Dynamics
 from torchgco.native.codegen import dynamics as code
 from torchgco.native.codegen.dynamics import DynamicsSource, step_parts, trace_dynamics
-from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_parts
+from torchgco.native.codegen.knot import KnotSource, Span, knot_parts
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 
@@ -39,9 +38,9 @@ def trace_model(problem: Problem) -> DynamicsSource:
     if problem.along is model:
         return trace_dynamics(model)
     span = _span(model, problem.N)
-    source, parts = knot_parts("stages", span, _parts, __file__, str(code.__file__))
-    lists = {name: tuple(parts[name]) for name in ("rows", "columns", "places_of_entries", "values")}
-    lists["places"] = lists.pop("places_of_entries")
+    make = lambda knot, _: step_parts(knot.inputs, knot.rows, knot.calls)
+    source, parts = knot_parts("stages", span, make, __file__, str(code.__file__))
+    lists = {name: tuple(parts[name]) for name in ("rows", "columns", "places", "values")}
     count = source.places.shape[1]
     return StagesSource(
         model.n, model.m, count, source.code, **lists, affine=parts["affine"], key=source.key, traced=span.traced,
@@ -59,8 +58,3 @@ def _span(model: Dynamics, N: int) -> Span:
     # A signature has N, and so the stages.
     traced.outside = [tensor for tensor in traced.outside if tensor is not stages]
     return Span(traced, model.n, model.m, N, N, range(N))
-
-
-def _parts(knot: Knot, _: str) -> dict[str, Any]:
-    parts = step_parts(knot.inputs, knot.rows, knot.calls)
-    return {**parts, "places_of_entries": parts.pop("places")}
