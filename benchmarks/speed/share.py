@@ -27,6 +27,7 @@ PHASES = {
 OUTER = "outer loop"
 # These call the native libraries; an argument is the native function or its name.
 CALLS = (
+    "torchgco.kernels.outer.run",
     "torchgco.native.engine.run",
     "torchgco.native.interior.run",
     "torchgco.native.sampler.run",
