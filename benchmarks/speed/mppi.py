@@ -15,7 +15,6 @@ from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from torchgco.base.draws import DrawKey
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.guidance.mppi import COLLISION_PENALTY
-from torchgco.kernels import open_loop
 from torchgco.scenarios import Task
 
 SECTION = "mppi"
@@ -32,7 +31,6 @@ def run(bench: Bench) -> None:
         if HAVE_PEER:
             rounds["pytorch-mppi"] = _theirs(task, samples)
         _measure(bench, samples, task.problem.N, rounds)
-    _say_rollout(bench, task)
     if not HAVE_PEER:
         bench.row(SECTION, "any", "pytorch-mppi", "not installed", "")
 
@@ -54,13 +52,6 @@ def _measure(bench: Bench, samples: int, stages: int, rounds: dict[str, Callable
     if HAVE_PEER:
         ratio = middle["pytorch-mppi"] / middle["torchgco"]
         bench.row(SECTION, case, "torchgco", RATIO, ratio, "", "pytorch-mppi / torchgco")
-
-
-def _say_rollout(bench: Bench, task: Task) -> None:
-    """Time the rollout of the mean: part of every round of torchgco, absent from pytorch-mppi."""
-    fly = lambda: open_loop(task.problem, task.U0)
-    times = [bench.timed(fly)[1].seconds for _ in range(1 + bench.sizes.mppi_repeats)]
-    bench.row(SECTION, "rollout of the mean", "torchgco", "per round", 1000 * median(times[1:]), "ms")
 
 
 def _ours(task: Task, samples: int) -> Callable[[], Any]:

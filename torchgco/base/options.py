@@ -9,7 +9,8 @@
             check_options(self, "sampler")
 
 A bool is no number, 5.0 is no whole number, and a number is finite unless its annotation says `UNBOUNDED`. Annotations
-that can't be checked (`Any`, a name that isn't known at run time) admit everything.
+that can't be checked (`Any`, a name that isn't known at run time) admit everything. The library annotated-types has
+limits alone: these have units, say themselves in errors, and are checked.
 """
 
 from __future__ import annotations

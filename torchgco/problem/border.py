@@ -225,6 +225,8 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     if K == 0:
         return
     wanted = f"rows (2, {K}, p) in {x0.dtype}, the type of x0, of two problems"
+    if isinstance(constraint, FunctionConstraint):
+        wanted = f"a function of {' and '.join(constraint.of)} that gives {wanted}"
     shape = _check_values(field, value, rows, (X, U), (2, K, None), wanted)
     if 0 in shape:
         return

@@ -1,4 +1,7 @@
-"""What the containers of messages have in common: choosing a topic, and unpacking within bounds."""
+"""What the containers of messages have in common: choosing a topic, and unpacking within bounds.
+
+Read by hand: the library rosbags unpacks a block before it can be known how large that is.
+"""
 
 from __future__ import annotations
 
