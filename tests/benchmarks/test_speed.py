@@ -66,16 +66,14 @@ def tiny(folder: Path) -> Bench:
     return Bench(TINY, Results(folder / "results.csv"), provenance("cpu"), say=lambda text: None)
 
 
-SLOW = batch, cores, families, first_use, growth, learned, mppi, paper, scaling, share
+SLOW = batch, cores, families, first_use, growth, latency, learned, mppi, own_model, paper, scaling, share
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # steps of sizes for tests are long
 @pytest.mark.parametrize(
     "section",
     [
-        latency,
         loop,
-        own_model,
         targets,
         *(pytest.param(section, marks=pytest.mark.slow) for section in SLOW),
     ],

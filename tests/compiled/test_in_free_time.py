@@ -172,6 +172,7 @@ def test_a_loop_comes_to_rest_in_the_least_time(monkeypatch: pytest.MonkeyPatch)
     assert arrived == pytest.approx(best, abs=0.1) and float(x.norm()) < 0.02
 
 
+@pytest.mark.slow
 def test_mean_controls_are_those_of_a_fine_grid() -> None:
     mpc = MPC(carts(N=10, B=3, least=0.2), period=0.5)
     u = mpc.step(carts(N=10, B=3).x0)

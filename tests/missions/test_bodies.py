@@ -116,6 +116,7 @@ def test_distances_are_those_of_the_turned_balls(attitude: str) -> None:
 TILT, HALF = math.radians(30), 0.18  # a level vehicle's rotors reach SIDE sin 30 + ROTOR = 0.21 m across the gap
 
 
+@pytest.mark.slow
 def test_a_mission_rolls_through_a_slot_that_hits_what_flies_level() -> None:
     """The gap is less than half of what the ball around the body needs, and too narrow for the body flown level."""
     problem, radius = among(slot(FLAT, HALF, TILT)), torch.tensor([0.6], **DOUBLE)
