@@ -23,8 +23,8 @@ from torchgco import (
     Solution,
     Spheres,
     Status,
+    judge,
 )
-from torchgco.api import touches
 
 FAST = AugmentedLagrangian()
 
@@ -49,21 +49,18 @@ def test_contact_between_knots_comes_with_one_warning_that_names_the_problems() 
     (warning,) = caught
     assert Path(warning.filename) == Path(__file__), "it points at the call"
     assert re.search(r"^6 of 8 trajectories .*: problem 1, 3, 4, 5, 6, \.\.\. \(", str(warning.message))
-    assert set(solution.statuses) == {Status.CONVERGED}
+    ended = [Status.INFEASIBLE if i in (1, 3, 4, 5, 6, 7) else Status.CONVERGED for i in range(8)]
+    assert solution.statuses == ended and float(solution.violation.max()) <= 1e-3
+    assert judge(problem, solution.U).feasible.tolist() == [status is Status.CONVERGED for status in ended]
     frame = solution.to_frame(problem)
     assert (frame.clearance < 0).tolist() == [i in (1, 3, 4, 5, 6, 7) for i in range(8)]
 
 
 @compiled
-def test_no_word_without_contact_or_without_a_claim() -> None:
+def test_no_warning_without_contact() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         torchgco.solve(row_of_discs(thin=()), solver=FAST)
-    problem = row_of_discs(B=2)
-    solution = FAST.solve(problem, torch.zeros(2, 8, 2, dtype=torch.float64))
-    for status in Status:
-        claimed = replace(solution, status=torch.full_like(solution.status, status))
-        assert touches(problem, claimed).tolist() == [False, status in (Status.CONVERGED, Status.FEASIBLE)]
 
 
 def test_columns_of_the_judge_come_with_the_problem() -> None:
@@ -73,7 +70,7 @@ def test_columns_of_the_judge_come_with_the_problem() -> None:
     assert "clearance" not in plain and judged.columns.tolist() == [*plain.columns, "clearance", "reached"]
     verdict = torchgco.judge(problem, solution.U)
     assert judged.clearance.tolist() == verdict.clearance.tolist() and judged.clearance[1] < 0 < judged.clearance[0]
-    assert judged.reached.tolist() == verdict.reached.tolist() == [True] * 3
+    assert judged.reached.tolist() == verdict.reached.tolist() == [True, False, True]
     with pytest.raises(torchgco.InputError, match=r"U: expected a tensor \(2, 8, 2\)"):
         solution.to_frame(problem.take(slice(0, 2)))
 

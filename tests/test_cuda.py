@@ -83,7 +83,7 @@ def test_the_default_solver_reaches_the_same_goals() -> None:
     assert found.statuses == expected.statuses
     torch.testing.assert_close(found.cost.cpu(), expected.cost, rtol=1e-4, atol=0.0)
     verdict, same = judge(there, found.U), judge(here, expected.U)
-    assert verdict.sound.device.type == "cuda" and verdict.sound.tolist() == same.sound.tolist()
+    assert verdict.reached.device.type == "cuda" and verdict.reached.tolist() == same.reached.tolist()
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -20,7 +20,7 @@ def test_the_python_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     problem, solution = names["problem"], names["solution"]
     assert isinstance(problem, Problem) and isinstance(solution, Solution)
     assert solution.statuses == [Status.CONVERGED] * 2
-    assert bool(judge(problem, solution.U, torch.tensor([1.0, 0.4], dtype=torch.float64), 0.3).sound.all())
+    assert bool(judge(problem, solution.U, torch.tensor([1.0, 0.4], dtype=torch.float64), 0.3).reached.all())
 
 
 def test_every_status_is_explained() -> None:

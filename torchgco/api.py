@@ -17,14 +17,13 @@ from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.constraints.norms import within_norms
-from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.worst import NO_PLACE, kind_of
 from torchgco.kernels import current, kernels_of, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.in_time import at_times, guessing_times, paced
+from torchgco.problem.in_time import at_times, guessing_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
@@ -214,17 +213,14 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
 
 
 def _warn_of_contact(problem: Problem, solution: Solution) -> None:
-    """A ContactWarning at the caller's caller where trajectories touch obstacles between knots.
-
-    Only trajectories with a status of CLAIMS count; obstacles of a kind that the judge doesn't know are left out.
-    """
+    """A ContactWarning at the caller's caller where trajectories keep all rows and are INFEASIBLE between the knots."""
     _warn_of_scale(problem, solution)
-    touching = touches(problem, solution).nonzero().flatten().tolist()
+    touching = touches(solution).nonzero().flatten().tolist()
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
         warnings.warn(
-            f"{len(touching)} of {problem.B} trajectories touch an obstacle between the knots, which their status does "
-            f"not show: problem {named} (to_frame(problem) has their clearance; shorter time steps help)",
+            f"{len(touching)} of {problem.B} trajectories are INFEASIBLE, as they touch an obstacle between the knots, at "
+            f"which all constraints hold: problem {named} (to_frame(problem) has their clearance; shorter time steps help)",
             ContactWarning,
             stacklevel=3,
         )
@@ -253,19 +249,9 @@ def _warn_of_scale(problem: Problem, solution: Solution) -> None:
         )
 
 
-def touches(problem: Problem, solution: Solution) -> Tensor:
-    """Which trajectories (B,) claim to be feasible and come below a clearance of 0 m, by the judge's distances."""
-    found = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    rows = found.nonzero().flatten()
-    if rows.numel() == 0:
-        return found
-    problem = paced(problem, solution.times)
-    nearest = torch.full_like(solution.cost[rows], torch.inf)
-    for part in problem.constraints:
-        if isinstance(part, tuple(CLEARANCES)):
-            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(part.take(rows), solution.X[rows])[1])
-    found[rows] = nearest < 0
-    return found
+def touches(solution: Solution) -> Tensor:
+    """Which trajectories (B,) are INFEASIBLE although they keep all rows: they touch an obstacle between two knots."""
+    return (solution.status == Status.INFEASIBLE) & (solution.violation <= ADMITTED)
 
 
 def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:

@@ -41,12 +41,12 @@ PATHS = COSTLY.num_paths  # of each of the two searches where the best candidate
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",
     "another local solution": "moving obstacles, and no paths: waiting, or passing on another side, costs less",
-    "not reached": "moving obstacles, and no paths: no attempt is sound",
+    "not reached": "moving obstacles, and no paths: no attempt arrives",
     "not among the paths": f"no candidate along {PATHS} paths of each search ends within 5 % of the best known cost",
     "no path sought": "a candidate does, but the first solve was never caught, so that `gco` sought no path",
     "a later path": "a candidate does, but its path comes after those that `gco` sought",
     "dropped as tracked": "its path was sought, but cheaper tracked candidates were relaxed in its place",
-    "dropped as relaxed": "it was relaxed, but was then unsound, or more expensive than those taken",
+    "dropped as relaxed": "it was relaxed, but then didn't arrive, or more expensive than those taken",
     "lost in the solve": "it was compared or chosen, and the solve ended elsewhere",
 }
 FATES = ("dropped as tracked", "dropped as relaxed", "lost in the solve")  # of a sought candidate
@@ -62,7 +62,7 @@ class Search:
 
     count: int  # paths sought, those of the same homotopy class included
     relaxed: Sequence[int] = ()
-    compared: Sequence[int] = ()  # the sound ones of those taken
+    compared: Sequence[int] = ()  # of those taken, the ones that arrive
     chosen: int | None = None  # None: no proposal
 
     @classmethod
@@ -77,19 +77,19 @@ class Search:
         return cls(len(fate), relaxed, compared, chosen[0] if chosen else None)
 
 
-def cause(best: float, sound: bool, costs: Sequence[float], searches: Sequence[Search]) -> str:
+def cause(best: float, reached: bool, costs: Sequence[float], searches: Sequence[Search]) -> str:
     """The cause for one layout on which `gco` isn't a success; of several good candidates the one that got farthest.
 
     Args:
         best: the best known cost, NaN where no solution is known.
-        sound: whether the result of `gco` is.
+        reached: whether the result of `gco` does.
         costs: of a refined candidate along each path, infinite where it has no good end; none: no paths can be sought.
         searches: those that `gco` made.
     """
-    if isnan(best) and not sound:
+    if isnan(best) and not reached:
         return "no solution known"
     if not costs:
-        return "another local solution" if sound else "not reached"
+        return "another local solution" if reached else "not reached"
     good = within(best, costs)
     if not good:
         return "not among the paths"
@@ -145,12 +145,12 @@ def fly(family: Family, first: int | None, seed: int) -> tuple[pd.DataFrame, dic
     verdict = judge(task.problem, setup.solver.solve(task.problem, task.U0, seed=seed).U, task.goal, task.goal_radius)
     assert layouts.best_cost is not None
     best = torch.as_tensor(layouts.best_cost)
-    short = ~torch.where(best.isnan(), verdict.sound, verdict.success(best.nan_to_num(0.0)))
+    short = ~torch.where(best.isnan(), verdict.reached, verdict.success(best.nan_to_num(0.0)))
     rows, examples = [], {}
     for i in range(task.problem.B):
         row: dict[str, Any] = {"family": family.name, "layout": i, "cause": None}
         if short[i]:
-            cost = float(verdict.cost[i]) if verdict.sound[i] else inf
+            cost = float(verdict.cost[i]) if verdict.reached[i] else inf
             found, example = study(setup.solver, task, layouts, i, seed, cost)
             row |= found
             examples.setdefault(row["cause"], example)
@@ -166,7 +166,7 @@ def study(
 
     Args:
         solver, task, layouts, i, seed: the solver, the layouts and their problems, the number of one, the draws.
-        cost: of the result of `gco`, infinite where it isn't sound.
+        cost: of the result of `gco`, infinite where it doesn't reach.
         count: paths whose candidates are refined.
     """
     assert layouts.best_cost is not None
@@ -209,7 +209,7 @@ def listed(trials: pd.DataFrame) -> str:
 
 
 def _cells(row: dict[Any, Any]) -> list[Any]:
-    ratio = "not sound" if not np.isfinite(row["ratio"]) else f"{row['ratio']:.3f}"
+    ratio = "not reached" if not np.isfinite(row["ratio"]) else f"{row['ratio']:.3f}"
     cheapest = f"{row['cheapest']:.3f}" if np.isfinite(row["cheapest"]) else "-"
     path, sought = ("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name in ("path", "sought"))
     return [row["family"], row["layout"], ratio, cheapest, path, sought, row["cause"]]

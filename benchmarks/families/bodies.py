@@ -80,8 +80,8 @@ def row(title: str, make: Callable[[int, int], Problem], count: int, seed: int) 
     solution = torchgco.solve(problem, verbose=False)
     seconds = (time.process_time() - began) / count
     verdict, true = judge(problem, solution.U), rectangle_clearance(problem, solution.X)
-    told, clear = verdict.sound.numpy(), verdict.reached.numpy() & (true >= 0)
-    cost = solution.cost[verdict.sound].median() if told.any() else math.nan
+    told, clear = verdict.reached.numpy(), verdict.reached.numpy() & (true >= 0)
+    cost = solution.cost[verdict.reached].median() if told.any() else math.nan
     counts = [page.share(int(part.sum()), count) for part in (told, clear)]
     return [title, *counts, f"{cost:.4g}", f"{seconds:.2f}"]
 
@@ -92,7 +92,7 @@ def text(count: int, seed: int) -> str:
         "parallel parking, slot of 1.35 car lengths": parking,
         "corridor 10 % wider than the covered car": corridor,
     }
-    head = ["scene", "sound by the judge", "rectangle clear between knots", "median cost", "s each"]
+    head = ["scene", "reached by the judge", "rectangle clear between knots", "median cost", "s each"]
     return page.markdown(head, [row(title, make, count, seed) for title, make in scenes.items()])
 
 

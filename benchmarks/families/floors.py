@@ -34,8 +34,8 @@ PEER = "path_pursuit"
 DEARER = 1.05  # of the peer's cost: what counts as dearer
 SOLVERS = ("gco", PEER)
 HEAD = (
-    "plans", "solver", "n", "reached", "sound", f"cost / `{PEER}`, median where both reached [95 %]",
-    f"over {DEARER:g}", f"time / `{PEER}`, median [95 %]", "s, median", "s, all", "not sound",
+    "plans", "solver", "n", "reached", f"cost / `{PEER}`, median where both reached [95 %]",
+    f"over {DEARER:g}", f"time / `{PEER}`, median [95 %]", "s, median", "s, all", "not reached",
 )  # fmt: skip
 MAP_HEAD = (
     "map",
@@ -44,7 +44,6 @@ MAP_HEAD = (
     "solver",
     "status",
     "reached",
-    "sound",
     "cost",
     "from the goal, m",
     "s",
@@ -131,7 +130,7 @@ def flown(name: str, task: Task) -> dict[str, Any]:
     verdict = torchgco.judge(task.problem, solution.U)
     return {
         "solver": name, "status": solution.statuses[0].name, "seconds": seconds, "stages": task.problem.N,
-        "cost": float(verdict.cost), "reached": bool(verdict.reached), "sound": bool(verdict.sound),
+        "cost": float(verdict.cost), "reached": bool(verdict.reached),
         "distance": float(verdict.goal_distance), "X": solution.X[0].numpy(),
     }  # fmt: skip
 
@@ -140,11 +139,11 @@ def row_of(plans: str, flights: pd.DataFrame, name: str) -> list[Any]:
     own, peer = (flights[flights["solver"] == one].set_index("plan") for one in (name, PEER))
     n, both = len(own), own["reached"] & peer["reached"]
     cost = (own["cost"] / peer["cost"])[both]
-    times, failed = own["seconds"] / peer["seconds"], own.index[~own["sound"]].tolist()
+    times, failed = own["seconds"] / peer["seconds"], own.index[~own["reached"]].tolist()
     dearer = f"{int((cost > DEARER).sum())} of {len(cost)}"
     same = name == PEER
     return [
-        plans, f"`{name}`", n, share(own["reached"].sum(), n), share(own["sound"].sum(), n),
+        plans, f"`{name}`", n, share(own["reached"].sum(), n),
         "1" if same else median(cost, ".3f"), "-" if same else dearer, "1" if same else median(times, ".2g"),
         shown(float(own["seconds"].median()), ".2g"), shown(float(own["seconds"].sum()), ".3g"),
         ", ".join(map(str, failed)) or "-",
@@ -181,7 +180,7 @@ def map_rows(folder: Path, owned: Owned, solvers: Sequence[str]) -> list[list[An
         held = flown(name, task)
         rows.append([
             Path(owned.file).stem, owned.radius, held["stages"], f"`{name}`", held["status"], _yes(held["reached"]),
-            _yes(held["sound"]), f"{held['cost']:.0f}", f"{held['distance']:.2f}", f"{held['seconds']:.2g}",
+            f"{held['cost']:.0f}", f"{held['distance']:.2f}", f"{held['seconds']:.2g}",
         ])  # fmt: skip
     return rows
 

@@ -125,7 +125,7 @@ def layout_flown(task: Task, solver: Any, number: int, ask: bool) -> Flown:
     spent = time.process_time() - began
     verdict = torchgco.judge(problem, found.U, times=found.t)
     gates = int(task.layouts.gate_counts[0])  # type: ignore[index]
-    sound = bool(verdict.sound)
+    sound = bool(verdict.reached)
     hand = by_hand(problem, found) if ask and sound else None
     one = Flown(gates, found.statuses[0] is Status.CONVERGED, int(verdict.gates_passed) == gates, sound,
                 float(found.duration), int(found.iterations), spent, hand)  # fmt: skip

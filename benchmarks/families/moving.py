@@ -89,7 +89,7 @@ def fixed(count: int, seed: int, durations: Tensor) -> Tensor:
         stated = problem(count, seed, NOMINAL[0], pace)
         found = torchgco.solve(stated, verbose=False)
         cost = part * durations + pace * found.cost
-        best = torch.where(torchgco.judge(stated, found.U).sound & (cost < best), cost, best)
+        best = torch.where(torchgco.judge(stated, found.U).reached & (cost < best), cost, best)
     return best
 
 
@@ -103,11 +103,11 @@ def text(count: int, seed: int) -> str:
         found = torchgco.solve(stated, verbose=False)
         spent = (time.process_time() - began) / count
         verdict = torchgco.judge(stated, found.U, times=found.t)
-        costs.append(torch.where(verdict.sound, found.cost, math.inf))
+        costs.append(torch.where(verdict.reached, found.cost, math.inf))
         durations.append(found.duration)
         ended = sum(status is Status.CONVERGED for status in found.statuses)
         counts = found.iterations.numpy()
-        rows.append([f"{nominal:g}", share(int(verdict.sound.sum()), count), ended,
+        rows.append([f"{nominal:g}", share(int(verdict.reached.sum()), count), ended,
                      f"{float(found.duration.median()):.2f} ({float(found.duration.max()):.2f})",
                      f"{np.median(counts):.0f} ({counts.max()})", f"{spent:.2f}"])  # fmt: skip
     grid = fixed(count, seed, durations[0])
@@ -115,7 +115,7 @@ def text(count: int, seed: int) -> str:
         row += [share(int((cost > (1.0 + NEAR) * rival).sum()), count) for rival in (grid, other)]
         known = torch.isfinite(grid) & torch.isfinite(cost)
         row.append(f"{float((cost / grid)[known].median()):.4f} ({float((cost / grid)[known].max()):.4f})")
-    head = ["nominal time, s", "sound", "CONVERGED", "duration, s (most)", "iterations (most)", "s a layout",
+    head = ["nominal time, s", "reached", "CONVERGED", "duration, s (most)", "iterations (most)", "s a layout",
             "costs over 0.5 % more than at fixed times", "than from the other nominal time",
             "cost / that at fixed times (most)"]  # fmt: skip
     return markdown(head, rows)

@@ -1,9 +1,9 @@
 """python -m benchmarks.families.oracle: the best known cost of every layout.
 
-Minutes per layout, offline. It flies the solvers of SEARCH and takes the cheapest sound trajectory of any: at the
-goal, violations of at most 1 mm, clear of the obstacles between the knots. The peers' costs on the public layouts
+Minutes per layout, offline. It flies the solvers of SEARCH and takes the cheapest trajectory that reaches: at the goal,
+violations of at most 1 mm, clear of the obstacles between the knots. The peers' costs on the public layouts
 come from data/reference.csv. The result is written as `best_cost` into the files of benchmarks/data; only the judge of
-`success` reads it. A cost in a file is only ever lowered; NaN means that no sound trajectory is known.
+`success` reads it. A cost in a file is only ever lowered; NaN means that none that reaches is known.
 With `--fresh N` the layouts are the first N drawn under `--seed`, kept with their costs in benchmarks/data/drawn.
 """
 
@@ -97,14 +97,14 @@ def reference(family: Family) -> np.ndarray:
 
 
 def flown(path: Path, overrides: list[str], draw: int, first: int | None) -> np.ndarray:
-    """Costs (L,) of one solver's sound trajectories, NaN where it has none."""
+    """Costs (L,) of one solver's trajectories that reach, NaN where it has none."""
     setup = compose([*overrides, "device.threads=1"])
     layouts = setup.layouts(first)
     task = setup.task(layouts)
     U = setup.solver.solve(task.problem, task.U0, seed=draw, ids=torch.as_tensor(layouts.ids)).U
     verdict = judge(task.problem, U, task.goal, task.goal_radius)
     costs = np.full(Layouts.load(path).count, np.nan)
-    costs[layouts.ids] = torch.where(verdict.sound, verdict.cost, torch.nan).numpy()
+    costs[layouts.ids] = torch.where(verdict.reached, verdict.cost, torch.nan).numpy()
     return costs
 
 

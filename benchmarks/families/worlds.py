@@ -23,7 +23,6 @@ from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import WORLDS
 from benchmarks.lib.kept import rows_of
 from benchmarks.lib.page import chosen, crossed, filed, machine, markdown, put, share, shown
-from torchgco.experiments.results.success import sound
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.scenarios import Layouts
 
@@ -94,7 +93,7 @@ def with_peers(name: str, trials: pd.DataFrame, peers: pd.DataFrame) -> pd.DataF
 
 def solved(name: str, trials: pd.DataFrame, asked: Namespace) -> set[int]:
     """The layouts that any solver is known to solve: here, or when the best costs were sought."""
-    known = set(trials.loc[sound(trials), "layout"].tolist())
+    known = set(trials.loc[trials["reached"], "layout"].tolist())
     path = WORLDS[name].file(asked.fresh, asked.seed)
     if path.is_file() and (best := Layouts.load(path).best_cost) is not None:
         known |= {i for i, cost in enumerate(best) if cost == cost}

@@ -2,7 +2,7 @@
 
 Of the layouts 0, 1, 2, ... of seed 0, the first 32 are kept on which a way through is proven. Among resting obstacles
 the proof is a path of the roadmap that isn't long, measured again by the judge's own distances; among moving ones it
-is a sound trajectory of `gco_max`. Best costs are sought by `python -m benchmarks.families.oracle --families NAME ...`.
+is a trajectory of `gco_max`. Best costs are sought by `python -m benchmarks.families.oracle --families NAME ...`.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _passable(task: Task) -> Tensor:
 
 def _flown(task: Task, solver: Solver) -> Tensor:
     ids = torch.as_tensor(task.layouts.ids)
-    return judge(task.problem, solver.solve(task.problem, task.U0, seed=0, ids=ids).U).sound
+    return judge(task.problem, solver.solve(task.problem, task.U0, seed=0, ids=ids).U).reached
 
 
 def main() -> int:

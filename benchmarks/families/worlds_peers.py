@@ -44,7 +44,7 @@ SOLVERS = {
 }
 NAMES = tuple(name for names in SOLVERS.values() for name in names)
 COLUMNS: tuple[str, ...] = (
-    "world", "solver", "guess", "layout", "layout_digest", "status", "reached", "sound", "cost", "violation",
+    "world", "solver", "guess", "layout", "layout_digest", "status", "reached", "cost", "violation",
     "clearance", "seconds", "limit", "iterations", "version", "date", "commit",
 )  # fmt: skip
 ACADOS_STATUS = {0: Status.CONVERGED.name, 2: Status.MAX_ITERATIONS.name}
@@ -141,14 +141,13 @@ def _judged(world: World, name: str, layout: int, flight: Flight) -> dict[str, o
     task, rows = world.task, torch.tensor([layout])
     held: dict[str, object] = {
         "world": world.name, "solver": name, "guess": "path" if flight.follows else "rest", "layout": layout,
-        "layout_digest": world.digests[layout], "status": flight.status, "reached": False, "sound": False,
+        "layout_digest": world.digests[layout], "status": flight.status, "reached": False,
         "seconds": f"{flight.seconds:.4g}", "iterations": flight.iterations,
         "version": f"acados {acados.version()}" if name.startswith("acados") else f"CasADi {version('casadi')}",
     }  # fmt: skip
     if flight.U is not None:
         verdict = judge(world.problem(layout), flight.U, task.goal[rows], task.goal_radius)
-        for column in ("reached", "sound"):
-            held[column] = bool(getattr(verdict, column))
+        held["reached"] = bool(verdict.reached)
         for column in ("cost", "violation", "clearance"):
             held[column] = f"{float(getattr(verdict, column)):.9g}"
     return held

@@ -94,7 +94,7 @@ class Drives:
             gaps = map(gap, driven, layouts.centers)
         clearance = np.array(list(gaps))
         change = np.abs(np.diff(U[..., 1].numpy(), axis=1, prepend=0.0)).max(axis=1) / DT
-        sound = verdict.sound.numpy() & np.isfinite(seconds) & (clearance > 0) & (change <= TURN_CHANGE)
+        sound = verdict.reached.numpy() & np.isfinite(seconds) & (clearance > 0) & (change <= TURN_CHANGE)
         return cls(seconds, clearance, change, sound)
 
     def score(self, optimal: np.ndarray) -> np.ndarray:

@@ -58,18 +58,18 @@ def problems(count: int, seed: int) -> Problem:
 def counted(problem: Problem, U: Tensor) -> dict[str, Tensor]:
     """Cost and violation (B,), and whether the result is feasible at full radii."""
     verdict = judge(problem, U)
-    sound = verdict.feasible & (verdict.violation <= 1e-3)
-    return {"cost": verdict.cost, "violation": verdict.violation, "sound": sound}
+    feasible = verdict.feasible
+    return {"cost": verdict.cost, "violation": verdict.violation, "feasible": feasible}
 
 
 def ratio(own: pd.DataFrame, peer: pd.DataFrame) -> pd.Series:
     """Costs as shares of the best start's, where both are feasible."""
-    return (own.cost / peer.cost)[own.sound & peer.sound]
+    return (own.cost / peer.cost)[own.feasible & peer.feasible]
 
 
 def close(own: pd.DataFrame, peer: pd.DataFrame) -> str:
     """How many are within 5 % of the best start; nothing is compared with itself."""
-    return "-" if own is peer else f"{share((ratio(own, peer) <= WITHIN).sum(), peer.sound.sum())} %"
+    return "-" if own is peer else f"{share((ratio(own, peer) <= WITHIN).sum(), peer.feasible.sum())} %"
 
 
 def ratios(own: pd.DataFrame, peer: pd.DataFrame) -> str:
@@ -79,7 +79,7 @@ def ratios(own: pd.DataFrame, peer: pd.DataFrame) -> str:
 COMPARISON = Comparison(counted, [
     ("solver", named("solver")),
     ("n", count),
-    ("feasible", lambda own, _: f"{share(own.sound.sum(), len(own))} %"),
+    ("feasible", lambda own, _: f"{share(own.feasible.sum(), len(own))} %"),
     ("within 5 % of the best start", close),
     ("cost ratio: median, 90 %, largest", ratios),
     ("seconds", lambda own, _: f"{own.seconds[0]:.3g}"),
@@ -98,7 +98,7 @@ def ipopt(problem: Problem, seed: int) -> pd.DataFrame:
             U0 = torch.nn.functional.interpolate(knots, STAGES, mode="linear", align_corners=True).mT.contiguous()
         flights.append(COMPARISON.fly(f"IPOPT, {STARTS} starts", problem, lambda U=U0: solver.solve(problem, U)))
     every = pd.concat(flights)
-    best = every.assign(lost=~every.sound).sort_values(["lost", "cost"], kind="stable")
+    best = every.assign(lost=~every.feasible).sort_values(["lost", "cost"], kind="stable")
     best = best[~best.index.duplicated()].sort_index()
     return best.assign(seconds=sum(flight.seconds for flight in flights))
 

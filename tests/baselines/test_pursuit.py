@@ -85,7 +85,7 @@ def test_it_arrives_through_the_door(model: Dynamics) -> None:
     assert bool((problem.goal.distance(X[:, -1, :2]) < 0.2).all())  # type: ignore[union-attr]
     solution = torchgco.solve(problem, solver="path_pursuit")
     verdict = judge(problem, solution.U)
-    assert bool(verdict.sound.all()) and solution.guided.tolist() == [1, 1]
+    assert bool(verdict.reached.all()) and solution.guided.tolist() == [1, 1]
     assert bool((judge(problem, torchgco.solve(problem, solver="interior_point").U).cost > verdict.cost).all())
 
 
@@ -93,7 +93,7 @@ def test_shapes_are_obstacles_too() -> None:
     wall = Boxes([[[3.0, 3.5]]] * 2, [[[0.2, 2.5]]] * 2, RADIUS)
     problem = task(parts=[wall, Spheres([[[2.5, 0.4]]] * 2, [[0.2]] * 2, RADIUS)])
     verdict = judge(problem, PathPursuit().solve(problem, rest(problem)).U)
-    assert bool(verdict.sound.all())
+    assert bool(verdict.reached.all())
 
 
 def test_the_rest_of_the_batch_changes_nothing() -> None:
@@ -110,7 +110,7 @@ def test_the_rest_of_the_batch_changes_nothing() -> None:
 def test_changes_of_controls_may_be_bounded(model: Dynamics) -> None:
     problem = task(model, parts=[two_rooms(), RateBounds([-0.4, -0.4], [0.4, 0.4])])
     solution = torchgco.solve(problem, solver="path_pursuit")
-    assert bool(judge(problem, solution.U).sound.all())
+    assert bool(judge(problem, solution.U).reached.all())
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_a_bad_start_affects_its_own_problem_alone() -> None:
 def test_horizons_may_differ() -> None:
     problem = task(horizon=[120, 90])
     solution = PathPursuit().solve(problem, rest(problem))
-    assert bool(judge(problem, solution.U).sound.all())
+    assert bool(judge(problem, solution.U).reached.all())
     U, _ = PathPursuit().guess(problem, rest(problem))
     assert not U[1, 90:].any() and U[1, 80:90].any()
 
@@ -159,7 +159,7 @@ def test_what_touches_between_knots_is_cleared() -> None:
     cut = PathPursuit(rounds=0).solve(problem, rest(problem))
     clear = PathPursuit().solve(problem, rest(problem))
     assert bool((chord_clearance(problem, cut.X) < 0).any()), "or there is nothing to clear"
-    assert bool((chord_clearance(problem, clear.X) >= 0).all()) and bool(judge(problem, clear.U).sound.all())
+    assert bool((chord_clearance(problem, clear.X) >= 0).all()) and bool(judge(problem, clear.U).reached.all())
     assert bool((clear.iterations >= cut.iterations).all()) and bool((clear.iterations > cut.iterations).any())
 
 
@@ -238,5 +238,5 @@ def test_it_reaches_nearly_all_drawn_floor_plans() -> None:
     setup, sound = compose(["scenario=floors", "seed=3"]), 0
     for number in range(12):
         held = setup.task(Floors().draw([number], 3))
-        sound += int(judge(held.problem, PathPursuit().solve(held.problem, held.U0).U).sound)
+        sound += int(judge(held.problem, PathPursuit().solve(held.problem, held.U0).U).reached)
     assert sound >= 11

@@ -106,7 +106,7 @@ def test_all_are_passed_in_their_order(gates: Gates, among: bool) -> None:
     problem = points(gates, ControlBounds(-5.0, 5.0), *discs)
     found = torchgco.solve(problem)
     part, X = problem.constraints[0], found.X.numpy()
-    assert found.statuses == [Status.CONVERGED] * B and bool(judge(problem, found.U).sound.all())
+    assert found.statuses == [Status.CONVERGED] * B and bool(judge(problem, found.U).reached.all())
     for b, g in np.ndindex(B, 2):
         k = int(part.places[b, g])
         if isinstance(part, GateBalls):
@@ -158,7 +158,7 @@ def test_paths_lead_through_them_leg_by_leg() -> None:
     gates = Gates([[3.0, 0.0, 1.0]], 0.2)
     problem = points(gates, walls, ControlBounds(-4.0, 4.0))
     found = torchgco.solve(problem, record=True)
-    assert bool(judge(problem, found.U).sound.all()) and found.to_frame(problem).gates_passed.tolist() == [1, 1]
+    assert bool(judge(problem, found.U).reached.all()) and found.to_frame(problem).gates_passed.tolist() == [1, 1]
     far = Spheres([[3.0, 30.0, 1.0], [3.0, 9.0, 1.0]], [0.5, 0.5], 0.1)
     on_the_way = points(Gates([[3.0, 10.0, 1.0]], 0.2), far)
     kept = Nearby.of(Call.checked(on_the_way, torch.zeros(B, N, 3, dtype=D)))

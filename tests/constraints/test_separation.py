@@ -150,7 +150,7 @@ def test_judge_and_certificate_measure_between_the_knots() -> None:
         == pytest.approx(float(fine.norm(dim=-1).min()) - 0.38, abs=1e-6)
         == pytest.approx(-0.18)
     )
-    assert float(chord_clearance(problem, X)) == pytest.approx(float(verdict.clearance)) and not verdict.sound
+    assert float(chord_clearance(problem, X)) == pytest.approx(float(verdict.clearance)) and not verdict.reached
     assert float(certify(problem, X, U).clearance) == pytest.approx(-0.2)
 
 

@@ -5,7 +5,7 @@ import torch
 
 from torchgco import Boxes, Field, FunctionDynamics, OccupancyGrid, Problem, QuadraticCost, Spheres, judge
 from torchgco.judging.contact import BETWEEN, contacts
-from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.obstacles.base import ADMITTED
 
 N, DT, RADIUS = 12, 0.1, 0.2
 
@@ -43,9 +43,9 @@ def test_a_way_through_walls_has_a_mark_in_the_middle_of_each() -> None:
         np.testing.assert_allclose(found, [[-0.5, y], [0.45, y]][: 1 + second], atol=half + 1e-9)
 
 
-def test_contact_begins_at_the_judges_share_of_the_radius() -> None:
-    for gap, count in ((CONTACT_FACTOR - 0.01, 1), (CONTACT_FACTOR + 0.01, 0)):
-        y = -0.2 - gap * RADIUS  # below the first wall alone
+def test_contact_begins_where_the_judge_has_it() -> None:
+    for more, count in ((-1e-4, 1), (1e-4, 0)):
+        y = -0.2 - RADIUS + ADMITTED - more  # below the first wall alone
         path = np.stack((np.linspace(-0.9, 0.1, 21), np.full(21, y)), axis=-1)
         assert len(contacts([task(path[None]).obstacles[0]], path, DT)) == count
     alone = np.array([[-0.5, 0.0]])

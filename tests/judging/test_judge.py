@@ -118,8 +118,8 @@ def test_a_collision_between_the_knots_is_seen() -> None:
     verdict = judge(problem, U, torch.tensor([2.0, 0.0], dtype=torch.float64), 0.1)
     assert float(verdict.clearance_knots) == pytest.approx(0.1 - 0.95 * 0.09)
     assert float(verdict.clearance) == pytest.approx(-0.95 * 0.09)
-    assert bool(verdict.feasible) and bool(verdict.reached)  # the paper's notion looks at the knots alone
-    assert not bool(verdict.sound)
+    assert bool(verdict.clear_95) and not bool(verdict.feasible)  # the paper's notion looks at the knots alone
+    assert float(verdict.violation) == 0.0 and not bool(verdict.reached)
 
 
 def test_a_moving_obstacle_is_followed_between_the_knots() -> None:
@@ -130,28 +130,28 @@ def test_a_moving_obstacle_is_followed_between_the_knots() -> None:
     assert float(verdict.clearance_knots) > float(verdict.clearance) + 1e-4
 
 
-def test_feasible_reached_sound_and_success() -> None:
+def test_feasible_reached_and_success() -> None:
     problem, U = passing(speed=1.0, offset=0.098)  # 0.098 from the centre: inside the full radius, outside 0.95 of it
     goal = torch.tensor([1.0, 0.0], dtype=torch.float64)
     verdict = judge(problem, U, goal, 0.1)
-    assert float(verdict.violation) == pytest.approx(0.002) and bool(verdict.feasible) and not bool(verdict.sound)
-    assert not bool(judge(problem, U, goal + 0.2, 0.1).reached)
+    assert float(verdict.violation) == pytest.approx(0.002) and bool(verdict.clear_95)
+    assert not bool(verdict.feasible | verdict.reached) and not bool(judge(problem, U, goal + 0.2, 0.1).reached)
     hard = U.clone()
     hard[:, -1] = 1.01  # moves no later knot, but breaks the bound
     assert not bool(judge(problem, hard, goal, 0.1).feasible)
     free, U = passing(speed=1.0, offset=0.5)
-    sound = judge(free, U, goal, 0.1)
-    assert bool(sound.sound)
-    assert bool(sound.success(sound.cost / 1.04)) and not bool(sound.success(sound.cost / 1.06))
+    there = judge(free, U, goal, 0.1)
+    assert bool(there.reached)
+    assert bool(there.success(there.cost / 1.04)) and not bool(there.success(there.cost / 1.06))
     with pytest.raises(InputError, match="best_cost: expected the best known cost of every problem, got NaN"):
-        sound.success(torch.full_like(sound.cost, torch.nan))
+        there.success(torch.full_like(there.cost, torch.nan))
 
 
 @pytest.mark.parametrize("best", [-100.0, 0.0, 100.0])
 def test_the_best_solution_is_a_success_whatever_the_sign_of_its_cost(best: float) -> None:
     free, U = passing(speed=1.0, offset=0.5)
     cost = torch.tensor([best], dtype=torch.float64)
-    verdict = replace(judge(free, U, [0.0, 0.0], 0.1), cost=cost, sound=torch.tensor([True]))
+    verdict = replace(judge(free, U, [0.0, 0.0], 0.1), cost=cost, reached=torch.tensor([True]))
     assert bool(verdict.success(cost))
     margin = 0.05 * abs(best)
     assert bool(verdict.success(cost - 0.9 * margin)) or best == -100.0
@@ -197,7 +197,7 @@ def test_a_model_without_a_position_is_judged() -> None:
             worst = max(worst, 15.0 - x, x - 25.0)
         assert verdict.cost[b].item() == pytest.approx(cost) and verdict.violation[b].item() == pytest.approx(worst)
     assert verdict.feasible.tolist() == [True, False]
-    assert not bool((verdict.reached | verdict.sound).any())
+    assert not bool(verdict.reached.any())
     for name in ("clearance", "clearance_knots", "goal_distance"):
         assert bool(getattr(verdict, name).isnan().all())
     held = torchgco.solve(problem, U, solver="hold")

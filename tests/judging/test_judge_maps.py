@@ -67,10 +67,10 @@ def test_verdicts_and_certificates_count_the_cells() -> None:
     )
     U = torch.tensor([7.0, 0.0]).double().expand(3, 3, 2)  # 0.7 m a step: the wall lies between knots
     verdict = judge(problem, U)
-    np.testing.assert_allclose(verdict.clearance[0], 0.3 - 0.19, atol=1e-8)
-    assert float(verdict.clearance[1]) < -0.19 < 0 < float(verdict.clearance_knots[1])
+    np.testing.assert_allclose(verdict.clearance[0], 0.3 - 0.199, atol=1e-8)
+    assert float(verdict.clearance[1]) < -0.199 < 0 < float(verdict.clearance_knots[1])
     assert float(verdict.clearance[2]) < 0
-    assert verdict.feasible.all() and verdict.sound.tolist() == [True, False, False]
+    assert verdict.clear_95.all() and verdict.feasible.tolist() == verdict.reached.tolist() == [True, False, False]
     X = torch.stack([x0 + 0.7 * k * torch.tensor([1.0, 0.0]) for k in range(4)], dim=1)
     certificate = certify(problem, X, U)
     np.testing.assert_allclose(certificate.clearance[0], 0.3 - 0.2, atol=1e-8)

@@ -162,7 +162,7 @@ def test_a_problem_among_them_is_solved() -> None:
     swings = OscillatingBoxes(boxes, *sines)
     problem = Problem(task.dynamics, cost, [swings], start, 60, Goal([[2.0, 0.0, 0.0]], 0.3))
     solution = torchgco.solve(problem)
-    assert bool(judge(problem, solution.U).sound.all())
+    assert bool(judge(problem, solution.U).reached.all())
 
 
 @pytest.mark.parametrize(

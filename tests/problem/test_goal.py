@@ -88,7 +88,7 @@ def test_a_terminal_function_with_a_goal_is_guided() -> None:
     assert scene_of(problem, U0) is not None
     solution = quick_gco(problem).solve(problem, U0)
     verdict = judge(problem, solution.U)
-    assert bool(verdict.sound.all()) and int(solution.guided[0]) > 0
+    assert bool(verdict.reached.all()) and int(solution.guided[0]) > 0
     blind, U0 = terminal_problem(None)
     assert blind.goal is None and scene_of(blind, U0) is None
     unaimed = judge(blind, U0)

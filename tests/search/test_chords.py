@@ -69,16 +69,16 @@ def test_chords_are_cleared_and_nothing_else_changes(make) -> None:
     problem, solution = cleared(make)
     before = without_clearing(problem)
     old, new = judge(problem, before), judge(problem, solution.U)
-    cut = old.feasible & (old.clearance < 0)
-    assert bool(cut.any()) and int(new.sound.sum()) > int(old.sound.sum())
-    assert bool((new.sound | ~old.sound).all()) and bool((new.reached | ~old.reached).all())
+    cut = old.clear_95 & (old.clearance < 0)
+    assert bool(cut.any()) and int(new.reached.sum()) > int(old.reached.sum())
+    assert bool((new.reached | ~old.reached).all())
     assert bool((new.clearance >= old.clearance).all())
     assert torch.equal(solution.U[~cut], before[~cut])
 
 
 def test_a_coarse_disc_is_cleared_for_every_start() -> None:
     problem, solution = cleared(coarse_disc)
-    assert bool(judge(problem, solution.U).sound.all())
+    assert bool(judge(problem, solution.U).reached.all())
 
 
 @pytest.mark.slow
@@ -91,8 +91,8 @@ def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
     rows = (replace(row, follow=row.follow[:1]) if isinstance(row, PathProposals) else row for row in solver.passes)
     solver = replace(solver, passes=tuple(rows))
     old = judge(problem, solve(problem, solver=without(solver, ClearChords)).U)
-    assert bool(old.feasible) and bool(old.clearance < 0)
-    assert bool(judge(problem, solve(problem, solver=solver).U).sound.all())
+    assert bool(old.clear_95) and bool(old.clearance < 0)
+    assert bool(judge(problem, solve(problem, solver=solver).U).reached.all())
 
 
 def test_a_way_along_thin_walls_is_cleared_by_the_interior_point() -> None:
@@ -110,7 +110,7 @@ def test_more_effort_loses_no_clear_trajectory() -> None:
     task = setup.task(setup.layouts(4))
     problem = task.problem.take(torch.tensor([3]))
     less, more = solve(problem), solve(problem, solver="gco_max")
-    assert bool(judge(problem, less.U).sound.all()) and bool(judge(problem, more.U).sound.all())
+    assert bool(judge(problem, less.U).reached.all()) and bool(judge(problem, more.U).reached.all())
     assert bool((more.cost <= 1.001 * less.cost).all())
 
 

@@ -203,10 +203,10 @@ def test_the_cheapest_refined_candidate_is_proposed_and_saves_the_solver_work() 
     problem, four = cup(B=2, N=120), varied(QUICK, num_paths=4, iterations=20)
     relaxed, refined = (proposed(varied(four, top=n), problem) for n in (1, 3))
     verdicts = [judge(problem, proposal.U, GOAL, 0.3) for proposal in (relaxed, refined)]
-    assert not bool(verdicts[0].sound.any()) and bool(verdicts[1].sound.all())
+    assert not bool(verdicts[0].reached.any()) and bool(verdicts[1].reached.all())
     for k in range(2):  # with paths on one side only
         other = judge(problem, alone(varied(four, top=3), problem, k).U, GOAL, 0.3)
-        assert bool(other.sound.all()) and bool((verdicts[1].cost <= other.cost).all())
+        assert bool(other.reached.all()) and bool((verdicts[1].cost <= other.cost).all())
     assert not any(bool(lam.any()) for lam in relaxed.multipliers.lam) and bool(refined.multipliers.lam[0].any())
     local = AugmentedLagrangian(ILQR(tolerance=1e-2, max_iterations=20), max_outer_iterations=20)
     counts = []

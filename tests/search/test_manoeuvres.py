@@ -110,7 +110,7 @@ def test_a_car_backs_up_into_a_corridor_hardly_wider_and_alone_as_in_a_batch() -
     problem = corridor([[1.0, 0.9, 0.1], [0.6, -1.0, 0.0], [-1.0, 0.1, 0.0]])
     solution = solve(problem)
     verdict = judge(problem, solution.U)
-    assert bool(verdict.sound.all())
+    assert bool(verdict.reached.all())
     assert float(solution.X[:2, :, 3].amin()) < -0.1  # no way in without
     alone = solve(problem.take(torch.tensor([1])))
     assert torch.equal(alone.U[0], solution.U[1])

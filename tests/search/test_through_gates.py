@@ -71,21 +71,21 @@ def test_each_leg_passes_on_its_better_side() -> None:
     found = torchgco.solve(problem)
     U0 = problem.x0.new_zeros(1, problem.N, 2)
     every = [InteriorPoint().solve(problem, U0, X0=bent(problem, sides)) for sides in product((-1.0, 1.0), repeat=LEGS)]
-    good = [one for one in every if bool(judge(problem, one.U, times=one.t).sound)]
+    good = [one for one in every if bool(judge(problem, one.U, times=one.t).reached)]
     costs = torch.cat([one.cost for one in good])
     assert len(good) >= 4 and float(costs.max()) > 1.1 * float(costs.min())
     assert float(found.cost) <= float(costs.min()) * (1.0 + 1e-6)
     verdict = judge(problem, found.U, times=found.t)
-    assert bool(verdict.sound) and int(verdict.gates_passed) == len(PLACES)
+    assert bool(verdict.reached) and int(verdict.gates_passed) == len(PLACES)
 
 
 def test_chords_are_clear_where_stages_are_long() -> None:
     """With twelve stages a leg the optimum at the knots alone cuts the discs."""
     problem = course(DISCS, stages=12)
     alone = InteriorPoint().solve(problem, problem.x0.new_zeros(1, problem.N, 2), X0=bent(problem, (1.0, -1.0, 1.0)))
-    assert not bool(judge(problem, alone.U, times=alone.t).sound)
+    assert not bool(judge(problem, alone.U, times=alone.t).reached)
     found = torchgco.solve(problem)
-    assert bool(judge(problem, found.U, times=found.t).sound) and float(found.violation) <= 1e-6
+    assert bool(judge(problem, found.U, times=found.t).reached) and float(found.violation) <= 1e-6
 
 
 def test_a_course_has_the_same_bits_in_any_batch() -> None:

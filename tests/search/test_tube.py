@@ -71,7 +71,7 @@ def test_it_arrives_behind_a_thick_wall_of_a_map(model: Dynamics) -> None:
     problem = room(model=model)
     found = judge(problem, alone(problem, Tube("maps")).solve(problem, rest(problem)).U)
     assert bool(found.reached.all())
-    assert bool(judge(problem, solve(problem).U).sound.all())
+    assert bool(judge(problem, solve(problem).U).reached.all())
 
 
 @MODELS

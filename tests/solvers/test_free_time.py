@@ -253,7 +253,7 @@ def test_the_time_frees_itself_of_its_guess_among_obstacles() -> None:
     assert bool((found.violation <= 1e-6).all())
     assert float(found.cost.max() / found.cost.min()) < 1.01
     verdict = judge(problem, found.U, times=found.t)
-    assert bool(verdict.sound.all())
+    assert bool(verdict.reached.all())
     straight = least_time(torch.tensor([[-4.0, 0.0]], dtype=D))[0] / 2.0**0.5  # thrust 2, without discs
     assert bool((found.duration > straight).all())
 
@@ -338,7 +338,7 @@ def test_a_moving_disc_is_passed_at_the_time_that_is_found() -> None:
     torch.testing.assert_close(found.duration[[0, 2]], torch.full((2,), free, dtype=D), rtol=1e-2, atol=0)
     assert float(found.duration[1]) > 1.05 * free
     verdict = judge(problem, found.U, times=found.t)
-    assert bool(verdict.sound.all()) and float(verdict.clearance[1]) < 0.1
+    assert bool(verdict.reached.all()) and float(verdict.clearance[1]) < 0.1
     proof = torchgco.certify(problem, found.X, found.U, times=found.t)
     spheres: Any = problem.obstacles[0]
     for b in range(3):  # by plain differences
@@ -358,7 +358,7 @@ def test_a_moving_disc_in_other_hands() -> None:
     problem = before_or_behind().take(torch.tensor([1]))
     for solver in ("ipopt", "interior_point"):
         found = torchgco.solve(problem, solver=solver)
-        assert bool(judge(problem, found.U, times=found.t).sound.all())
+        assert bool(judge(problem, found.U, times=found.t).reached.all())
     figure = torchgco.plot(problem, found)
     assert figure.axes and torchgco.show(problem, found).save
 

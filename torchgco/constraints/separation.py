@@ -86,7 +86,7 @@ class Separation(Constraint):
         """False where bodies touch at the start, (B,)."""
         return (self._away(x0).norm(dim=-1) >= CONTACT_FACTOR * self.min_distance.unsqueeze(-1)).all(-1)
 
-    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """Smallest distance (B,) to where bodies touch, both on the straight lines between their knots, m.
 
         They touch a `share` of the distance below it.
@@ -95,7 +95,8 @@ class Separation(Constraint):
         a, along = away[:, :-1], away.diff(dim=1)
         length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(X.dtype).tiny)
         nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
-        return nearest.norm(dim=-1).flatten(1).amin(-1) - (1.0 - share) * self.min_distance
+        contact = 1.0 - (TOUCH if share is None else share)
+        return nearest.norm(dim=-1).flatten(1).amin(-1) - contact * self.min_distance
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:

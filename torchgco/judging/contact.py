@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.judging.certificate import CHORDS
 from torchgco.judging.judge import by_kind
 from torchgco.judging.maps import path_distances
 from torchgco.maps.distance import DistanceField
-from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.body import BoundBody
 
 BETWEEN = 4  # pieces of a stage, each of which has a contact of its own or none
@@ -26,7 +25,7 @@ def contacts(
 ) -> np.ndarray:
     """Places (C, d) where a path (K, d), m, touches obstacles of a batch of one: the deepest of each contact.
 
-    Bodies touch at CONTACT_FACTOR of their radii, as the judge has it; between the knots, `dt` seconds apart, the path
+    Bodies touch where the judge has it; between the knots, `dt` seconds apart, the path
     is straight, and the states (K, n) change evenly, which the attitude of a `Body` depends on.
 
     Raises:
@@ -59,7 +58,7 @@ def pieces(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def map_depth(field: DistanceField, places: np.ndarray, radius: float) -> np.ndarray:
     """How deep (P,), m, a vehicle of this radius is in contact with a map on the pieces between places (P+1, d)."""
-    return CONTACT_FACTOR * radius - path_distances(field, 0, torch.from_numpy(places)).numpy()
+    return radius - ADMITTED - path_distances(field, 0, torch.from_numpy(places)).numpy()
 
 
 def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -81,7 +80,7 @@ def _depth(part: Obstacles, places: np.ndarray, dt: float, states: np.ndarray | 
     X[:, part.position] = torch.from_numpy(places)
     if states is not None:
         X = torch.from_numpy(np.array(states, dtype=float))
-    beneath = _beneath(one, X) - (1.0 - CONTACT_FACTOR) * part.margins[0].double().cpu()
+    beneath = _beneath(one, X) - part.contact_depths[0].double().cpu()
     beneath = beneath.masked_fill(part.absent[0].cpu(), -torch.inf)
     return beneath.amax(-1).numpy() if beneath.shape[-1] else np.full(len(places) - 1, -np.inf)
 

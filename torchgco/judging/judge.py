@@ -6,7 +6,7 @@ obstacles by plain differences. docs/words.md defines the terms that it returns.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,12 +28,11 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.between import Paths, paths
 from torchgco.problem.goal import Goal
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 
-OTHERS_WITHIN = ADMITTED  # how far all constraints but the obstacles may be violated by a feasible trajectory
-SUCCESS_VIOLATION = ADMITTED  # full radii, in metres
 SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
 NUMBERS_AT_ONCE = 2**18  # numbers held at once where distances from spheres are measured: 2 MB
 
@@ -44,21 +43,22 @@ class Verdict:
 
     cost: Tensor  # J_var
     violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
-    # Smallest distance, m, to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 (r + r_veh), where r rounds it,
-    # at the knots; of positions that keep a distance from each other, above 0.95 of it; infinite without either. A
-    # constraint given as a function has no distance: its rows count only as violations. NaN where the model has no
-    # position, and no positions keep a distance.
+    # Smallest distance, m, to contact at the knots: to a surface of 0.95 (r_obs + r_veh), of a box grown by
+    # 0.95 (r + r_veh), where r rounds it; of a map to r_veh - 1e-3 m from its cells and points; of positions that keep
+    # a distance from each other, above 0.95 of it; infinite without any. A constraint given as a function has no
+    # distance: its rows count only as violations. NaN where the model has no position, and no positions keep distance.
     clearance_knots: Tensor
-    clearance: Tensor  # the same along the straight segments between the knots
+    clearance: Tensor  # the same between the knots, too, along the path that the model's integrator takes there
     goal_distance: Tensor  # m, last knot to goal, positions only; NaN without a goal
-    feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
+    # bool: what the statuses CONVERGED and FEASIBLE say: violation <= 1e-3, clearance >= 0, every gate passed
+    feasible: Tensor
     # bool: feasible, and closer to the goal than the goal radius, of a required one 1e-3 m more; False without a goal
     reached: Tensor
-    sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
+    clear_95: Tensor  # bool, the paper's notion: clearance_knots >= 0, every other constraint within 1e-3
     gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, between the knots too
 
     def success(self, best_cost: Tensor) -> Tensor:
-        """Whether sound, and within 5 % of the best known cost (B,), (B,) bool.
+        """Whether reached, and within 5 % of the best known cost (B,), (B,) bool.
 
         Raises:
             InputError: a best cost that isn't a number: without one, success is unknown.
@@ -67,7 +67,7 @@ class Verdict:
         check_shape(best_cost, () if best_cost.dim() == 0 else tuple(self.cost.shape), "best_cost")
         if bool(best_cost.isnan().any()):
             raise InputError("best_cost", "the best known cost of every problem", "NaN")
-        return self.sound & near_best(self.cost, best_cost)
+        return self.reached & near_best(self.cost, best_cost)
 
 
 def near_best(cost: Any, best: Any) -> Any:
@@ -194,31 +194,32 @@ def _own_goal(problem: Problem) -> Goal:
 def _verdict(
     problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: tuple[Tensor, Tensor] | None, moved: Tensor
 ) -> Verdict:
-    far = torch.full_like(cost, torch.inf)
+    far, along = torch.full_like(cost, torch.inf), paths(problem, X, U)
     clearance_knots, clearance, violation, others = far, far, moved, torch.zeros_like(cost)
     for constraint in problem.constraints:
         worst = constraint.worst(X, U) if problem.horizon is None else _worst_within(problem, constraint, X, U)
         violation = torch.maximum(violation, worst)
         if isinstance(constraint, Obstacles | Separation):
-            at_knots, between = _clearances(problem, constraint, X)
+            at_knots, between = _clearances(problem, constraint, X, along)
             clearance_knots = torch.minimum(clearance_knots, at_knots)
             clearance = torch.minimum(clearance, between)
         else:
             others = torch.maximum(others, worst)
-    finite = torch.isfinite(X).flatten(1).all(-1)
-    feasible = finite & (clearance_knots >= 0) & (others <= OTHERS_WITHIN) & (moved == 0)
+    passed, gates = torch.zeros_like(problem.stages), 0
+    for way in (passes(part, X) for part in problem.constraints):
+        if way is not None:
+            passed, gates = passed + way.passed.sum(-1), gates + way.passed.shape[-1]
+    finite = torch.isfinite(X).flatten(1).all(-1) & (moved == 0)
+    clear_95 = finite & (clearance_knots >= 0) & (others <= ADMITTED)
+    feasible = finite & (violation <= ADMITTED) & (clearance >= 0) & (passed == gates)
     goal_distance, reached = torch.full_like(cost, torch.nan), torch.zeros_like(feasible)
     if goal is not None:
         goal_distance = (X[:, -1, problem.position] - goal[0]).square().sum(-1).sqrt()
         required = problem.goal is not None and problem.goal.required  # rows among the others are kept as far as these
-        reached = feasible & (goal_distance < goal[1] + (OTHERS_WITHIN if required else 0.0))
-    sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
+        reached = feasible & (goal_distance < goal[1] + (ADMITTED if required else 0.0))
     if problem.dynamics.position is None and not any(isinstance(part, Separation) for part in problem.constraints):
         clearance_knots = clearance = torch.full_like(cost, torch.nan)
-    passed = torch.zeros_like(problem.stages)
-    for way in (passes(part, X) for part in problem.constraints):
-        passed = passed if way is None else passed + way.passed.sum(-1)
-    return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound, passed)
+    return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, clear_95, passed)
 
 
 def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
@@ -237,15 +238,21 @@ def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor
     return worst
 
 
-def _clearances(problem: Problem, obstacles: Constraint, X: Tensor) -> tuple[Tensor, Tensor]:
+def _clearances(
+    problem: Problem, obstacles: Constraint, X: Tensor, along: Sequence[Paths]
+) -> tuple[Tensor, Tensor]:
     """Smallest distances (B,) at the knots and between them; those of a horizon's own knots where horizons differ."""
-    measure = by_kind(CLEARANCES, obstacles)
-    if problem.horizon is None:
-        return measure(obstacles, X)
-    at_knots, between = torch.empty_like(X[:, 0, 0]), torch.empty_like(X[:, 0, 0])
-    for last in problem.horizon.unique().tolist():
-        rows = (problem.horizon == last).nonzero().flatten()
-        at_knots[rows], between[rows] = measure(obstacles.take(rows), X[rows, : last + 1])
+    at_knots, between = (torch.empty_like(X[:, 0, 0]) for _ in range(2))
+    for path in along:
+        stages = problem.stages[path.rows]
+        for last in [problem.N] if problem.horizon is None else stages.unique().tolist():
+            own = (stages == last).nonzero().flatten()
+            rows = path.rows[own]
+            part, measure = obstacles.take(rows), by_kind(CLEARANCES, obstacles)
+            at_knots[rows], between[rows] = measure(part, X[rows, : last + 1])
+            if path.pieces > 1:
+                fine = part.in_pieces(path.pieces) if isinstance(part, Obstacles) else part
+                between[rows] = measure(fine, path.X[own, : path.pieces * last + 1])[1]
     return at_knots, between
 
 
@@ -324,13 +331,17 @@ def separation_clearance(separation: Separation, X: Tensor) -> tuple[Tensor, Ten
 
 
 def field_clearance(field: BoundField, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest distance (B,) of the occupied cells, or points, less 0.95 r_veh, at the knots and between them, m.
+    """Smallest distance (B,) of the occupied cells, or points, less r_veh - 1e-3, at the knots and between them, m.
 
-    Where nothing is nearer than `maps.NEAR` a lower bound; infinite where the map is empty.
+    Where nothing is nearer than `maps.EXACT_TO` a lower bound; infinite where the map is empty. At the start, and in
+    the first stage, contact is where the start is, or at 0.95 r_veh if that is nearer.
     """
-    p, contact = X[..., field.position], CONTACT_FACTOR * field.vehicle_radius
-    at_knots = segment_distances(field, torch.stack((p, p), dim=2).flatten(1, 2))[:, ::2].amin(-1) - contact
-    return at_knots, torch.minimum(segment_distances(field, p).amin(-1) - contact, at_knots)
+    p, radius = X[..., field.position], field.vehicle_radius.unsqueeze(-1)
+    at_knots = segment_distances(field, torch.stack((p, p), dim=2).flatten(1, 2))[:, ::2] - radius
+    along = segment_distances(field, p) - radius
+    ways = (gaps + field.depths_along(at_knots[:, 0], gaps.shape[1]) for gaps in (at_knots, along))
+    nearest, between = (gaps.amin(-1) for gaps in ways)
+    return nearest, torch.minimum(between, nearest)
 
 
 def body_clearance(body: BoundBody, X: Tensor) -> tuple[Tensor, Tensor]:
@@ -377,7 +388,7 @@ def by_kind(measures: dict[type[Constraint], Any], obstacles: Constraint) -> Any
 
 def frame_columns(verdict: Verdict) -> dict[str, Any]:
     """The verdict as arrays, by the names of a study's columns (`success` needs the best cost first)."""
-    names = ("feasible", "reached", "cost", "violation", "clearance", "clearance_knots", "goal_distance")
+    names = "feasible", "reached", "clear_95", "cost", "violation", "clearance", "clearance_knots", "goal_distance"
     return {name: getattr(verdict, name).cpu().numpy() for name in names}
 
 

@@ -26,6 +26,7 @@ from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
 from torchgco.native.structures import Options
+from torchgco.obstacles.base import TOUCH
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
@@ -99,13 +100,14 @@ class NativeKernels(Kernels):
         self.engine.run(name, problem.B, self.engine.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
         return worst
 
-    def chord_clearance(self, problem: Problem, X: Tensor, share: float) -> Tensor:
+    def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
         parts = [c.bare for c in problem.constraints]
         others = [part for part in parts if type(part) is not BoundSpheres]
         if len(others) == len(parts):
             return clearance_of(others, X, share)
         U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
-        packed = self.engine.packed(problem, X=X.contiguous(), U=U, merit=least, gain=1.0 - share)
+        contact = 1.0 - (TOUCH if share is None else share)
+        packed = self.engine.packed(problem, X=X.contiguous(), U=U, merit=least, gain=contact)
         self.engine.run("tgco_chords", problem.B, packed)
         return clearance_of(others, X, share, least)
 

@@ -65,7 +65,7 @@ class Kernels:
         """The largest violation (B,), of all constraints or of `obstacles` alone (geometric ones)."""
         return violation(problem.geometric if obstacles else problem.constraints, X, U)
 
-    def chord_clearance(self, problem: Problem, X: Tensor, share: float) -> Tensor:
+    def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
         """See `kernels.chord_clearance`."""
         return clearance_of([c.bare for c in problem.constraints], X, share)
 
@@ -110,10 +110,11 @@ class Kernels:
         return torch.zeros(0, dtype=torch.int64, device=X.device)
 
 
-def clearance_of(parts: list[Any], X: Tensor, share: float, least: Tensor | None = None) -> Tensor:
+def clearance_of(parts: list[Any], X: Tensor, share: float | None, least: Tensor | None = None) -> Tensor:
     """Smallest distance (B,) from the lines between knots to those of the parts that keep a distance; or `least`."""
     least = X.new_full(X.shape[:1], torch.inf) if least is None else least
     for part in parts:
         if isinstance(part, Obstacles | Separation):
-            least = torch.minimum(least, part.chord_clearance(X, share))
+            away = part.chord_clearance(X) if share is None else part.chord_clearance(X, share)
+            least = torch.minimum(least, away)
     return least

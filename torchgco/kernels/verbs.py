@@ -12,9 +12,10 @@ from torchgco.costs.base import ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics import rollout
 from torchgco.kernels.choice import kernels_of
-from torchgco.kernels.in_pytorch import InteriorKernels
+from torchgco.kernels.in_pytorch import InteriorKernels, clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.obstacles.base import TOUCH
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.between import bends, bulge, paths
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
 
@@ -82,13 +83,31 @@ def is_convex(problem: Problem) -> bool:
     return bounded and isinstance(cost, BoundQuadratic) and kernels_of(problem).affine
 
 
-def chord_clearance(problem: Problem, X: Tensor, share: float = TOUCH) -> Tensor:
+def chord_clearance(problem: Problem, X: Tensor, share: float | None = None) -> Tensor:
     """Smallest distance (B,) from the straight lines between knots to obstacles, m, negative in contact.
 
     Counted from a `share` of an obstacle's margin beneath its surface, by default from where bodies touch; infinite
     without obstacles and positions that keep a distance.
     """
     return kernels_of(problem).chord_clearance(problem, X, share)
+
+
+def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The same (B,) of where bodies touch, from the paths that the integrator takes between the knots.
+
+    Exact where a path may touch; elsewhere that of its chords, which are then farther away than it leaves them.
+    """
+    found = chord_clearance(problem, X)
+    if not bends(problem):
+        return found
+    near = (found < bulge(problem, X, U)).nonzero().flatten()
+    for path in paths(problem.take(near), X[near], U[near]):
+        if path.pieces > 1:
+            rows = near[path.rows]
+            parts = (constraint.bare for constraint in problem.take(rows).constraints)
+            fine = [part.in_pieces(path.pieces) if isinstance(part, Obstacles) else part for part in parts]
+            found[rows] = clearance_of(fine, path.X, None)
+    return found
 
 
 def interior_of(problem: Problem) -> InteriorKernels:

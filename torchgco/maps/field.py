@@ -17,7 +17,7 @@ from torchgco.maps.distance import ALL_FREE, DistanceField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
 from torchgco.maps.points import PointCloud
-from torchgco.obstacles.base import ABSENT, CONTACT_FACTOR, OwnKind
+from torchgco.obstacles.base import ABSENT, ADMITTED, CONTACT_FACTOR, TOUCH, OwnKind, least
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import dimension, vehicle_radii
 
@@ -129,6 +129,29 @@ class BoundField(OwnKind):
     def sizes(self) -> Tensor:
         return (self.vehicle_radius + self.field.thickness).unsqueeze(-1)
 
+    @property
+    def contact_depths(self) -> Tensor:
+        """A map is touched at the vehicle's full radius, but for what counts as feasible: cells have no radius."""
+        return torch.full_like(self.margins, ADMITTED)
+
+    def depths_along(self, start: Tensor, count: int) -> Tensor:
+        """How deep beneath the full surface the map is touched at the first of `count` places and after it, (B, count).
+
+        What a start, `start` (B,), m, away from the surface, has less than the full distance is no contact of the way
+        that leads out of it, up to where other obstacles touch.
+        """
+        depths = self.contact_depths.repeat(1, count)
+        depths[:, 0] = torch.maximum(depths[:, 0], torch.minimum(-start, TOUCH * self.vehicle_radius))
+        return depths
+
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
+        if share is not None:
+            return super().chord_clearance(X, share)
+        p = X[..., self.position]
+        start = self.signed_distance(p[:, :1], p.new_zeros(1))[:, 0, 0]
+        gaps = self.segment_clearance(p[:, :-1], p[:, 1:])
+        return least(gaps + self.depths_along(start, gaps.shape[1]).unsqueeze(-1))
+
     def rows(self, p: Tensor, t: Tensor) -> Tensor:
         square = self.vehicle_radius.square().unsqueeze(-1) - squares(self.lattice, p, self.cores)
         return torch.where(self.absent, ABSENT, self.factors.unsqueeze(-1) * square).unsqueeze(-1)
@@ -192,7 +215,8 @@ class BoundField(OwnKind):
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """As for all obstacles; where the field's bound says no, each cell, or point, near the start is measured."""
-        clear = super().start_is_clear(x0)
+        clear = self.signed_distance(x0[:, None, self.position], x0.new_zeros(1))[:, 0]
+        clear = (clear >= -TOUCH * self.margins).all(-1)
         finite = torch.isfinite(x0[:, self.position]).all(-1)
         for b in (~clear & finite).nonzero().flatten().tolist():
             least = CONTACT_FACTOR * float(self.vehicle_radius[b])

@@ -126,6 +126,11 @@ class Obstacles(Constraint):
         raise undefined(self, "margins")
 
     @property
+    def contact_depths(self) -> Tensor:
+        """How deep beneath the full surface bodies touch, (B, M), m."""
+        return TOUCH * self.margins
+
+    @property
     def sizes(self) -> Tensor:
         """The smallest distance from an obstacle's centre to its full surface, (B, M), m."""
         return self.margins
@@ -157,19 +162,23 @@ class Obstacles(Constraint):
         """The same kind with the obstacles at places (B, M') alone; -1 stands for an absent one."""
         raise undefined(self, "chosen")
 
-    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+    def beneath(self, share: float | None) -> Tensor:
+        """Depths (B, M), m, from which clearances count: a share of the margins; None: where bodies touch."""
+        return self.contact_depths if share is None else share * self.margins
+
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """Smallest distance (B,) from the straight lines between knots to obstacles, m; negative inside of them.
 
         Counted from a `share` of the margin beneath the full surface, by default from where bodies touch; infinite
         where there is no obstacle. Obstacles that move override this.
         """
         p = X[..., self.position]
-        return least(self.segment_clearance(p[:, :-1], p[:, 1:]) + (share * self.margins).unsqueeze(1))
+        return least(self.segment_clearance(p[:, :-1], p[:, 1:]) + self.beneath(share).unsqueeze(1))
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where the vehicle touches an obstacle at the start, (B,)."""
         distance = self.signed_distance(x0[:, None, self.position], x0.new_zeros(1))[:, 0]
-        return (distance >= (CONTACT_FACTOR - 1.0) * self.margins).all(-1)
+        return (distance >= -self.contact_depths).all(-1)
 
     def counted(self, rows: Tensor, other: float, count: int) -> Tensor:
         """Rows (B, K, M) of `count` knots in all, with `other` where a problem's time has stopped."""
@@ -185,6 +194,11 @@ class Obstacles(Constraint):
     def with_step(self, dt: float) -> Self:
         """The same obstacles, which move from knot to knot by what they do in dt, s."""
         return replace(self, dt=dt)  # type: ignore[type-var]
+
+    def in_pieces(self, count: int) -> Self:
+        """The same obstacles for states at the ends of `count` pieces of each stage."""
+        part = self if self.stops is None else self.stopping_at(count * self.stops)
+        return part.with_step(part.dt / count) if part.moving else part
 
     def with_knots(self, knots: slice) -> Self:
         """The same obstacles, which count at other knots."""

@@ -14,7 +14,7 @@ from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement, passed_on
-from torchgco.constraints.base import CONTACT_FACTOR, TOUCH
+from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.obstacles.attitude import Attitude, attitude_of
 from torchgco.obstacles.base import Obstacles, Solids, places_of
 
@@ -237,6 +237,7 @@ class BoundBody(Obstacles):
     vehicle_radius = property(lambda self: self.radii.amax(-1))  # type: ignore[assignment]
     absent = property(lambda self: self._joined("absent"))  # type: ignore[assignment]
     margins = property(lambda self: self._joined("margins"))  # type: ignore[assignment]
+    contact_depths = property(lambda self: self._joined("contact_depths"))  # type: ignore[assignment]
     sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
     radii = property(lambda self: torch.stack([ball.vehicle_radius for ball in self.balls], dim=-1))  # (B, P), m
     # Of the smallest ball about the position that holds the body, (B,), m.
@@ -286,14 +287,14 @@ class BoundBody(Obstacles):
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         raise InputError("body", "states, whose `chord_clearance` is measured", "positions alone")
 
-    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """As of all obstacles, of states that change evenly between the knots."""
         near = self._nearest(X, share)
         part, X = (self if near is None else self.chosen(near)).finer(X)
         found = [ball.chord_clearance(P, share) for ball, P in part.each(X)]
         return (torch.stack(found, dim=-1) - part.points.bulge(X).amax(1)).amin(-1)
 
-    def _nearest(self, X: Tensor, share: float) -> Tensor | None:
+    def _nearest(self, X: Tensor, share: float | None) -> Tensor | None:
         """Places (B, M') of those that may be the nearest to a ball on its way along X; None of a kind that can't say.
 
         A ball is no farther from an obstacle than at a knot, and no nearer than its reach around the position is.
@@ -306,7 +307,8 @@ class BoundBody(Obstacles):
         away = inner.signed_distance(p, p.new_zeros(p.shape[1])).amin(1) + inner.vehicle_radius.unsqueeze(-1)  # (B, M)
         half = 0.5 * p.diff(dim=1).norm(dim=-1).amax(-1)  # a point of the way is so near to a knot
         least = away - ((out + self.radii).amax(-1) + half).unsqueeze(-1)
-        most = away + share * inner.margins + ((out - self.radii).amin(-1) + share * self.radii.amax(-1)).unsqueeze(-1)
+        deep = self.beneath(share).unflatten(-1, (len(self.balls), -1)).amax(1)
+        most = away + deep + (out - self.radii).amin(-1).unsqueeze(-1)
         limit = most.amin(-1) + self.points.bulge(X).flatten(1).amax(-1)
         kept = ~(least > limit.unsqueeze(-1)) & ~inner.absent  # NaN may be near
         return places_of(kept)
@@ -318,13 +320,7 @@ class BoundBody(Obstacles):
         """
         share = torch.arange(PIECES, dtype=X.dtype, device=X.device).view(1, 1, -1, 1) / PIECES
         within = torch.lerp(X[:, :-1].unsqueeze(2), X[:, 1:].unsqueeze(2), share).flatten(1, 2)
-
-        def slower(part: Any) -> Any:
-            if part.stops is not None:
-                part = part.stopping_at(PIECES * part.stops)
-            return part.with_step(part.dt / PIECES) if part.moving else part
-
-        return self._of_each(slower), torch.cat((within, X[:, -1:]), dim=1)
+        return self.in_pieces(PIECES), torch.cat((within, X[:, -1:]), dim=1)
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         return torch.stack([ball.start_is_clear(P) for ball, P in self.each(x0)]).all(0)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import passed_on
 from torchgco.constraints.norms import NO_ROW
-from torchgco.obstacles.base import TOUCH, Obstacles
+from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
 
 
@@ -83,8 +83,11 @@ class SpheresInFreeTime(Obstacles):
     def distances(self, X: Tensor) -> Tensor:
         return self.along(X).distances(X)
 
-    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         return self.along(X).chord_clearance(X, share)
+
+    def with_step(self, dt: float) -> Self:
+        return replace(self, spheres=self.spheres.with_step(dt))
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, spheres=self.spheres.grown(by))

@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_finite, per_row
 from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint
-from torchgco.obstacles.base import ABSENT, TOUCH, OwnKind, least, picked
+from torchgco.obstacles.base import ABSENT, OwnKind, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, segment_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
@@ -95,12 +95,12 @@ class BoundOscillatingBoxes(OwnKind):
         now = self.places(a.new_zeros(1))[:, 0]
         return replace(self.boxes, centers=now).segment_clearance(a, b)
 
-    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
         local = torch.stack(self._local(X[..., self.position], t), dim=-1)
         begin, along = local[:, :-1].unbind(-1), local.diff(dim=1).unbind(-1)
         gap = segment_distance(begin, along, self._solids.halves()) - self.bulge.unsqueeze(1)
-        gap = gap + (share * self.margins - self.boxes.inflated_radii).unsqueeze(1)
+        gap = gap + (self.beneath(share) - self.boxes.inflated_radii).unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
     @property

@@ -193,14 +193,15 @@ class BoundSpheres(OwnKind):
     def inflated(self) -> Solids | None:
         return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
 
-    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         o = self.centers.unsqueeze(1)
         if self.velocities is not None:
             t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device)
             t = t.unsqueeze(0) if self.stops is None else torch.minimum(t, self.stops.unsqueeze(-1))
             o = o + (t * self.dt)[..., None, None] * self.velocities.unsqueeze(1)
         away = X[:, :, None, self.position] - o
-        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - (1.0 - share) * self.inflated_radii.unsqueeze(1)
+        contact = 1.0 - (TOUCH if share is None else share)
+        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - contact * self.inflated_radii.unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
     def _gaps(self, p: Tensor, t: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
-from torchgco.judging.judge import SUCCESS_VIOLATION
+from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.style import INK, legend, panels, solver_colours, tasks_of, tidy
 
 LOWEST = 1e-12
@@ -51,7 +51,7 @@ def violation_figure(trials: pd.DataFrame) -> Figure:
     for ax, values in shown:
         decades = {name: np.log10(held.clip(LOWEST)) for name, held in values.items()}
         # A linear axis of exponents: its lower end stands for all below.
-        _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(SUCCESS_VIOLATION))
+        _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(ADMITTED))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.xaxis.set_major_formatter(FuncFormatter(_power))
     return figure

@@ -127,7 +127,7 @@ def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
 def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
     """Places (C, d) where a path (N+1, d) touches obstacles or the map of layout i: the deepest of each contact.
 
-    Bodies touch at CONTACT_FACTOR of their radii, and distances are measured as by the judge; between the knots the
+    Bodies touch, and distances are measured, as by the judge; between the knots the
     path is straight, and the states (N+1, n) change evenly, by which a vehicle's body turns.
     """
     places, knots = pieces(flown(path))

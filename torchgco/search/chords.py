@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.base.options import Count
 from torchgco.base.status import is_over
 from torchgco.base.tree import take
-from torchgco.kernels import chord_clearance, measured
+from torchgco.kernels import measured, path_clearance
 from torchgco.lagrangian.quality import leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
@@ -126,7 +126,7 @@ def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) ->
     Returns:
         The problems that touched, and whether they still do.
     """
-    clearance = chord_clearance(call.problem, best.X)
+    clearance = path_clearance(call.problem, best.X, best.U)
     by, now = torch.zeros_like(clearance), clearance.clone()
     rows = touching = ((best.violation <= limit) & (clearance < 0)).nonzero().flatten()
     for _ in range(rounds):
@@ -149,6 +149,6 @@ def serving(
     They do where they are feasible, arrive if the old ones do, and keep more clearance than `least`, (B,), m.
     """
     found = replace(new, violation=measured(problem, new.X, new.U))
-    clearance = chord_clearance(problem, found.X)
+    clearance = path_clearance(problem, found.X, found.U)
     serves = (found.violation <= limit) & (clearance > least)
     return serves & ~leaves_goal(problem, found.X, old.X), found, clearance

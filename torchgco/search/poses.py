@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
@@ -174,4 +173,4 @@ def _clear(part: Obstacles, states: Tensor) -> Tensor:
 def _room(balls: Obstacles, p: Tensor) -> Tensor:
     """How far (K,), m, a ball at points (1, K, d) is from touching obstacles."""
     away = balls.signed_distance(p, p.new_zeros(p.shape[1]))[0]
-    return (away + (1.0 - CONTACT_FACTOR) * balls.margins).amin(-1)
+    return (away + balls.contact_depths).amin(-1)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgco.base.tree import put, take
 from torchgco.constraints.gates import gates_of
-from torchgco.kernels import chord_clearance
+from torchgco.kernels import path_clearance
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Solids
@@ -151,7 +151,7 @@ class ThroughGates:
         fits = (found.violation <= self.limit) & torch.isfinite(found.cost)
         clearance, some = torch.full_like(grown, -torch.inf), fits.nonzero().flatten()
         if some.numel() > 0:
-            clearance[some] = chord_clearance(problem.take(some), found.X[some])
+            clearance[some] = path_clearance(problem.take(some), found.X[some], found.U[some])
         arrived = has_arrived(problem, found.X) | (not ranks_arrival(problem))
         ranks = zip(*map(Tensor.tolist, (~fits, ~arrived, clearance < 0.0, found.cost)), strict=True)
         for place, (b, rank) in enumerate(zip(rows.tolist(), ranks, strict=True)):

@@ -24,8 +24,10 @@ from torchgco.kernels import cost_unit, current, open_loop, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.horizons import at_rest_after, for_solvers
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
+from torchgco.solvers.ending import judged_between
 from torchgco.solvers.timing import Chooser, lifted_multipliers, solve_in_time
 
 
@@ -211,6 +213,7 @@ class Solver(Brief):
                 held = f"free_start: the start is held at x0, as {type(self).__name__} doesn't choose it; {expected}"
                 warnings.warn(held, StartWarning, stacklevel=2)
             found = self.run(call)
+            found = replace(found, status=judged_between(call.problem, found.X, found.U, found.status))
             found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
             return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
 
@@ -234,7 +237,9 @@ class Solver(Brief):
             able = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
             raise InputError("solver", able, type(self).__name__)
         found = solve_in_time(chooser, problem, call, X0)
-        return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
+        _, X, U = at_times(problem, found.X, found.U, found.times)
+        account = Account(problem, self, kernels=self.kernels or used(call.problem))
+        return replace(found, status=judged_between(call.problem, X, U, found.status), account=account)
 
     def choosing_time(self, problem: Problem) -> Chooser | None:
         """What solves problems with a free time, in the form `in_time`, for this solver; None: it can't."""

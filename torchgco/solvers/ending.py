@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.base.status import STALLED, UNMOVED, Status, is_over
 from torchgco.ilqr.riccati import BackwardPass
-from torchgco.kernels import cost_scale, cost_unit, kernels_of
+from torchgco.kernels import cost_scale, cost_unit, kernels_of, path_clearance
 from torchgco.lagrangian.lagrangian import Lagrangian, binding
 from torchgco.problem.problem import Problem
 
@@ -111,6 +111,16 @@ def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
     gains = torch.where(again.view(1, -1, 1, 1), second.gains, first.gains)
     linear, quadratic = (torch.where(again, b, a) for a, b in zip(first[1:3], second[1:3], strict=True))
     return BackwardPass(gains, linear, quadratic, again & second.failed)
+
+
+def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Tensor:
+    """The statuses (B,), but INFEASIBLE where a trajectory keeps all rows and touches an obstacle between two knots."""
+    rows = ((status == Status.CONVERGED) | (status == Status.FEASIBLE)).nonzero().flatten()
+    if rows.numel() == 0:
+        return status
+    status = status.clone()
+    status[rows[path_clearance(problem.take(rows), X[rows], U[rows]) < 0]] = int(Status.INFEASIBLE)
+    return status
 
 
 def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:

@@ -173,7 +173,7 @@ class Flight(Batch):
         rows = pd.DataFrame(
             {
                 "scenario": layouts.name, "layout": layouts.ids, "seed": setup.seed, "model": setup.vehicle.name,
-                "solver": self.name, "status": statuses, **frame_columns(verdict), "sound": verdict.sound.numpy(),
+                "solver": self.name, "status": statuses, **frame_columns(verdict),
                 **durations(times), **gates_passed(checked.problem, verdict),
                 **certificate_columns(certificate),
                 "iterations": solution.iterations.cpu().numpy(),

@@ -58,7 +58,7 @@ class MissionFlight(Batch):
         return {
             "scenario": self.layouts.name, "layout": int(self.layouts.ids[b]), "seed": setup.seed,
             "model": setup.vehicle.name, "solver": self.name, "status": outcome.name,
-            "feasible": outcome not in FAILED, "reached": outcome == Outcome.REACHED, "sound": False,
+            "feasible": outcome not in FAILED, "reached": outcome == Outcome.REACHED, "clear_95": outcome not in FAILED,
             **dict.fromkeys(SINGLE, np.nan),
             "batch_size": self.layouts.count, "threads": torch.get_num_threads(), "device": setup.device.type,
             "dtype": str(setup.dtype).removeprefix("torch."), "kernels": "", "version": VERSION,

@@ -39,7 +39,7 @@ from torchgco.experiments.results.identity import (
 )
 from torchgco.experiments.results.lock import held
 from torchgco.experiments.results.provenance import recorded
-from torchgco.experiments.results.success import sound, with_success
+from torchgco.experiments.results.success import with_success
 from torchgco.kernels import native
 from torchgco.missions import Mission
 from torchgco.plotting.silhouettes import body_of
@@ -279,7 +279,7 @@ def _fly_side_by_side(
 def _update_success(study: _Study, store: StudyFolder) -> None:
     """Judge the rows of a finished study again where the best costs of its layouts have changed since."""
     trials = store.table()
-    new = with_success(trials.assign(sound=sound(trials)), study.layouts, study.rivals)
+    new = with_success(trials, study.layouts, study.rivals)
     if not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object)):
         store.replace(new, study.layouts)
         say("The best costs of the layouts have changed: best_cost and success were computed again.\n")

@@ -193,7 +193,7 @@ def _trajectories(
             stored = [place[number] for number in some.ids.tolist()]
             times = times_at(held_times, stored, task.problem.N)
             verdict = judge(task.problem, controls[stored, : task.problem.N], task.goal, task.goal_radius, times=times)
-            columns = {"solver": name, "layout": some.ids, **frame_columns(verdict), "sound": verdict.sound.numpy()}
+            columns = {"solver": name, "layout": some.ids, **frame_columns(verdict)}
             more = durations(times) | gates_passed(task.problem, verdict)
             parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))

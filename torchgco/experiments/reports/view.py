@@ -20,7 +20,7 @@ from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS
-from torchgco.judging.judge import OTHERS_WITHIN
+from torchgco.obstacles.base import ADMITTED
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page
@@ -63,7 +63,7 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
             here = [rows[name, number] for number in ids]
             touching = np.array([not row["clearance"] >= 0 for row in here])
             said = [result_of(row) for row in here], [told(row) for row in here]
-            flown.append(flights_of(problem, look, X, U, name, *said, OTHERS_WITHIN, touching))
+            flown.append(flights_of(problem, look, X, U, name, *said, ADMITTED, touching))
         for b, number in enumerate(ids):
             held = [flights[b] for flights in flown if len(flights[b].path)]
             # The knots' times are those of the solver under study; others are shown at the same knots.

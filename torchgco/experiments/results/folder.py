@@ -31,8 +31,8 @@ from torchgco.experiments.statistics.statistics import check_trials
 from torchgco.scenarios import Layouts
 
 COLUMNS = (
-    "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "cost", "best_cost",
-    "violation", "clearance", "clearance_knots", "goal_distance", "dynamics_residual", "clearance_full",
+    "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "clear_95", "cost",
+    "best_cost", "violation", "clearance", "clearance_knots", "goal_distance", "dynamics_residual", "clearance_full",
     "bound_violation", "kkt_residual", "iterations", "outer_iterations", "guided", "seconds", "batch_size", "threads",
     "device", "dtype", "kernels", "version", "best_from", "layout_digest", "settings_digest",
 )  # fmt: skip
@@ -290,7 +290,7 @@ def read_shard(path: Path) -> Flown:
     def read(path: Path) -> Flown:
         held = read_npz(path)
         rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
-        absent = {*COLUMNS, "sound"} - {*JUDGED, *rows.columns}
+        absent = set(COLUMNS) - {*JUDGED, *rows.columns}
         if absent or U.ndim != 3 or len(U) != len(rows):
             raise ValueError(f"{len(rows)} rows, controls {U.shape}, no {', '.join(sorted(absent)) or 'more'}")
         return rows, U

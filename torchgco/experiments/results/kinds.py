@@ -12,7 +12,14 @@ import pandas as pd
 from torchgco.experiments.results.files import write
 from torchgco.experiments.statistics.missions import MISSIONS_AT_ONCE, summarise_missions
 from torchgco.experiments.statistics.paired import compare
-from torchgco.experiments.statistics.statistics import OUTCOMES, TASK, are_missions, summarise, task_columns
+from torchgco.experiments.statistics.statistics import (
+    OUTCOMES,
+    PAPER_OUTCOME,
+    TASK,
+    are_missions,
+    summarise,
+    task_columns,
+)
 from torchgco.experiments.statistics.tables import (
     PAIR_CELLS,
     RATES_TEXT,
@@ -25,12 +32,13 @@ from torchgco.experiments.statistics.tables import (
 )
 from torchgco.missions.outcome import Outcome
 
+PAPER_SOLVER = "gco_paper"  # whose tables have the paper's notion of feasible, too
 KIND = "kind"  # first column of summary.csv and paired.csv
 
 
 # Head, form and columns of the summary.
 TRAJECTORY_EFFORT = (
-    ("n", "{:d}", "n"), ("invalid", "{:d}", "invalid"), ("viol. ok", "{:.0%}", "violation_ok"),
+    ("n", "{:d}", "n"), ("invalid", "{:d}", "invalid"),
     ("violation", "{:.2g}", "violation_median"), ("cost reached", "{:.1f}", "cost_median_reached"),
     ("cost all", "{:.1f}", "cost_median"), ("cost ratio", "{:.3f} ({:.3f})", "cost_ratio_median", "cost_ratio_p90"),
     ("iter.", "{:.0f} ({:.0f})", "iterations_median", "iterations_p90"),
@@ -65,6 +73,7 @@ TRAJECTORIES = Kind(
     paper=("n", "cost ratio", "iter.", "seconds"),
     compared={**PAIR_CELLS, "cost ratio": cost_ratio},
     statuses=True,
+    more_rates=lambda task: {PAPER_OUTCOME: rate(PAPER_OUTCOME)} if (task["solver"] == PAPER_SOLVER).any() else {},
     notes=f"{RATES_TEXT}\n{EFFORT_TEXT}",
 )
 MISSIONS = Kind(

@@ -16,7 +16,7 @@ import pandas as pd
 from torchgco.base.errors import InputError
 from torchgco.experiments.results.identity import ARITHMETIC, digest, flat
 from torchgco.experiments.results.runs import DIGESTS, MERGED, ROW, Run, find_runs
-from torchgco.experiments.results.success import judged, sound
+from torchgco.experiments.results.success import judged
 from torchgco.experiments.results.variants import labels, task_of_runs
 from torchgco.experiments.statistics.statistics import PAIR, TASK, are_missions, grouped, task_columns
 
@@ -159,7 +159,7 @@ def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
     ).groupby(LAYOUT)
     rivals = groups["solver"].transform("min") < groups["solver"].transform("max")
     rivals &= ~are_missions(rows)  # they have no costs to compare
-    narrow = rows[["cost"]].assign(sound=sound(rows), **{LAYOUT: groups.obj[LAYOUT]})
+    narrow = rows[["cost", "reached"]].assign(**{LAYOUT: groups.obj[LAYOUT]})
     again = judged(narrow, groups["best"].transform("min"), rivals, [LAYOUT])
     return rows.assign(**{name: again[name] for name in ("best_cost", "success", "best_from")})
 

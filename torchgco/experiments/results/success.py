@@ -8,32 +8,27 @@ import numpy as np
 import pandas as pd
 
 from torchgco.experiments.results.folder import COLUMNS
-from torchgco.judging.judge import SUCCESS_VIOLATION, near_best
+from torchgco.judging.judge import near_best
 from torchgco.scenarios import Layouts
-
-
-def sound(trials: pd.DataFrame) -> pd.Series:
-    """Whether each trial reached its goal without violation or collision: success, but for the cost (`judge`)."""
-    clean = (trials["violation"] <= SUCCESS_VIOLATION) & (trials["clearance"] >= 0)
-    return trials["reached"].astype(bool) & clean
 
 
 def judged(rows: pd.DataFrame, best: pd.Series, rivals: pd.Series, layout: Sequence[str]) -> pd.DataFrame:
     """The rows with `best_cost`, `best_from` ("file" or "study") and `success`.
 
     Args:
-        rows: with columns cost and sound.
+        rows: with columns cost and reached.
         best: best cost of the layout's file, by row; NaN where there is none.
-        rivals: by row, whether several solvers flew the layout; then the cheapest sound row replaces a missing `best`.
+        rivals: by row, whether several solvers flew the layout; then the cheapest that reached replaces a missing
+            `best`.
         layout: columns that name a layout.
 
     Where no best cost is known (a single solver, none in the file) success is NA.
     """
-    is_sound = rows["sound"].astype(bool)
-    cheapest = rows.assign(_cost=rows["cost"].where(is_sound)).groupby(list(layout), dropna=False)["_cost"]
+    reached = rows["reached"].astype(bool)
+    cheapest = rows.assign(_cost=rows["cost"].where(reached)).groupby(list(layout), dropna=False)["_cost"]
     filled = best.where(best.notna() | ~rivals, cheapest.transform("min")).astype(float)
     source = pd.Series(None, index=rows.index, dtype=object).mask(rivals, "study").mask(best.notna(), "file")
-    success = (is_sound & near_best(rows["cost"], filled)).astype("boolean")
+    success = (reached & near_best(rows["cost"], filled)).astype("boolean")
     return rows.assign(best_cost=filled, success=success.where(source.notna(), pd.NA), best_from=source)
 
 
@@ -46,5 +41,5 @@ def with_success(rows: pd.DataFrame, layouts: Layouts | None, solvers: int) -> p
     if layouts is not None and layouts.best_cost is not None:
         best = rows["layout"].map(dict(zip(layouts.ids.tolist(), layouts.best_cost, strict=True))).astype(float)
     rivals = pd.Series(solvers > 1, index=rows.index)
-    more = [name for name in rows.columns if name not in COLUMNS and name != "sound"]
+    more = [name for name in rows.columns if name not in COLUMNS]
     return judged(rows, best, rivals, ["layout"]).reindex(columns=[*COLUMNS, *more])

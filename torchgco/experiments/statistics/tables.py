@@ -32,6 +32,7 @@ class Kind:
         of: said before the name of a task.
         statuses: whether statuses are counted in a table of their own.
         effort_note: what is said below the effort of a task, from its summary.
+        more_rates: further columns of rates, from a summary.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Kind:
     of: str = ""
     statuses: bool = False
     effort_note: Callable[[pd.DataFrame], str] = lambda task: ""
+    more_rates: Callable[[pd.DataFrame], Columns] = lambda task: {}
 
     def text(self, summary: pd.DataFrame, paired: pd.DataFrame) -> str:
         """The report for a terminal, some 120 columns wide: rates, effort, statuses and comparisons of each task.
@@ -57,7 +59,7 @@ class Kind:
         for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
             seeds, swept = dict.fromkeys(seed for held in task["seed"] for seed in held.split()), swept_of(task)
             blocks.append(f"{self.of}{scenario} ({model}), seed {', '.join(seeds)}")
-            blocks.append(_lines(task, swept, solver() | self.rates))
+            blocks.append(_lines(task, swept, solver() | self.rates | self.more_rates(task)))
             blocks.append(_lines(task, swept, solver() | self.effort) + self.effort_note(task))
             if self.statuses:
                 blocks.append(_lines(task, swept, solver() | _statuses(task)))
@@ -68,7 +70,8 @@ class Kind:
     def printed(self, summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
         """The tables that a paper prints: rates and effort, and comparisons where there are any."""
         effort = {head: self.effort[head] for head in self.paper}
-        tables = [_printed(summary, solver() | self.rates | effort), _printed(paired[paired["n"] > 0], self.compared)]
+        rates = solver() | self.rates | self.more_rates(summary)
+        tables = [_printed(summary, rates | effort), _printed(paired[paired["n"] > 0], self.compared)]
         return [table for table in tables if len(table)]
 
 
