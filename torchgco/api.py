@@ -219,8 +219,9 @@ def _warn_of_contact(problem: Problem, solution: Solution) -> None:
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
         warnings.warn(
-            f"{len(touching)} of {problem.B} trajectories are INFEASIBLE, as they touch an obstacle between the knots, at "
-            f"which all constraints hold: problem {named} (to_frame(problem) has their clearance; shorter time steps help)",
+            f"{len(touching)} of {problem.B} trajectories are INFEASIBLE, as they touch an obstacle between the knots, "
+            f"while all constraints hold at them: problem {named} (to_frame(problem) has their clearance; "
+            "shorter time steps help)",
             ContactWarning,
             stacklevel=3,
         )

@@ -33,6 +33,7 @@ OTHER_START = (
 )
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
+TOUCHES = "All constraints hold at the knots, and the vehicle touches an obstacle between two of them."
 COVERED = "The goal is required, and an obstacle, grown by the vehicle's radius, covers all of it."
 NEARER = (
     "A longer horizon N, weaker limits, or a larger radius of the goal; without required=True the solve tells how near "
@@ -84,10 +85,18 @@ class Facts:
     covered: bool = False
 
     @property
+    def touches(self) -> bool:
+        """Whether it ended badly between the knots alone."""
+        bad = self.status is Status.INFEASIBLE and not self.named
+        return bad and self.clearance is not None and self.clearance < 0
+
+    @property
     def told(self) -> list[str]:
         """Why the solve ended so, in sentences."""
         if self.unmoved:
             return [OTHER_START]
+        if self.touches:
+            return [TOUCHES]
         if self.radius is None and self.missed is not None:
             return [self.status.sentence, COVERED if self.covered else MISSED.format(missed=self.missed)]
         if self.radius is None:
@@ -111,9 +120,9 @@ def advice(facts: Facts) -> list[str]:
         found.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')
     if facts.pathless and not facts.reached:
         found.append("A look at the scene (torchgco.plot): no path to the goal was found between the obstacles.")
-    if facts.status in FITS and facts.clearance is not None and facts.clearance < 0:
+    if facts.touches:
         found.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
-    if facts.status in FITS and facts.reached is False:
+    elif facts.status in FITS and facts.reached is False:
         found.append("A longer horizon N, or a larger terminal weight: the trajectory stops short of the goal.")
     elif facts.missed is not None and facts.status is Status.INFEASIBLE:
         found.append(OTHER_GOAL if facts.covered else NEARER)

@@ -24,6 +24,7 @@ from torchgco.obstacles.inputs import dimension, vehicle_radii
 Interpolation = Literal["smooth", "linear"]
 SEGMENT_STEPS = 0.5  # spacings of the lattice between points at which a segment's distance is looked up
 POINTS_AT_ONCE = 2**16  # points looked up together
+BOUND = 1e-8  # m: more than bounds of distances lie below them
 PIECE = 2**10  # of these along one segment
 
 
@@ -141,7 +142,7 @@ class BoundField(OwnKind):
         that leads out of it, up to where other obstacles touch.
         """
         depths = self.contact_depths.repeat(1, count)
-        depths[:, 0] = torch.maximum(depths[:, 0], torch.minimum(-start, TOUCH * self.vehicle_radius))
+        depths[:, 0] = torch.maximum(depths[:, 0], torch.minimum(BOUND - start, TOUCH * self.vehicle_radius))
         return depths
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
