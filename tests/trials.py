@@ -18,6 +18,7 @@ PLAIN = {
     "feasible": True,
     "reached": True,
     "success": True,
+    "clear_95": True,
     "cost": 100.0,
     "best_cost": 100.0,
     "violation": 1e-6,

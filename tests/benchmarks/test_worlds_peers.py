@@ -85,7 +85,7 @@ def test_a_flight_beyond_its_limit_is_a_row(tmp_path: Path) -> None:
     peers = worlds_peers.Peers(world, Endless(), presets.fatrop_guided(world.problem(0)), None)  # type: ignore[arg-type]
     flight = peers.fly("fatrop", 0, 1)
     row = worlds_peers._judged(world, "fatrop", 0, flight)
-    assert (row["status"], row["seconds"], row["reached"], row["sound"]) == ("TIME_LIMIT", "1", False, False)
+    assert (row["status"], row["seconds"], row["reached"]) == ("TIME_LIMIT", "1", False)
 
 
 def test_nothing_is_guided_among_moving_obstacles(tmp_path: Path) -> None:
@@ -103,13 +103,13 @@ def test_the_table_counts_the_peers() -> None:
     ours = pd.DataFrame({
         "scenario": "woods20", "model": "quadrotor", "seed": 0, "solver": "gco", "status": "CONVERGED",
         "layout": range(4), "layout_digest": digests, "feasible": True, "reached": [True, True, True, False],
-        "success": True, "violation": 0.0, "clearance": 0.1, "cost": best[:4], "best_cost": best[:4],
+        "clear_95": True, "success": True, "violation": 0.0, "clearance": 0.1, "cost": best[:4], "best_cost": best[:4],
         "iterations": 1, "outer_iterations": 1, "guided": 0, "seconds": 0.1,
     })  # fmt: skip
     flown = {"layout": [0, 1, 2, 3, 0], "layout_digest": ["a", "b", "changed", "d", "a"]}
     peers = pd.DataFrame({
         **flown, "world": ["woods20"] * 4 + ["woods40"], "solver": "fatrop", "status": "CONVERGED",
-        "reached": [True, True, True, False, True], "sound": [True, True, True, False, True], "violation": 0.0,
+        "reached": [True, True, True, False, True], "violation": 0.0,
         "clearance": 0.1, "cost": [1.04 * best[0], 1.06 * best[1], best[2], np.nan, 1.0], "iterations": 10,
         "seconds": [1.0, 3.0, 9.0, 120.0, 5.0],
     })  # fmt: skip

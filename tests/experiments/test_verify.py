@@ -115,8 +115,8 @@ def test_the_formats_give_what_was_confirmed_and_what_was_not(form: str, out, fl
 
 
 COLUMNS = [
-    "cost", "violation", "clearance", "clearance_knots", "goal_distance", "feasible", "reached", "success", "best_from",
-    "model", "seed", "version", "device", "dtype", "layout_digest", "settings_digest",
+    "cost", "violation", "clearance", "clearance_knots", "goal_distance", "feasible", "reached", "success", "clear_95",
+    "best_from", "model", "seed", "version", "device", "dtype", "layout_digest", "settings_digest",
 ]  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.problem.problem import Problem
 
-MOST_PIECES = 16  # of a stage: their chords are 256 times as close to a path as the stage's own
+PIECES_AT_MOST = 16  # of a stage: their chords are 256 times as close to a path as the stage's own
 
 
 class Paths(NamedTuple):
@@ -60,13 +60,13 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 def paths(problem: Problem, X: Tensor, U: Tensor) -> list[Paths]:
     """Trajectories X (B, N+1, n), U (B, N, m) in pieces so short that paths leave their chords by at most 1e-3 m.
 
-    A quarter of the bulge is left where a piece is half as long; no stage has more than `MOST_PIECES`. Problems with as
+    A quarter of the bulge is left where a piece is half as long; no stage has more than `PIECES_AT_MOST`. Problems with as
     many pieces are together.
     """
     every = torch.arange(len(X), device=X.device)
     if len(X) == 0 or not bends(problem):
         return [Paths(every, 1, X)]
-    pieces = (bulge(problem, X, U) / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, MOST_PIECES)
+    pieces = (bulge(problem, X, U) / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, PIECES_AT_MOST)
     found = []
     for count in pieces.unique().int().tolist():
         rows = (pieces == count).nonzero().flatten()
