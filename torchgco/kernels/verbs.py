@@ -100,8 +100,9 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     found = chord_clearance(problem, X)
     if not bends(problem):
         return found
-    near = (found < bulge(problem, X, U)).nonzero().flatten()
-    for path in paths(problem.take(near), X[near], U[near]):
+    off = bulge(problem, X, U)
+    near = (found < off).nonzero().flatten()
+    for path in paths(problem.take(near), X[near], U[near], off[near]):
         if path.pieces > 1:
             rows = near[path.rows]
             parts = (constraint.bare for constraint in problem.take(rows).constraints)

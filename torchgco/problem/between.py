@@ -57,16 +57,20 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     return off.square().sum(-1).amax(-1).sqrt()
 
 
-def paths(problem: Problem, X: Tensor, U: Tensor) -> list[Paths]:
+def paths(problem: Problem, X: Tensor, U: Tensor, off: Tensor | None = None) -> list[Paths]:
     """Trajectories X (B, N+1, n), U (B, N, m) in pieces so short that paths leave their chords by at most 1e-3 m.
 
-    A quarter of the bulge is left where a piece is half as long; no stage has more than `PIECES_AT_MOST`. Problems with as
-    many pieces are together.
+    A quarter of the bulge is left where a piece is half as long; no stage has more than `PIECES_AT_MOST`. Problems with
+    as many pieces are together.
+
+    Args:
+        off: their bulges (B,), m, where these are known.
     """
     every = torch.arange(len(X), device=X.device)
     if len(X) == 0 or not bends(problem):
         return [Paths(every, 1, X)]
-    pieces = (bulge(problem, X, U) / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, PIECES_AT_MOST)
+    off = bulge(problem, X, U) if off is None else off
+    pieces = (off / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, PIECES_AT_MOST)
     found = []
     for count in pieces.unique().int().tolist():
         rows = (pieces == count).nonzero().flatten()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.status import STOPPED
 from torchgco.base.tree import copied, put, take
-from torchgco.kernels import path_clearance
+from torchgco.kernels import chord_clearance
 from torchgco.lagrangian.quality import arrive_alike, has_arrived, is_preferred
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
@@ -76,7 +76,7 @@ class Best:
         fits &= arrive_alike(problem, new.best.X, old.best.X)
         if not bool(fits.any()):
             return
-        before, now = (path_clearance(problem, end.best.X, end.best.U) >= 0 for end in (old, new))
+        before, now = (chord_clearance(problem, end.best.X) >= 0 for end in (old, new))
         for at in (fits & (before != now) & (before == preferred)).nonzero().flatten():
             one = take(old if bool(preferred[at]) else new, at.unsqueeze(0))
             kept = self.spare.setdefault(int(rows[at]), one)
