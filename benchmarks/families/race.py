@@ -1,8 +1,9 @@
 """The track of 19 gates for a quadrotor with four rotors, in the least time, with a duration for each leg.
 
 The README of TOGT-Planner gives 17.56 s for the method of Foehn, Romero and Scaramuzza, "Time-optimal planning for
-quadrotor waypoint flight" (Science Robotics, 2021). Gates, start, end and vehicle are retyped from github.com/FSC-Lab/TOGT-Planner (MIT
-licence), resources/racetrack/race_uzh_19wp.yaml and parameters/cpc/cpc_quad.yaml: seven places, 2.7 times around.
+quadrotor waypoint flight" (Science Robotics, 2021). Gates, start, end and vehicle are retyped from
+github.com/FSC-Lab/TOGT-Planner (MIT licence), resources/racetrack/race_uzh_19wp.yaml and
+parameters/cpc/cpc_quad.yaml: seven places, 2.7 times around.
 """
 
 from __future__ import annotations
