@@ -22,6 +22,8 @@ from torchgco import (
     Restarts,
     Solution,
     Spheres,
+    Status,
+    judge,
     presets,
 )
 from torchgco.search import Tube
@@ -156,3 +158,11 @@ def assert_same_bits(a: Solution, b: Solution) -> None:
     for lam_a, lam_b in zip(a.multipliers.lam, b.multipliers.lam, strict=True):
         assert torch.equal(lam_a, lam_b)
     assert torch.equal(a.multipliers.mu, b.multipliers.mu)
+
+
+def at_knots(problem: Problem, solution: Solution) -> list[Status]:
+    """The statuses, CONVERGED for what is INFEASIBLE only because it touches an obstacle between two knots."""
+    verdict = judge(problem, solution.U)
+    alone = (verdict.violation <= 1e-3) & (verdict.clearance < 0.0)
+    pairs = zip(solution.statuses, alone.tolist(), strict=True)
+    return [Status.CONVERGED if touches and one is Status.INFEASIBLE else one for one, touches in pairs]

@@ -70,7 +70,7 @@ MODELS = pytest.mark.parametrize("model", [UNICYCLE, STEPS], ids=["driven", "tra
 def test_it_arrives_behind_a_thick_wall_of_a_map(model: Dynamics) -> None:
     problem = room(model=model)
     found = judge(problem, alone(problem, Tube("maps")).solve(problem, rest(problem)).U)
-    assert bool(found.reached.all())
+    assert bool((found.clear_95 & (found.goal_distance < 0.3)).all()), "nothing clears the ways between the knots"
     assert bool(judge(problem, solve(problem).U).reached.all())
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.status import SOLVED, Status, is_over
 from torchgco.base.tree import put
-from torchgco.kernels import chord_clearance, is_convex
+from torchgco.kernels import is_convex, path_clearance
 from torchgco.lagrangian.quality import is_preferred, leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
@@ -115,7 +115,8 @@ class Converge(Row):
         arrives = ~leaves_goal(problem, new.X, old.X)
         near = new.cost <= old.cost + WORTH * old.cost.abs()
         serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
-        clear = ~(chord_clearance(problem, new.X) < chord_clearance(problem, old.X).clamp(max=0.0))
+        now, before = (path_clearance(problem, one.X, one.U) for one in (new, old))
+        clear = ~(now < before.clamp(max=0.0))
         clear |= old.violation > limit
         search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
 

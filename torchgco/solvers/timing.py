@@ -23,7 +23,7 @@ from torchgco.base.status import Status
 from torchgco.base.tree import put, spread, take
 from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import WrappedCost
-from torchgco.kernels import chord_clearance
+from torchgco.kernels import path_clearance
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.problem.in_time import at_held_times, factors_in, in_time, states_in_time, times_of
@@ -254,7 +254,7 @@ class Timed:
     def _keep(self, rows: Tensor, found: Solution) -> None:
         """Keep what is better than before; iterations add up, and so do records."""
         limit, problem = self.chooser.limit, self.call.problem.take(rows)
-        clear = chord_clearance(problem, found.X) >= 0.0
+        clear = path_clearance(problem, found.X, found.U) >= 0.0
         if "best" not in vars(self):
             self.best, self.clear = found, clear
             return
