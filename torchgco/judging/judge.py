@@ -55,7 +55,7 @@ class Verdict:
     # bool: feasible, and closer to the goal than the goal radius, of a required one 1e-3 m more; False without a goal
     reached: Tensor
     sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
-    gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, between the knots too
+    gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, at or between any knots
 
     def success(self, best_cost: Tensor) -> Tensor:
         """Whether sound, and within 5 % of the best known cost (B,), (B,) bool.
