@@ -185,6 +185,25 @@ def test_a_gate_that_is_not_passed_is_named() -> None:
             assert row_told(gates, row, knot, problem.dynamics) == f"the {what} of gate {g + 1}, "
 
 
+@pytest.mark.parametrize(("along", "knots"), [
+    ([1.0, 1.04], [19, 21]), ([1.0, 1.04], [19, 22]), ([1.0, 1.04], [19, 23]), ([0.02, 1.98], [1, N - 1]),
+])  # fmt: skip
+def test_at_neighbouring_knots_and_at_both_ends(along: list[float], knots: list[int]) -> None:
+    """Of two problems, the second of which ends earlier where its last gate does; and of a third, which has no start."""
+    whole = drawn(3, 2, 2, 1)
+    gates = Gates([[x, 0.0] for x in along], normals=[[1.0, 0.2]] * 2, half_widths=HALF, knots=knots)
+    parts = [gates, ControlBounds(-40.0, 40.0)]
+    horizon, x0 = [N, knots[1] + 1, N], whole.x0.clone()
+    x0[2, 0] = torch.nan
+    problem = Problem(whole.dynamics, whole.cost, parts, x0, N, whole.goal, horizon=horizon)
+    for solver in ("gco", "interior_point"):
+        found = torchgco.solve(problem, solver=solver, verbose=False)
+        assert found.statuses == [Status.CONVERGED] * 2 + [Status.NON_FINITE]
+        part = problem.constraints[0].bare
+        assert [passed_by_hand(found.X[b, :, :2].numpy(), part, b) for b in range(2)] == [2, 2]
+        assert judge(problem, found.U).gates_passed.tolist() == [2, 2, 0]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", ["gco", "interior_point"])
 @pytest.mark.parametrize("among", [False, True])
