@@ -189,7 +189,7 @@ def test_a_gate_that_is_not_passed_is_named() -> None:
     ([1.0, 1.04], [19, 21]), ([1.0, 1.04], [19, 22]), ([1.0, 1.04], [19, 23]), ([0.02, 1.98], [1, N - 1]),
 ])  # fmt: skip
 def test_at_neighbouring_knots_and_at_both_ends(along: list[float], knots: list[int]) -> None:
-    """Of two problems, the second of which ends earlier where its last gate does; and of a third, which has no start."""
+    """Of two problems, the second of which ends where its last gate does; and of a third, which has no start."""
     whole = drawn(3, 2, 2, 1)
     gates = Gates([[x, 0.0] for x in along], normals=[[1.0, 0.2]] * 2, half_widths=HALF, knots=knots)
     parts = [gates, ControlBounds(-40.0, 40.0)]

@@ -101,15 +101,15 @@ def gates_told(problem: Problem, X: Tensor) -> list[str]:
     lines = []
     for part in problem.constraints:
         gates, way = part.bare, passes(part, X)
-        if way is None or bool(way.passed.all()):
+        if way is None or bool(way.passed.all()) or not isinstance(gates, GateBalls | GateSquares):
             continue
         g = int((~way.passed[0]).nonzero()[0])
-        away, size, square = float(way.distance[0, g]), number(float(gates.sizes[0, g])), isinstance(gates, GateSquares)
-        after = " after those before it" if g > 0 else ""
-        told = f"{number(away)} m from its middle, {'half width' if square else 'radius'} {size} m"
+        away, size, square = float(way.distance[0, g]), float(gates.sizes[0, g]), isinstance(gates, GateSquares)
+        told = f"{number(away)} m from its middle, {'half width' if square else 'radius'} {number(size)} m"
         if square:
-            told = f"crossed {told}" if away < np.inf else f"not crossed from behind to ahead of its normal{after}"
-        lines.append(f"gate {g + 1} of {way.passed.shape[1]} isn't passed: {told}")
+            told = f"crossed {told}" if away < np.inf else "not crossed from behind to ahead of its normal"
+        after = "" if g == 0 else " after those before it"
+        lines.append(f"gate {g + 1} of {way.passed.shape[1]} isn't passed{after}: {told}")
     return lines
 
 
