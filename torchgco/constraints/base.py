@@ -20,6 +20,7 @@ from torchgco.costs.base import add_blocks
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 TOUCH = 1.0 - CONTACT_FACTOR  # the same, as a share beneath the full surface
+ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
 
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor

@@ -10,8 +10,12 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
-from torchgco.constraints.base import Constraint, whole
+from torchgco.constraints.base import ADMITTED, Constraint, whole
 from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
+
+# How far, m, a square's plane lies behind and ahead of the knots between which it is crossed: a trajectory that is
+# feasible within the tolerance is still that tolerance away on each side, so that none can stand in the plane.
+ROOM = 2.0 * ADMITTED
 
 
 @dataclass(frozen=True)
@@ -22,9 +26,10 @@ class Gates(Constraint):
         frames = Gates([[2.0, 0, 1], [4, 1, 1]], normals=[[1.0, 0, 0], [0, 1, 0]], half_widths=0.2)
 
     A ball is a row |p - center| <= radius at its knot. A square is crossed from behind to ahead of its normal between
-    its knot and the next: at both the position is inside the prism over the square, before the plane at the first and
-    beyond it at the second, so that the straight line between them crosses the square itself. The search for paths
-    leads through the gates leg by leg.
+    its knot and the next: at both the position is inside the prism over the square, 2 mm behind the plane at the first
+    and 2 mm ahead of it at the second, so that the straight line between them crosses the square itself. The knots
+    before and after these, unless they are another gate's or beyond 1..N, are 6 mm behind and ahead: as far as at a
+    constant speed. The search for paths leads through the gates leg by leg.
 
     Args:
         centers: (G, d), or (B, G, d) one row of gates per problem, m.
@@ -106,7 +111,7 @@ class GateBalls(NormBounds):
 
 @dataclass(frozen=True)
 class GateSquares(Vectors):
-    """Gates that are squares, bound: rows A p - b <= 0, per knot those before a plane, or beyond one."""
+    """Gates that are squares, bound: rows A p - b <= 0, per knot those behind a plane, or ahead of one."""
 
     centers: Tensor  # (B, G, d), m
     axes: Tensor  # (B, G, d, d): normal, then the directions of the sides, as rows
@@ -139,11 +144,26 @@ class GateSquares(Vectors):
         (B, G, _), p, half = self.centers.shape, self.slopes.shape[2], self.half_widths.unsqueeze(-1)
         normal, sides = self.axes[:, :, :1], self.axes[:, :, 1:]
         each = torch.arange(B, device=self.centers.device).unsqueeze(-1)
-        for beyond, sign in ((0, 1.0), (1, -1.0)):
+        for ahead, sign in ((0, 1.0), (1, -1.0)):
             rows = torch.cat((sign * normal, sides, -sides), dim=2)  # (B, G, p, d)
-            room = torch.cat((torch.zeros_like(half), half.expand(B, G, p - 1)), dim=-1)
-            at = each, self.places - 1 + beyond
-            self.slopes[at], self.limits[at] = rows, room + (rows @ self.centers.unsqueeze(-1))[..., 0]
+            room = torch.cat((torch.full_like(half, -ROOM), half.expand(B, G, p - 1)), dim=-1)
+            limits = room + (rows @ self.centers.unsqueeze(-1))[..., 0]
+            at = each, self.places - 1 + ahead
+            self.slopes[at], self.limits[at] = rows, limits
+            b, g, k = self._beside(ahead)
+            # A knot may lie after one gate and before the next: its rows of the two are different ones.
+            self.slopes[b, k - 1, ahead], self.limits[b, k - 1, ahead] = rows[b, g, 0], limits[b, g, 0] - 2.0 * ROOM
+
+    def _beside(self, ahead: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The gates, each as b and g, with a knot k behind or ahead of theirs that is no gate's own."""
+        N = self.slopes.shape[1]
+        own = torch.zeros(len(self.places), N + 2, dtype=torch.bool, device=self.places.device)
+        own[:, 0] = own[:, N + 1] = True
+        for shift in (0, 1):
+            own.scatter_(1, self.places + shift, True)
+        knots = self.places + (2 if ahead else -1)
+        b, g = (~own.gather(1, knots)).nonzero(as_tuple=True)
+        return b, g, knots[b, g]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return (self.slopes * self._vectors(X, U).unsqueeze(-2)).sum(-1) - self.limits

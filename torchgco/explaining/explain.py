@@ -15,7 +15,7 @@ from torchgco.explaining.account import Account
 from torchgco.explaining.advice import Facts, advice, tells_to_record
 from torchgco.explaining.barred import goal_facts, map_facts
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
-from torchgco.explaining.places import caught_told, number, place_told
+from torchgco.explaining.places import caught_told, gates_told, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
 from torchgco.lagrangian.unmoved import unmoved
@@ -168,6 +168,7 @@ def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]
     lines += _duration(solved, b, one)
     worst = place_told(one.problem, one.X, one.U, one.t)
     lines.append("no constraint is violated" if worst is None else f"violated most: {worst}")
+    lines += gates_told(one.held, one.full_X)
     if facts.clearance is not None and facts.clearance < float("inf"):
         side = "touches an obstacle" if facts.clearance < 0 else "clear of obstacles"
         lines.append(f"{side}: {number(facts.clearance)} m to contact, between the knots too")

@@ -14,6 +14,7 @@ from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.norms import Cone, NormBounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import controls_of, states_of
+from torchgco.judging.gates import passes
 from torchgco.judging.worst import NO_PLACE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
@@ -86,7 +87,7 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     constraint = problem.constraints[worst["constraint"]]
     length = " m" if constraint.geometric or isinstance(constraint, GoalBall | GateBalls | GateSquares) else ""
     where = knots_told([worst["knot"]], t)
-    row = row_told(constraint, worst["row"], problem.dynamics)
+    row = row_told(constraint, worst["row"], worst["knot"], problem.dynamics)
     return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
 
 
@@ -95,7 +96,24 @@ def constraint_told(constraint: Constraint, i: int) -> str:
     return f"constraints[{i}] ({kind_of(constraint)})"
 
 
-def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
+def gates_told(problem: Problem, X: Tensor) -> list[str]:
+    """The first of each constraint's gates that X (1, N+1, n) doesn't pass after those before it, and why."""
+    lines = []
+    for part in problem.constraints:
+        gates, way = part.bare, passes(part, X)
+        if way is None or bool(way.passed.all()) or not isinstance(gates, GateBalls | GateSquares):
+            continue
+        g = int((~way.passed[0]).nonzero()[0])
+        away, size, square = float(way.distance[0, g]), float(gates.sizes[0, g]), isinstance(gates, GateSquares)
+        told = f"{number(away)} m from its middle, {'half width' if square else 'radius'} {number(size)} m"
+        if square:
+            told = f"crossed {told}" if away < np.inf else "not crossed from behind to ahead of its normal"
+        after = "" if g == 0 else " after those before it"
+        lines.append(f"gate {g + 1} of {way.passed.shape[1]} isn't passed{after}: {told}")
+    return lines
+
+
+def row_told(constraint: Constraint, row: int, knot: int, dynamics: Dynamics) -> str:
     """A row of a constraint: which obstacle, or which bound of which component, by its name where it has one."""
     if isinstance(constraint, BoundBody):
         return "ball {}, obstacle {}, ".format(*divmod(row, constraint.inscribed.absent.shape[1]))
@@ -108,7 +126,9 @@ def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
         kind, of = ("control", controls_of) if constraint.of == "u" else ("state", states_of)
         named = getattr(dynamics, f"{kind}_names")
         return f"{side} bound of {kind} {component}{f' ({of(dynamics)[component].label})' if len(named) else ''}, "
-    if isinstance(constraint, GoalBall | GateBalls):
+    if isinstance(constraint, GateBalls | GateSquares):
+        return _gate_told(constraint, row, knot)
+    if isinstance(constraint, GoalBall):
         return "its radius, "
     if isinstance(constraint, GoalState):
         return f"state {constraint.components.tolist()[row]}, "  # type: ignore[union-attr]
@@ -117,3 +137,14 @@ def row_told(constraint: Constraint, row: int, dynamics: Dynamics) -> str:
         places = listed(constraint.components.tolist())  # type: ignore[union-attr]
         return f"{what} {'controls' if constraint.of == 'u' else 'states'} {places}, "
     return f"row {row}, "
+
+
+def _gate_told(gates: GateBalls | GateSquares, row: int, knot: int) -> str:
+    """Which gate a row of a knot is of: its radius, or its plane, or one of its sides."""
+    off = knot - gates.places[0]
+    at, what = off == 0, "radius"
+    if isinstance(gates, GateSquares):
+        at |= off == 1
+        what = "side" if row > 0 and bool(at.any()) else "plane"
+        at = at if bool(at.any()) else off == (2 if row > 0 else -1)
+    return f"the {what} of gate {int(at.nonzero()[0]) + 1}, "

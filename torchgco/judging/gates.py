@@ -1,7 +1,8 @@
-"""Whether a trajectory passes its gates, measured between the knots too, by maths of its own."""
+"""Whether a trajectory passes its gates in their order, measured along all of it by maths of its own."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -14,43 +15,80 @@ from torchgco.obstacles.base import ADMITTED
 
 
 class Passes(NamedTuple):
-    """How each problem passes each of its gates, (B, G)."""
+    """How each problem passes each of its gates, (B, G), after those before it."""
 
-    distance: Tensor  # m: from a ball's centre, or in a square's plane along the farther side; infinite: not crossed
-    passed: Tensor  # bool: at most the gate's radius or half width, and 1e-3 m, away; a square in its direction
+    passed: Tensor  # bool
+    when: Tensor  # int64: the knot by which it is; N + 1 of those that aren't
+    # m: the least on the way through it, from a ball's centre, or in a square's plane along the farther side; of one
+    # that isn't passed, the least after the gates before it; infinite: not crossed, or after one that isn't passed.
+    distance: Tensor
+
+
+class Meetings(NamedTuple):
+    """What a trajectory does at one gate on its way to each knot from 1 to N, (B, N)."""
+
+    time: Tensor  # in knots
+    next: Tensor  # the time from which on the gate after it may be passed
+    distance: Tensor  # m; see `Passes`
+    passes: Tensor  # bool
 
 
 def passes(constraint: Constraint, X: Tensor) -> Passes | None:
-    """How X (B, N+1, n) passes the gates of a constraint; None where it has none.
-
-    A ball is passed on the straight lines from the knot before its own to the knot after it, a square on the one from
-    its knot to the next.
-    """
+    """How X (B, N+1, n), straight from knot to knot, passes the gates of a constraint; None where it has none."""
     gates = constraint.bare
     if isinstance(gates, GateBalls):
-        return _balls(gates, X[..., gates.components])
-    return _squares(gates, X[..., gates.components]) if isinstance(gates, GateSquares) else None
+        return through_balls(gates.centers, gates.sizes, X[..., gates.components])
+    return _through_squares(gates, X[..., gates.components]) if isinstance(gates, GateSquares) else None
 
 
-def _balls(gates: GateBalls, p: Tensor) -> Passes:
-    before, at, after = (_knots(p, gates.places + shift) - gates.centers for shift in (-1, 0, 1))
-    away = torch.minimum(segment_distance(before, at), segment_distance(at, after))
-    return Passes(away, away <= gates.sizes + ADMITTED)
+def through_balls(centers: Tensor, radii: Tensor, p: Tensor) -> Passes:
+    """How positions p (B, N+1, d) pass balls (B, G, d) of radii (B, G): where lines come within these, and 1e-3 m."""
+
+    def meetings(g: int) -> Meetings:
+        center = centers[:, g].unsqueeze(1)
+        away = segment_distance(p[:, :-1] - center, p[:, 1:] - center)
+        time = torch.arange(p.shape[1] - 1, dtype=p.dtype, device=p.device).expand_as(away)
+        return Meetings(time, time, away, away <= radii[:, g : g + 1] + ADMITTED)
+
+    return _in_order(p, map(meetings, range(centers.shape[1])))
 
 
-def _squares(gates: GateSquares, p: Tensor) -> Passes:
-    a, b = (_knots(p, gates.places + shift) - gates.centers for shift in (0, 1))
-    normal, sides = gates.axes[:, :, 0], gates.axes[:, :, 1:]
-    first, second = (normal * a).sum(-1), (normal * b).sum(-1)
-    crosses = (first <= ADMITTED) & (second >= -ADMITTED) & (second > first)
-    share = torch.where(crosses, -first / (second - first), 0.0).clamp(0.0, 1.0)
-    place = a + share.unsqueeze(-1) * (b - a)
-    away = (sides @ place.unsqueeze(-1))[..., 0].abs().amax(-1)
-    away = torch.where(crosses, away, torch.inf)
-    return Passes(away, away <= gates.half_widths + ADMITTED)
+def _through_squares(gates: GateSquares, p: Tensor) -> Passes:
+    """A square is passed from a knot at least 1e-3 m behind its plane to the next one that is as far ahead of it.
+
+    Where the way between them crosses the plane for the last time, it is within the square and 1e-3 m.
+    """
+    k = torch.arange(p.shape[1], device=p.device).expand(p.shape[:2])
+
+    def meetings(g: int) -> Meetings:
+        q = (p - gates.centers[:, g].unsqueeze(1)) @ gates.axes[:, g].mT  # (B, N+1, d): along the normal first
+        s = q[..., 0]
+        side = (s >= ADMITTED).to(k) - (s <= -ADMITTED).to(k)
+        left = torch.where(side != 0, k, 0).cummax(-1).values  # the knot outside the plane that was left last
+        crosses = (side[:, 1:] > 0) & (side.gather(1, left)[:, :-1] < 0)
+        under = torch.where(s <= 0, k, 0).cummax(-1).values[:, :-1]
+        a, b = (q.gather(1, (under + i).unsqueeze(-1).expand_as(q[:, 1:])) for i in (0, 1))
+        share = torch.where(crosses, -a[..., 0] / (b[..., 0] - a[..., 0]), 0.0)
+        away = (a + share.unsqueeze(-1) * (b - a))[..., 1:].abs().amax(-1)
+        away = torch.where(crosses, away, torch.inf)
+        time = under + share  # a square that comes twice, one after the other, is crossed twice
+        later = torch.nextafter(time, torch.full_like(time, torch.inf))
+        return Meetings(time, later, away, away <= gates.half_widths[:, g : g + 1] + ADMITTED)
+
+    return _in_order(p, map(meetings, range(gates.centers.shape[1])))
 
 
-def _knots(p: Tensor, places: Tensor) -> Tensor:
-    """Positions (B, G, d) at knots (B, G), the first and the last for those beyond."""
-    index = places.clamp(0, p.shape[1] - 1).unsqueeze(-1).expand(-1, -1, p.shape[-1])
-    return p.gather(1, index)
+def _in_order(p: Tensor, gates: Iterable[Meetings]) -> Passes:
+    """The first passage of each gate along p (B, N+1, d) after that of the gate before."""
+    (B, K, _), found = p.shape, []
+    k = torch.arange(K - 1, device=p.device)
+    since, left = p.new_zeros(B, 1), torch.zeros(B, 1, dtype=torch.bool, device=p.device)
+    for time, next_, away, passes in gates:
+        later = (time >= since) & ~left
+        first = torch.where(later & passes, k, K - 1).amin(-1, keepdim=True)  # K - 1: none
+        left = first == K - 1
+        until = torch.where(~passes & (k > first), k, K - 1).amin(-1, keepdim=True)
+        way = later & (left | ((k >= first) & (k < until)))
+        found.append((~left, first + 1, torch.where(way, away, torch.inf).amin(-1, keepdim=True)))
+        since = torch.where(left, since, next_.gather(1, first.clamp(max=K - 2)))
+    return Passes(*(torch.cat(column, dim=1) for column in zip(*found, strict=True)))

@@ -55,7 +55,7 @@ class Verdict:
     # bool: feasible, and closer to the goal than the goal radius, of a required one 1e-3 m more; False without a goal
     reached: Tensor
     clear_95: Tensor  # bool, the paper's notion: clearance_knots >= 0, every other constraint within 1e-3
-    gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, between the knots too
+    gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, at or between any knots
 
     def success(self, best_cost: Tensor) -> Tensor:
         """Whether reached, and within 5 % of the best known cost (B,), (B,) bool.

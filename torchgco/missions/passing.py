@@ -12,6 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.constraints.gates import GateBalls, gates_of
 from torchgco.judging.distances import segment_distance
+from torchgco.judging.gates import through_balls
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 
@@ -69,17 +70,7 @@ class Passing(PerElement):
             its middle on the way through it, m, or until the end; infinite for those after a gate that isn't passed.
         """
         G, T = self.radii.shape[1], len(p)
-        when, distance = torch.full((G,), T), torch.full((G,), torch.inf, dtype=p.dtype)
-        first = 0
-        for g in range(G if T > 1 else 0):
-            away = segment_distance(p[first:-1] - self.centers[0, g], p[first + 1 :] - self.centers[0, g])
-            inside = away <= self.radii[0, g] + ADMITTED
-            if not bool(inside.any()):
-                distance[g] = away.min()
-                break
-            enters = int(inside.int().argmax())
-            outside = (~inside[enters:]).nonzero()
-            leaves = enters + int(outside[0]) if len(outside) else len(inside)
-            when[g], distance[g] = first + enters + 1, away[enters:leaves].min()
-            first += enters
-        return when, distance
+        if T < 2:
+            return torch.full((G,), T), torch.full((G,), torch.inf, dtype=p.dtype)
+        way = through_balls(self.centers[:1], self.radii[:1], p.unsqueeze(0))
+        return way.when[0], way.distance[0]

@@ -13,11 +13,11 @@ from torch import Tensor
 from torchgco.base.brief import brief
 from torchgco.base.errors import ScaleWarning, undefined
 from torchgco.base.shapes import MISTAKES, Dimensions
+from torchgco.constraints.base import ADMITTED as ADMITTED
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
 from torchgco.constraints.base import Constraint, add_at, count_of
 
-ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
 TINY = 1e-12  # what is divided by is at least this: lengths and their squares in the search for paths
 

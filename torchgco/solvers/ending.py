@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchgco.base.status import STALLED, UNMOVED, Status, is_over
 from torchgco.ilqr.riccati import BackwardPass
+from torchgco.judging.gates import passes
 from torchgco.kernels import cost_scale, cost_unit, kernels_of, path_clearance
 from torchgco.lagrangian.lagrangian import Lagrangian, binding
 from torchgco.problem.problem import Problem
@@ -114,12 +115,19 @@ def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
 
 
 def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Tensor:
-    """The statuses (B,), but INFEASIBLE where a trajectory keeps all rows and touches an obstacle between two knots."""
+    """The statuses (B,), but INFEASIBLE where a trajectory keeps all rows and isn't feasible between the knots.
+
+    It touches an obstacle there, or doesn't pass a gate, as the tolerance of the rows was too large for that.
+    """
     rows = ((status == Status.CONVERGED) | (status == Status.FEASIBLE)).nonzero().flatten()
     if rows.numel() == 0:
         return status
+    part, X, U = problem.take(rows), X[rows], U[rows]
+    bad = path_clearance(part, X, U) < 0
+    for way in (passes(constraint, X) for constraint in part.constraints):
+        bad = bad if way is None else bad | ~way.passed.all(-1)
     status = status.clone()
-    status[rows[path_clearance(problem.take(rows), X[rows], U[rows]) < 0]] = int(Status.INFEASIBLE)
+    status[rows[bad]] = int(Status.INFEASIBLE)
     return status
 
 
