@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
@@ -20,7 +20,7 @@ from torchgco.constraints.norms import within_norms
 from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.worst import NO_PLACE, kind_of
-from torchgco.kernels import current, kernels_of, open_loop
+from torchgco.kernels import current, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -70,7 +70,7 @@ def solve(
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
             its controls; where starts are free, from its starts too; where the time is, from its states and times.
-        max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
+        max_seconds: time after which the best trajectories so far are returned, without compiling; see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
             and `fatrop`, and without obstacles, or with a free time, `gco`. Default: those that U0 leads to; where the
             time is free, those of its estimate.
@@ -127,7 +127,7 @@ def compare(
         A row per solver and problem, with index `solver` and `element`: the columns of `Solution.to_frame(problem)`;
         `cost_ratio` to the cheapest trajectory of the problem that is as good (its goal reached, where that is judged,
         else its constraints kept), NaN for those that aren't; `seconds` per problem, those of the whole solve divided
-        by B. The first call for a form of problem compiles; the times of a second one are those to compare.
+        by B, without compiling.
 
     Raises:
         InputError: as `solve`; no solver, or two of the same name.
@@ -139,14 +139,13 @@ def compare(
     made = _named_solvers(problem, solvers)
     frames = []
     for name, solver in made.items():
-        kernels_of(problem)
         prepared = solver.prepare(problem)
-        began = time.perf_counter()
+        began = clock.seconds()
         with torch.no_grad():
             found = solve(problem, U0, prepared, seed, max_seconds=max_seconds, verbose=False)
         if problem.x0.device.type == "cuda":
             torch.cuda.synchronize(problem.x0.device)
-        seconds = (time.perf_counter() - began) / max(1, problem.B)
+        seconds = (clock.seconds() - began) / max(1, problem.B)
         frames.append(_judged_frame(problem, found).assign(solver=name, seconds=seconds).reset_index())
     table = pd.concat(frames, ignore_index=True)
     good = table["reached"] if "reached" in table else table["violation"] <= ADMITTED

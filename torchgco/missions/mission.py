@@ -7,7 +7,6 @@ along the plan. A vehicle that reaches its goal, touches an obstacle or diverges
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar
@@ -15,6 +14,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, computing_on
@@ -323,9 +323,9 @@ class Flight:
         ended = torch.zeros_like(self.rows, dtype=torch.bool)
         for j in range(self.substeps):
             seen = measured(self.x, self.noise[self.rows, step])
-            began = time.perf_counter()
+            began = clock.seconds()
             tracking = self.mission.tracker.track(seen, reference, j * self.plant.dt, tracking)
-            seconds = (time.perf_counter() - began) / self.rows.numel()
+            seconds = (clock.seconds() - began) / self.rows.numel()
             flew, x = ~ended, self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
             check_shape(x, tuple(self.x.shape), "plant.advance")
             before, self.x = self.x, torch.where(ended.unsqueeze(-1), self.x, x)

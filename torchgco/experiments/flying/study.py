@@ -263,10 +263,15 @@ def _fly_side_by_side(
         shown = max(shown, finished)
         bar.set_postfix_str(f"solved {int(shown)}/{total}", refresh=True)
 
+    flights = [_flight(study, name, ids, Shared()) for name, ids in batches]
+    bar.set_description("compiling")
+    for name in study.solvers:
+        if first := next((flight for flight in flights if flight.name == name), None):
+            first.compile()
     bar.set_description(f"{workers} processes")
     run_all(
         fly,
-        [_flight(study, name, ids, Shared()) for name, ids in batches],
+        flights,
         workers,
         prepare=prepare,
         options=(torch.get_num_threads(), native()),
