@@ -42,7 +42,6 @@ from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.success import sound, with_success
 from torchgco.kernels import native
 from torchgco.missions import Mission
-from torchgco.plotting.silhouettes import body_of
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.
@@ -160,8 +159,9 @@ def _report(study: _Study, folder: Path) -> str:
     if study.setup.mission is not None:
         return write_mission_report(folder, study.setup, figures=study.plan.figures)
     plan = study.plan
-    body = body_of(study.setup.task(study.layouts.take([0])).problem)
-    return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, body)
+    return write_report(
+        folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, study.setup.vehicle
+    )
 
 
 def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
