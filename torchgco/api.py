@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, Never
 
 import torch
 from torch import Tensor
 
 from torchgco.base import clock
 from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
-from torchgco.base.options import check_value
+from torchgco.base.options import check_value, option_places
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
@@ -54,6 +56,7 @@ def solve(
     record: bool = False,
     verbose: bool | None = None,
     smoothing: float | None = None,
+    **misplaced: Never,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -83,9 +86,12 @@ def solve(
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
-            states X0, or an argument is of another kind or out of its range.
+            states X0, or an argument is of another kind or out of its range; an option of the solver among the
+            arguments, with the place where it belongs.
     """
     check_untransformed("solve")
+    if misplaced:
+        raise _misplaced(problem, "gco" if solver is None else solver, *next(iter(misplaced.items())))
     asked = problem = current_problem(problem)
     warm = _checked(warm)
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
@@ -183,6 +189,19 @@ def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
     if not isinstance(made, Solver):
         raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
     return made.recording() if record else made
+
+
+def _misplaced(problem: Problem, solver: Solver | str, name: str, value: Any) -> InputError:
+    """The error for an argument that `solve` doesn't have: where it is an option of the solver, or one like it."""
+    made = _solver(solver, problem, False)
+    places = [place for place in option_places(made) if place.rpartition(".")[2] == name]
+    if places:
+        whose = f"presets.{solver}(problem)" if isinstance(solver, str) else "your solver"
+        expected = f"an option of the solver in its place: {', '.join(places)} of {whose}, by dataclasses.replace"
+    else:
+        near = get_close_matches(name, inspect.signature(solve).parameters, n=1)
+        expected = "an argument of solve" + "".join(f", such as {other}" for other in near)
+    return InputError(f"solve.{name}", expected, shown(value))
 
 
 def _checked(warm: Any) -> Solution | None:

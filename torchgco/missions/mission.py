@@ -37,6 +37,7 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
+OTHERS = "torchgco.MPC controls other models"
 Duration = Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")]
 Begin = Callable[[Problem, Tensor, int, Tensor], Pilot]
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
@@ -85,7 +86,8 @@ class Mission:
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
         if not isinstance(dynamics, self.model):
-            raise InputError("model", f"{self.model_name}, which this mission plans with", type(dynamics).__name__)
+            expected = f"{self.model_name}, which this mission flies ({OTHERS})"
+            raise InputError("model", expected, type(dynamics).__name__)
         frame, other = airframe_of(dynamics), getattr(self.plant, "airframe", None)
         if isinstance(other, Airframe) and other != frame:
             named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(other, f.name)]
