@@ -86,16 +86,13 @@ def solve(
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
-            states X0, or an argument is of another kind or out of its range; an option of the solver among the
-            arguments, with the place where it belongs.
+            states X0, or an argument is of another kind, out of its range, or one that solve doesn't have.
     """
     check_untransformed("solve")
-    if misplaced:
-        raise _misplaced(problem, "gco" if solver is None else solver, *next(iter(misplaced.items())))
     asked = problem = current_problem(problem)
-    warm = _checked(warm)
+    warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
-    solver = "gco" if solver is None else solver
+    _refuse(misplaced, problem, solver)
     name = solver if isinstance(solver, str) else None
     X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
@@ -110,8 +107,7 @@ def solve(
         watcher.end(found)
     finally:
         watcher.close()
-    if found.account is not None:
-        found = replace(found, account=found.account.asked(asked, name))
+    found = replace(found, account=found.account and found.account.asked(asked, name))
     _warn_of_contact(problem, found)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
@@ -191,17 +187,16 @@ def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
     return made.recording() if record else made
 
 
-def _misplaced(problem: Problem, solver: Solver | str, name: str, value: Any) -> InputError:
-    """The error for an argument that `solve` doesn't have: where it is an option of the solver, or one like it."""
-    made = _solver(solver, problem, False)
-    places = [place for place in option_places(made) if place.rpartition(".")[2] == name]
-    if places:
-        whose = f"presets.{solver}(problem)" if isinstance(solver, str) else "your solver"
-        expected = f"an option of the solver in its place: {', '.join(places)} of {whose}, by dataclasses.replace"
-    else:
+def _refuse(misplaced: Mapping[str, Any], problem: Problem, solver: Solver | str) -> None:
+    """Raise InputError for an argument that `solve` doesn't have: where the solver has it, or which one is like it."""
+    for name, value in misplaced.items():
+        made = option_places(_solver(solver, problem, False))
         near = get_close_matches(name, inspect.signature(solve).parameters, n=1)
         expected = "an argument of solve" + "".join(f", such as {other}" for other in near)
-    return InputError(f"solve.{name}", expected, shown(value))
+        if places := [place for place in made if place.rpartition(".")[2] == name]:
+            whose = f"presets.{solver}(problem)" if isinstance(solver, str) else "your solver"
+            expected = f"an option of the solver in its place: {', '.join(places)} of {whose}, by dataclasses.replace"
+        raise InputError(f"solve.{name}", expected, shown(value))
 
 
 def _checked(warm: Any) -> Solution | None:

@@ -37,7 +37,7 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
-OTHERS = "torchgco.MPC controls other models"
+OTHER_MODELS = "torchgco.MPC controls other models"
 Duration = Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")]
 Begin = Callable[[Problem, Tensor, int, Tensor], Pilot]
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
@@ -86,7 +86,7 @@ class Mission:
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
         if not isinstance(dynamics, self.model):
-            expected = f"{self.model_name}, which this mission flies ({OTHERS})"
+            expected = f"{self.model_name}, which this mission flies ({OTHER_MODELS})"
             raise InputError("model", expected, type(dynamics).__name__)
         frame, other = airframe_of(dynamics), getattr(self.plant, "airframe", None)
         if isinstance(other, Airframe) and other != frame:

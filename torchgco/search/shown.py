@@ -6,7 +6,7 @@ from textwrap import fill
 
 import pandas as pd
 
-WIDTH = 100  # letters of a line
+TEXT_WIDTH = 100  # letters of a line
 
 
 class Sentences(pd.DataFrame):
@@ -16,7 +16,7 @@ class Sentences(pd.DataFrame):
         lines = []
         for *short, text in self.itertuples():
             lines.append("  ".join(map(str, short)))
-            lines.append(fill(str(text), WIDTH, initial_indent="    ", subsequent_indent="    "))
+            lines.append(fill(str(text), TEXT_WIDTH, initial_indent="    ", subsequent_indent="    "))
         return "\n".join(lines)
 
     def _repr_html_(self) -> str | None:
