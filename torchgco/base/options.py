@@ -255,6 +255,7 @@ def option_places(part: Any, inside: str = "") -> list[str]:
     if is_dataclass(part) and not isinstance(part, type):
         held = {field.name: getattr(part, field.name) for field in fields(part) if field.init}
     elif hasattr(part, "keys"):
-        held = dict(part)
+        rows: Any = part
+        held = dict(rows)
     here = {f"{inside}{name}": value for name, value in held.items()}
     return [place for name, value in here.items() for place in (name, *option_places(value, f"{name}."))]

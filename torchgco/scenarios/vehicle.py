@@ -204,6 +204,7 @@ class Vehicle:
             wanted = fitting(layouts.dimension, None if given is None else given.shape[1])
             raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
         whole = self.completed(layouts)
+        assert whole.vehicle_radius is not None and whole.goal_radius is not None and whole.stages is not None
 
         def tensor(value: object) -> Tensor:
             return torch.as_tensor(value, dtype=dtype, device=device)
@@ -243,7 +244,7 @@ class Vehicle:
             Qf=rest * tensor(list(self.terminal_weight)), x_ref=tensor(whole.goal).unsqueeze(1),
             u_ref=tensor(list(self.control_reference)),
         )  # fmt: skip
-        goal, goal_radius = tensor(whole.goal), float(whole.goal_radius)
+        goal, goal_radius = tensor(whole.goal), whole.goal_radius
         center = goal[:, dynamics.position]
         binds = time is not None or layouts.goal_required is True
         end = self._required(goal, center, goal_radius) if binds else Goal(center, goal_radius)
