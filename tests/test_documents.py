@@ -51,7 +51,7 @@ PAGES += [
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n)+")
 PYTHON, SHELL = "python", "sh"
-INSTALLS = ("pip install -e .", "pip install -e '.[cluster]'", "pip install -e '.[ray]'")
+INSTALLS = ("pip install -e .", "pip install 'torchgco[cluster]'", "pip install 'torchgco[ray]'")
 TARGETS = {"quality": quality, "ladder": quality, "oracle": oracle, "benchmark": speed, "benchmark-gpu": speed}
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
+import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, reduce
 from math import inf, nan
 from pathlib import Path
 from typing import Any
@@ -43,8 +45,10 @@ from torchgco import (
     certify,
     judge,
     plan_batch,
+    presets,
     solve,
 )
+from torchgco.base.options import option_places
 from torchgco.baselines import CasADiSolver
 from torchgco.missions import Mission, Planner, RotorPlant
 from torchgco.missions.contact import Contact
@@ -187,7 +191,7 @@ CASES: dict[str, list[Callable[[], object]]] = {
     ],
     "airframe.rotor_time_constant": [lambda: Airframe(rotor_time_constant=0)],
     "control_bounds.lower": [
-        *(lambda b=b: held(ControlBounds(b, 1)) for b in ("a", None, {}, nan, [inf, 0], [0] * 3, [])),
+        *(lambda b=b: held(ControlBounds(b, 1)) for b in ("a", {}, nan, [inf, 0], [0] * 3, [])),
         lambda: held(ControlBounds(1, -1)),
     ],
     "control_bounds.upper": [lambda b=b: held(ControlBounds(-1, b)) for b in (-inf, [1, -inf], True)],
@@ -296,3 +300,30 @@ def test_plain_input_of_other_kinds_is_taken() -> None:
     assert held(ControlBounds(-1, 1, np.array([0, 2]))).constraints[0].knots.tolist() == [0, 2]
     network = torch.nn.Linear(8, 6, dtype=D)
     make(dynamics=FunctionDynamics(lambda x, u: network(torch.cat((x, u), dim=-1)), 6, 2, 0.1))  # a learned model
+
+
+@pytest.mark.parametrize("name", ["gco", "al_ilqr", "interior_point", None])
+def test_an_option_among_the_arguments_is_sent_to_its_place(name: str | None) -> None:
+    """Every option of the solver and of its parts: the place that is named leads to it."""
+    problem, U0, _ = solved()
+    solver: Any = presets.named(name or "gco", problem)
+    for place in option_places(solver):
+        option = place.rpartition(".")[2]
+        if option in inspect.signature(solve).parameters:
+            continue
+        with pytest.raises(InputError) as caught:
+            solve(problem, U0, solver=name, **{option: 12})
+        line = str(caught.value)
+        assert line.startswith(f"solve.{option}: expected an option of the solver in its place: ") and "\n" not in line
+        (named,) = re.findall(r"in its place: (.*) of presets\.", line)
+        assert place in named.split(", ") and line.endswith("got 12")
+        assert all(hasattr(reduce(getattr, one.split(".")[:-1], solver), option) for one in named.split(", "))
+
+
+def test_a_misspelt_argument_is_named_beside_the_one_like_it() -> None:
+    problem, U0, _ = solved()
+    for wrong, like in (("max_second", "max_seconds"), ("warmstart", "warm"), ("Seed", "seed")):
+        with pytest.raises(InputError, match=f"^solve.{wrong}: expected an argument of solve, such as {like}, got 1$"):
+            solve(problem, U0, **{wrong: 1})  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^solve\.qqq: expected an argument of solve, got 1$"):
+        solve(problem, U0, qqq=1)  # type: ignore[call-arg]

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import time
+import inspect
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, Never
 
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
-from torchgco.base.options import check_value
+from torchgco.base.options import check_value, option_places
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.constraints.norms import within_norms
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.worst import NO_PLACE, kind_of
-from torchgco.kernels import current, kernels_of, open_loop
+from torchgco.kernels import current, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -53,6 +55,7 @@ def solve(
     record: bool = False,
     verbose: bool | None = None,
     smoothing: float | None = None,
+    **misplaced: Never,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -69,7 +72,7 @@ def solve(
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
             its controls; where starts are free, from its starts too; where the time is, from its states and times.
-        max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
+        max_seconds: time after which the best trajectories so far are returned, without compiling; see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
             and `fatrop`, and without obstacles, or with a free time, `gco`. Default: those that U0 leads to; where the
             time is free, those of its estimate.
@@ -82,13 +85,13 @@ def solve(
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
-            states X0, or an argument is of another kind or out of its range.
+            states X0, or an argument is of another kind, out of its range, or one that solve doesn't have.
     """
     check_untransformed("solve")
     asked = problem = current_problem(problem)
-    warm = _checked(warm)
+    warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
-    solver = "gco" if solver is None else solver
+    _refuse(misplaced, problem, solver)
     name = solver if isinstance(solver, str) else None
     X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
@@ -103,8 +106,7 @@ def solve(
         watcher.end(found)
     finally:
         watcher.close()
-    if found.account is not None:
-        found = replace(found, account=found.account.asked(asked, name))
+    found = replace(found, account=found.account and found.account.asked(asked, name))
     _warn_of_contact(problem, found)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
@@ -126,7 +128,7 @@ def compare(
         A row per solver and problem, with index `solver` and `element`: the columns of `Solution.to_frame(problem)`;
         `cost_ratio` to the cheapest trajectory of the problem that is as good (its goal reached, where that is judged,
         else its constraints kept), NaN for those that aren't; `seconds` per problem, those of the whole solve divided
-        by B. The first call for a form of problem compiles; the times of a second one are those to compare.
+        by B, without compiling.
 
     Raises:
         InputError: as `solve`; no solver, or two of the same name.
@@ -138,14 +140,13 @@ def compare(
     made = _named_solvers(problem, solvers)
     frames = []
     for name, solver in made.items():
-        kernels_of(problem)
         prepared = solver.prepare(problem)
-        began = time.perf_counter()
+        began = clock.seconds()
         with torch.no_grad():
             found = solve(problem, U0, prepared, seed, max_seconds=max_seconds, verbose=False)
         if problem.x0.device.type == "cuda":
             torch.cuda.synchronize(problem.x0.device)
-        seconds = (time.perf_counter() - began) / max(1, problem.B)
+        seconds = (clock.seconds() - began) / max(1, problem.B)
         frames.append(_judged_frame(problem, found).assign(solver=name, seconds=seconds).reset_index())
     table = pd.concat(frames, ignore_index=True)
     good = table["reached"] if "reached" in table else table["violation"] <= ADMITTED
@@ -183,6 +184,18 @@ def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
     if not isinstance(made, Solver):
         raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
     return made.recording() if record else made
+
+
+def _refuse(misplaced: Mapping[str, Any], problem: Problem, solver: Solver | str) -> None:
+    """Raise InputError for an argument that `solve` doesn't have: where the solver has it, or which one is like it."""
+    for name, value in misplaced.items():
+        made = option_places(_solver(solver, problem, False))
+        near = get_close_matches(name, inspect.signature(solve).parameters, n=1)
+        expected = "an argument of solve" + "".join(f", such as {other}" for other in near)
+        if places := [place for place in made if place.rpartition(".")[2] == name]:
+            whose = f"presets.{solver}(problem)" if isinstance(solver, str) else "your solver"
+            expected = f"an option of the solver in its place: {', '.join(places)} of {whose}, by dataclasses.replace"
+        raise InputError(f"solve.{name}", expected, shown(value))
 
 
 def _checked(warm: Any) -> Solution | None:

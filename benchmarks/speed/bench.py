@@ -13,6 +13,7 @@ import torch
 
 from benchmarks.speed.results import MEASURED, Results
 from benchmarks.speed.sizes import Sizes
+from torchgco.base import clock
 from torchgco.experiments.config.build import Setup, compose
 from torchgco.judging.judge import Verdict
 from torchgco.kernels import kernels_of
@@ -93,18 +94,19 @@ class Bench:
         self.row(section, case, "all", "left out: would take", seconds, "s")
         return False
 
-    def timed(self, work: Callable[[], T]) -> tuple[T, Took]:
-        """The result of `work`, and its time, until the device has finished.
+    def timed(self, work: Callable[[], T], compiling: bool = False) -> tuple[T, Took]:
+        """The result of `work`, and its time, until the device has finished, with or without tracing and compiling.
 
         Python's garbage is collected before, not in the middle: most of it is of the peers' models.
         """
         gc.collect()
         gc.disable()
         self.wait()
-        processor, wall = time.process_time(), time.perf_counter()
+        clocks = (time.process_time, time.perf_counter) if compiling else (clock.processor_seconds, clock.seconds)
+        began = [now() for now in clocks]
         result = work()
         self.wait()
-        processor, wall = time.process_time() - processor, time.perf_counter() - wall
+        processor, wall = (now() - before for now, before in zip(clocks, began, strict=True))
         gc.enable()
         return result, Took(wall if self.device == "cuda" else processor, wall)
 

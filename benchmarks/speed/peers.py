@@ -100,7 +100,7 @@ class CasADiPeer(Peer):
     @classmethod
     def ready(cls, bench: Bench, name: str, task: Task) -> CasADiPeer:
         solver = bench.setup(f"solver={name}", *_model(task)).solver
-        prepared, took = bench.timed(lambda: solver.prepare(task.problem))
+        prepared, took = bench.timed(lambda: solver.prepare(task.problem), compiling=True)
         if isinstance(solver, GuidedCasADi):
             warm = first(task, 1)
             solver.guess(warm.problem, warm.U0)  # compiles

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, inf
@@ -20,7 +21,9 @@ from torchgco import (
     FunctionCost,
     FunctionDynamics,
     InputError,
+    NormBounds,
     Problem,
+    RateBounds,
     StateBounds,
     Status,
     kernels,
@@ -29,6 +32,7 @@ from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
 from torchgco.kernels import EagerWarning, current
+from torchgco.scenarios import Layouts
 
 D = torch.float64
 STEPS = 20
@@ -164,3 +168,55 @@ def test_bounds_by_knot_do_not_fit_a_problem_of_another_length() -> None:
     assert point(bounds).constraints[0].value is not None
     with pytest.raises(InputError, match=r"control_bounds.lower: expected shape|control_bounds.upper: expected shape"):
         point(bounds, stages=15)
+
+
+KINDS = {StateBounds: 4, ControlBounds: 2, RateBounds: 2}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(6))
+def test_none_is_no_bound(kind: Any, seed: int) -> None:
+    """For one component or for all, of each problem, and at each knot; what is bound is what infinity gives."""
+    draw, size = torch.Generator().manual_seed(seed), KINDS[kind]
+    K = STEPS if kind is not RateBounds else STEPS - 1
+    shape = [(size,), (2, size), (2, K, size)][seed % 3]
+    numbers = [sign * (1.0 + torch.rand(shape, generator=draw, dtype=D)) for sign in (-1.0, 1.0)]
+    free = [torch.rand(shape, generator=draw) < 0.5 for _ in numbers]
+    for some in free:
+        some.view(-1, size)[:, 0] = False
+    infinite = [bound.masked_fill(none, sign * inf) for bound, none, sign in zip(numbers, free, (-1, 1), strict=True)]
+    given = [with_none(bound.tolist()) for bound in infinite]
+    for lower, upper in (given, map(as_objects, given), [tuple(given[0]), given[1]], [None, given[1]]):
+        expected = [-inf if lower is None else infinite[0], infinite[1]]
+        (bound,), (other,) = (point(kind(*both)).constraints for both in ((lower, upper), expected))
+        assert torch.equal(bound.lower, other.lower) and torch.equal(bound.upper, other.upper)
+        X, U = (torch.randn(2, k, n, generator=draw, dtype=D) for k, n in ((STEPS + 1, 4), (STEPS, 2)))
+        assert torch.equal(bound.value(X, U), other.value(X, U))
+
+
+def with_none(value: Any) -> Any:
+    return [with_none(one) for one in value] if isinstance(value, list) else value if abs(value) < inf else None
+
+
+def as_objects(value: Any) -> Any:
+    return np.array(value, dtype=object)
+
+
+def test_none_is_no_bound_of_norms_layouts_and_compiled_problems() -> None:
+    (norms,) = point(NormBounds("u", lower=[None, 0.5], upper=[2.0, None])).constraints
+    (same,) = point(NormBounds("u", lower=[0.0, 0.5], upper=[2.0, inf])).constraints
+    assert torch.equal(norms.lower, same.lower) and torch.equal(norms.upper, same.upper)
+    layouts = Layouts(np.zeros((1, 1, 2)), np.ones((1, 1)), control_lower=[None, -1], control_upper=[2, None])
+    assert layouts.control_lower is not None and layouts.control_upper is not None
+    assert layouts.control_lower.tolist() == [-inf, -1] and layouts.control_upper.tolist() == [2, inf]
+    mpc = torchgco.compile(point(ControlBounds([None, -1.0], [1.0, None]), B=1))
+    mpc.numbers["lower"], mpc.numbers["upper"] = [None, -2.0], [2.0, None]
+    assert mpc.numbers["lower"].tolist() == [[-inf, -2.0]] and mpc.numbers["upper"].tolist() == [[2.0, inf]]
+    with pytest.raises(InputError, match="infinity in components that were infinite"):
+        mpc(upper=[2.0, 2.0])
+
+
+@pytest.mark.parametrize("wrong", [[None, None], None])
+def test_no_bound_at_all_is_refused_as_before(wrong: Any) -> None:
+    with pytest.raises(InputError, match="control_bounds: expected at least one finite bound"):
+        point(ControlBounds(wrong, wrong))

@@ -11,12 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tqdm import tqdm
 
 import torchgco
 from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem_line
 from torchgco import kernels
-from torchgco.experiments.config.build import compose
+from torchgco.experiments.config.build import compose, compose_config
 from torchgco.experiments.config.groups import options_of
 from torchgco.experiments.flying import progress, study
 from torchgco.experiments.results.folder import COLUMNS
@@ -26,6 +27,7 @@ from torchgco.solvers.augmented_lagrangian import OuterLoop
 
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
+PLACES = [(at, then) for at in range(4) for then in range(at, 4)]
 # Runs the command with a standard output that nobody reads.
 PIPE = """
 import os, sys
@@ -188,6 +190,22 @@ def test_version_and_help(run) -> None:
         (listed,) = re.findall(rf"^  {group} +((?:.*\n {{18}})*.*)", out, re.MULTILINE)
         assert set(re.findall(r"\w+", listed)) == set(options_of(group))
     assert "forest*," in out and "walls*," in run("--help", "scenario=walls")[1]
+
+
+WHERE = [[], ["model=planar", "scenario=planar_trap"], ["solver=gco_max", "experiment=mission"], ["experiment=race"]]
+
+
+@pytest.mark.parametrize("words", WHERE)
+def test_all_keys_are_printed_with_their_values(words: list[str], run) -> None:
+    code, out, err = run("--cfg", "job", "--resolve", *words)
+    assert code == 0, err
+    assert "${" not in out and OmegaConf.to_container(OmegaConf.create(out)) == compose_config(words)
+
+
+def test_flags_may_stand_between_words(run) -> None:
+    words, flags = ["scenario=walls", "seed=3", "study.layouts=2"], ["--cfg", "job", "-p", "study"]
+    wholes = [run(*words[:at], *flags[:2], *words[at:then], *flags[2:], *words[then:]) for at, then in PLACES]
+    assert len(set(wholes)) == 1 and wholes[0][0] == 0 and "layouts: 2" in wholes[0][1]
 
 
 @pytest.mark.slow

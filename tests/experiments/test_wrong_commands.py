@@ -190,6 +190,22 @@ def test_a_group_without_an_option_is_refused_in_python_too() -> None:
         compose(["scenario=null"])
 
 
+@pytest.mark.parametrize("word", ["--config-dir", "--config-dir=mine", "-cd=mine", "--multirun"])
+def test_python_is_told_what_stands_for_a_flag(word: str) -> None:
+    with pytest.raises(InputError, match=r"^overrides: expected KEY=VALUE or GROUP=OPTION") as caught:
+        compose([word, "mine"])
+    assert ("hydra.searchpath=[file://FOLDER]" in str(caught.value)) == ("config" in word)
+
+
+MISSIONS = [["model=unicycle"], ["model=unicycle", "scenario=planar_random"], ["model=car", "scenario=yard"]]
+
+
+@pytest.mark.parametrize("words", MISSIONS)
+def test_missions_of_other_models_name_what_flies_them(words: list[str]) -> None:
+    with pytest.raises(InputError, match=r"torchgco\.MPC controls other models"):
+        compose(["mission=default", "plant=rotors", *words])
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_the_largest_seed_and_the_current_folder_are_accepted(run, tmp_path) -> None:

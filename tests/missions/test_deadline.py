@@ -30,11 +30,11 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     looks: list[int] = []
     seconds = count()
 
-    def monotonic() -> float:
+    def later() -> float:
         looks.append(1)
         return float(next(seconds))
 
-    monkeypatch.setattr(contracts, "time", SimpleNamespace(monotonic=monotonic))
+    monkeypatch.setattr(contracts, "clock", SimpleNamespace(seconds=later))
     return looks
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from dataclasses import fields, replace
 from typing import Any
 
@@ -319,3 +320,17 @@ def test_a_problem_has_the_rows_of_its_kind() -> None:
     for kind, constraints in kinds.items():
         problem = replace(bodies, constraints=constraints)
         assert presets.gco(problem).table(problem)["name"].tolist() == rows[kind]
+
+
+@pytest.mark.parametrize("name", ["gco", "gco_fast", "gco_max"])
+def test_a_table_is_a_mapping_of_its_rows_and_prints_whole(name: str) -> None:
+    solver = presets.PRESETS[name](3)
+    assert isinstance(solver, Restarts)
+    rows = {**solver.passes}
+    assert list(rows) == list(solver.passes.names) and tuple(rows.values()) == tuple(solver.passes)
+    first, last = next(iter(rows)), rows.popitem()[0]
+    assert replace(solver, passes=rows).passes == solver.passes.changed(**{last: None})
+    assert replace(solver, passes={**solver.passes, first: rows[first]}) == solver
+    table = solver.table()
+    for text in table.to_numpy().flatten():
+        assert " ".join(text.split()) in " ".join(repr(table).split()) and html.escape(text) in table._repr_html_()

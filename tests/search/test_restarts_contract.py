@@ -74,7 +74,7 @@ def test_progress_names_the_candidates_that_are_solved() -> None:
 def test_the_search_for_paths_ends_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """The clock passes the limit while the first candidates are solved: no later step begins."""
     now = 0.0
-    monkeypatch.setattr(contracts, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(contracts, "clock", SimpleNamespace(seconds=lambda: now))
     solved, steps = Candidates.solved, []
 
     def slow(self: Candidates, *args, **options) -> Candidates:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, reduce
 from itertools import pairwise
 from types import NoneType, UnionType
@@ -247,3 +247,15 @@ PLAIN_RULES: dict[Any, Rule] = {
     Callable: Rule(callable, "a function", "functions"),
     Tensor: Rule(lambda v: isinstance(v, Tensor), "a tensor", "tensors"),
 }
+
+
+def option_places(part: Any, inside: str = "") -> list[str]:
+    """The options of an object and of its parts, such as "passes.paths.num_paths"; parts have fields or keys."""
+    held = dict[str, Any]()
+    if is_dataclass(part) and not isinstance(part, type):
+        held = {field.name: getattr(part, field.name) for field in fields(part) if field.init}
+    elif hasattr(part, "keys"):
+        rows: Any = part
+        held = dict(rows)
+    here = {f"{inside}{name}": value for name, value in held.items()}
+    return [place for name, value in here.items() for place in (name, *option_places(value, f"{name}."))]

@@ -47,6 +47,15 @@ def tensor(value: Any, field: str, like: Tensor) -> Tensor:
         raise InputError(field, "numbers", shown(value)) from None
 
 
+def bound_of(value: Any, none: float) -> Any:
+    """A bound as it was given, with the number `none` in the place of each None: no bound."""
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [bound_of(one, none) for one in value]
+    return none if value is None else value
+
+
 def as_states(x0: Any) -> Tensor:
     """States (B, n) from a tensor, an array or lists of numbers; a single state (n,) is a batch of one.
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.clock import setting_up
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.status import Status
@@ -70,6 +71,7 @@ class CasADiSolver(Solver):
         problem = current_problem(problem)
         return self if problem.time is not None else self._prepared(problem)
 
+    @setting_up()
     def _prepared(self, problem: Problem) -> PreparedCasADi:
         # Not where the solver is made: presets and commands name it also where CasADi isn't installed.
         if find_spec("casadi") is None:

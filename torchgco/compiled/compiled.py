@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.api import solve
+from torchgco.base import clock
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import CPU, check_untransformed, computing_on
@@ -61,7 +61,7 @@ class Answer:
     iterations: Tensor  # (B,) int64, of all solves of the call
     violation: Tensor  # (B,): largest violation, metres for lengths
     warm: Tensor  # (B,) bool: whether the solve from the last answer was enough
-    seconds: float  # that the call took
+    seconds: float  # that the call took, without compiling
     t: Tensor | None = None  # (B, N+1): times of the knots where the time is free, s; else None
 
     @property
@@ -207,7 +207,7 @@ class Compiled:
                 receding, else 0. Where the time is free, `elapsed` serves.
             elapsed: where the time is free, the time since the last call, s, by which the horizon has moved: the guess
                 is what is then left of the last trajectories, and of their time. None: 0.
-            max_seconds: after which the iterate so far is returned; looked at in every iteration.
+            max_seconds: after which the iterate so far is returned, without compiling; looked at in every iteration.
             numbers: new numbers by name, for names that are no words, such as "constraints[1].centers".
             named: the same.
 
@@ -215,7 +215,7 @@ class Compiled:
             InputError: an unknown name, numbers of another shape or that the problem can't have, or a call while
                 another thread's runs. Nothing is changed then.
         """
-        began = time.perf_counter()
+        began = clock.seconds()
         if not self._lock.acquire(blocking=False):
             raise InputError("mpc", "one call at a time: a compiled problem per thread", "a call during another one")
         try:
@@ -347,7 +347,7 @@ class Compiled:
                 return self._answer(able & able.all(), began)
         good = late = np.zeros_like(able)
         if able.any():
-            left = math.inf if until == math.inf else max(0.0, until - time.perf_counter())
+            left = math.inf if until == math.inf else max(0.0, until - clock.seconds())
             kept.solve(able, self.interior.warm_barrier, seconds=left)
             status, worst = kept.statuses, kept.violations if kept.engine.measures else self._violation().numpy()
             finite = kept.finite
@@ -400,7 +400,7 @@ class Compiled:
         """A solve by the solver that `compile` was given, from the last answer where a shift is given."""
         now = self._now() if problem is None else problem
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
-        seconds = None if until == math.inf else max(1e-3, until - time.perf_counter())
+        seconds = None if until == math.inf else max(1e-3, until - clock.seconds())
         warm = None if shift is None or self._last is None else later(now, self._last, shift)
         return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
@@ -421,4 +421,4 @@ class Compiled:
         if found is None and isinstance(kept, KeptInTime):
             with _plainly():
                 t = kept.times
-        return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began, t)
+        return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), clock.seconds() - began, t)

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.shapes import bound_of
 from torchgco.base.tree import PerElement, own_mapped
 from torchgco.base.values import Values
 from torchgco.constraints.base import Constraint
@@ -50,6 +51,7 @@ class Number:
         derived: whether kernels read what is computed from it, not the number itself.
         check: says what is wrong with new numbers, (expected, got), or None.
         after: is called when new numbers have been written.
+        none: what None stands for in new numbers; only bounds have some.
         joint: says what is wrong with new numbers, by full names, that are written together; raises or returns as
             `check`.
     """
@@ -62,6 +64,7 @@ class Number:
     after: Callable[[], object] | None = None
     joint: Joint | None = None
     shape: tuple[int, ...] = ()
+    none: float | None = None
 
     def __post_init__(self) -> None:
         first, *last = self.views
@@ -79,6 +82,7 @@ class Number:
         Raises:
             InputError: another shape, no numbers, or numbers that the problem can't have.
         """
+        value = value if self.none is None else bound_of(value, self.none)
         given, shape = as_floats(value, self.name), self.shape
         if given.shape != shape and given.shape != shape[1:]:
             expected = f"shape {shape}" if len(shape) == 1 else f"shape {shape}, or {shape[1:]} for all problems"
@@ -320,7 +324,10 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
 
     fields = {side: (getattr(part, side), partial(check, side=side)) for side in ("lower", "upper")}
     crossed = _crossed(part, name, np.greater, "lower bounds of at most the upper ones")
-    return numbers(name, fields, i, joint=crossed)
+    found = numbers(name, fields, i, joint=crossed)
+    for number, none in zip(found, (-np.inf, np.inf), strict=True):
+        number.none = none
+    return found
 
 
 def _crossed(part: Any, name: str, is_over: Callable[..., Any], expected: str) -> Joint:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_finite, check_shape, tensor
+from torchgco.base.shapes import Dimensions, bound_of, check_finite, check_shape, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots
 
 LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
@@ -22,7 +22,7 @@ class _Bounds(Constraint):
     """lower <= z <= upper, as rows [z - upper, lower - z] of the bounded components.
 
     Bounds are one number for all components, (size,), per problem (B, size), or per knot (B|1, K, size) with a row for
-    each of the K `knots` in their order; infinity means unbounded.
+    each of the K `knots` in their order; infinity or None means unbounded.
 
     Raises:
         InputError: on `Problem(...)`: wrong shape, NaN, bounds crossed, nothing bounded, a lower bound of infinity or
@@ -107,7 +107,7 @@ class _Bounds(Constraint):
     def _checked(self, value: Any, name: str, shape: tuple[int, int, int], dims: Dimensions, refused: float) -> Tensor:
         """A bound as (B|1, size) or (B|1, K|1, size), for the shape (B, K, size)."""
         B, K, size = shape
-        bound = tensor(value, name, dims.like)
+        bound = tensor(bound_of(value, -refused), name, dims.like)
         bound = bound.repeat(size) if bound.dim() == 0 else bound
         bound = bound.unsqueeze(0) if bound.dim() == 1 else bound
         if bound.dim() == 3:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import Dimensions, check_finite, tensor
+from torchgco.base.shapes import Dimensions, bound_of, check_finite, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
@@ -85,8 +85,8 @@ class NormBounds(Vectors):
         kind, components = _chosen(self.of, self.components, ("x", "u"), dims, f"{name}.of")
         knots, K = _knots(self.knots, kind, dims, f"{name}.knots")
         lower, upper = (
-            None if given is None else _per_knot(given, f"{name}.{side}", dims, K)
-            for side, given in (("lower", self.lower), ("upper", self.upper))
+            None if given is None else _per_knot(bound_of(given, none), f"{name}.{side}", dims, K)
+            for side, given, none in (("lower", self.lower, 0.0), ("upper", self.upper, math.inf))
         )
         if lower is not None and not bool((torch.isfinite(lower) & (lower >= 0)).all()):
             raise InputError(f"{name}.lower", "finite numbers of at least 0", lower.tolist())

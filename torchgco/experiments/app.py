@@ -137,10 +137,10 @@ def _command() -> int:
     parser = get_args_parser()
     parser.error = _refuse_flags
     try:
-        words = parser.parse_args().overrides
+        words = parser.parse_intermixed_args().overrides
         check_once(words)
-        typed = dict(zip(words, hydra_words(words), strict=True))
-        sys.argv[1:] = [typed.get(word, word) for word in sys.argv[1:]]  # Hydra's own main reads them
+        # Hydra's own main reads them, and takes no flags between words.
+        sys.argv[1:] = [*(word for word in sys.argv[1:] if word not in words), *hydra_words(words)]
         _run()
     except InputError:
         raise

@@ -7,7 +7,6 @@ plan comes to rest within it. Where no new plan does, the previous one is flown 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.errors import InputError
 from torchgco.exploration.evading import evaded
 from torchgco.exploration.explorer import (
@@ -129,22 +129,22 @@ class Exploration:
                 key = (self.seed, self.ids[b], step)
                 scan = self.sensor.scan(scout.world, x[b, :3].numpy(), x[b, 6:10].numpy(), step * self.dt, key)
                 scan = scan.seen_from(x[b, 6:10].numpy(), measured[b, :3].numpy(), measured[b, 6:10].numpy())
-                began = time.perf_counter()
+                began = clock.seconds()
                 keep = scout.movers.observe(scan, scout.seen, step * self.dt)
                 scan = scan if keep.all() else scan.take(keep)
                 changed = scout.seen.add(scan, self.sensor.range, 3.0 * self.sensor.noise)
                 scout.movers.note(scout.seen, changed)
                 scout.changed = np.concatenate([scout.changed, changed])
-                mapped = time.perf_counter()
+                mapped = clock.seconds()
                 scout.seen.remeasure(scout.changed)
-                took = [mapped - began, time.perf_counter() - mapped]
+                took = [mapped - began, clock.seconds() - mapped]
             scout.log.changes.append((scout.changed, scout.seen.state.reshape(-1)[scout.changed]))
             scout.changed = scout.changed[:0]
             scout.seconds = dict(zip(TIMED_PARTS, (*took, 0.0), strict=True))
 
     def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
         """Plans from plants measured at x (B, 17), and the seconds that they took, those of the maps among them."""
-        began = time.perf_counter()
+        began = clock.seconds()
         sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
         bias = self.planner.estimated(x, before, self.dt)
         for scout in self.scouts:
@@ -162,7 +162,7 @@ class Exploration:
         plan = self._chosen(problem, kept, len(seeds))
         for b, scout in enumerate(self.scouts):
             scout.log.safe.append(plan.X[b, :, :3].numpy().copy())
-        return replace(plan, measured=x, bias=bias, step=step), time.perf_counter() - began + sensed
+        return replace(plan, measured=x, bias=bias, step=step), clock.seconds() - began + sensed
 
     def parts(self) -> dict[str, Tensor]:
         """Seconds of the last period by part, (B,)."""
@@ -203,7 +203,7 @@ class Exploration:
         planes, room, allowed, inside, regions = [], [], [], [], []
         for seed in seeds:
             for b, scout in enumerate(self.scouts):
-                began, keep = time.perf_counter(), scout.keep
+                began, keep = clock.seconds(), scout.keep
                 knots = np.clip(seed[b].numpy(), *scout.seen.box(keep))
                 own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
                 if self.explorer.movers != "none":
@@ -221,7 +221,7 @@ class Exploration:
                 )
                 for parts, part in new:
                     parts.append(part)
-                scout.seconds["field_seconds"] += time.perf_counter() - began
+                scout.seconds["field_seconds"] += clock.seconds() - began
         form = PlanningForm(self.explorer, self.planner, self.whole.take(torch.arange(self.whole.B).repeat(C)))
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, inside, allowed, regions)]
         return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack)

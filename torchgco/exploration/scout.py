@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from torchgco.base import clock
 from torchgco.exploration.explorer import Explorer
 from torchgco.exploration.movers import Movers, Moving, nothing
 from torchgco.exploration.reference import between, motion, swings, taut
@@ -74,7 +74,7 @@ class Scout:
 
     def seek(self, position: np.ndarray) -> None:
         """Find the path to the goal from a position (3,), m, and the part of it that is known to be free."""
-        began = time.perf_counter()
+        began = clock.seconds()
         self._search(position)
         keep = self.keep
         points = _halved(np.concatenate([position[None], self.path[1:]]))
@@ -85,7 +85,7 @@ class Scout:
         free = points[: blocked[0] if len(blocked) else len(points)]
         self.corners = taut(free, lambda p: bool((self.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
         self._wait(position, points, gaps)
-        self.seconds["search_seconds"] += time.perf_counter() - began
+        self.seconds["search_seconds"] += clock.seconds() - began
 
     def _search(self, position: np.ndarray) -> None:
         """The path to the goal; where none is found, with less margin from now on, for a while.

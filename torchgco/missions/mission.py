@@ -7,7 +7,6 @@ along the plan. A vehicle that reaches its goal, touches an obstacle or diverges
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar
@@ -15,6 +14,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, computing_on
@@ -37,6 +37,7 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
+OTHER_MODELS = "torchgco.MPC controls other models"
 Duration = Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")]
 Begin = Callable[[Problem, Tensor, int, Tensor], Pilot]
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
@@ -85,7 +86,8 @@ class Mission:
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
         if not isinstance(dynamics, self.model):
-            raise InputError("model", f"{self.model_name}, which this mission plans with", type(dynamics).__name__)
+            expected = f"{self.model_name}, which this mission flies ({OTHER_MODELS})"
+            raise InputError("model", expected, type(dynamics).__name__)
         frame, other = airframe_of(dynamics), getattr(self.plant, "airframe", None)
         if isinstance(other, Airframe) and other != frame:
             named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(other, f.name)]
@@ -323,9 +325,9 @@ class Flight:
         ended = torch.zeros_like(self.rows, dtype=torch.bool)
         for j in range(self.substeps):
             seen = measured(self.x, self.noise[self.rows, step])
-            began = time.perf_counter()
+            began = clock.seconds()
             tracking = self.mission.tracker.track(seen, reference, j * self.plant.dt, tracking)
-            seconds = (time.perf_counter() - began) / self.rows.numel()
+            seconds = (clock.seconds() - began) / self.rows.numel()
             flew, x = ~ended, self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
             check_shape(x, tuple(self.x.shape), "plant.advance")
             before, self.x = self.x, torch.where(ended.unsqueeze(-1), self.x, x)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -11,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.options import NonNegative, PositiveOrInfinite, Seconds, Share, check_options
 from torchgco.base.tree import Rows, put, take
 from torchgco.constraints.base import Constraint
@@ -163,14 +163,14 @@ class Planner:
         ids: Tensor,
         measured: Tensor | None = None,
     ) -> tuple[Plan, Problem, float]:
-        """Plans from plants x (B, 17) at a control step, their problems, and the seconds that the planning took.
+        """Plans from plants x (B, 17) at a control step, their problems, and the seconds that it took to solve them.
 
         Args:
             whole: the problems of the open-loop study; now: those of the plan before, at first of `problem`.
             measured: the states that were measured last, (B, 17), where x is predicted from them; None: x.
         """
         measured = x if measured is None else measured
-        began = time.perf_counter()
+        began = clock.seconds()
         now, margin, bias, U0 = self._posed(whole, now, x, step, before, measured)
         solve = _Solve(self, now, seed, ids, began, self.tolerance + margin.between(whole))
         if before is None:
@@ -179,7 +179,7 @@ class Planner:
             multipliers = before.continued(now)
             U0 = _brought_back(now, before, multipliers) if self.feedback else U0
             plan = solve.next(U0, before, multipliers)
-        return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
+        return replace(plan, measured=measured, bias=bias, step=step), now, clock.seconds() - began
 
     def first(self, whole: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
         """The problems of the first plans from plants x (B, 17), and the solver's solutions, as `plan` makes them."""
@@ -313,7 +313,7 @@ class _Solve:
     def _time_left(self) -> float | None:
         """Seconds that are left of the limit, at least `MIN_SECONDS`; None without a limit."""
         limit = self.planner.max_seconds
-        return None if limit is None else max(MIN_SECONDS, limit - (time.perf_counter() - self.began))
+        return None if limit is None else max(MIN_SECONDS, limit - (clock.seconds() - self.began))
 
     def _keep_former(self, plan: Plan, before: Plan, U: Tensor, multipliers: Multipliers) -> None:
         """Put previous plans, flown one stage later by U, in the place of new ones that are infeasible and worse."""

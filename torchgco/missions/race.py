@@ -7,7 +7,6 @@ the 14 states that a tracker follows: the joint thrust by the mass is the last o
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
@@ -15,6 +14,7 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Meters, NonNegative, Within, check_options
 from torchgco.constraints.base import Constraint
@@ -174,7 +174,7 @@ class Racer:
 
     def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
         """See `Pilot`."""
-        began, now = time.perf_counter(), step * self.period
+        began, now = clock.seconds(), step * self.period
         violation, kept = torch.zeros_like(x[:, 0]), torch.ones_like(x[:, 0], dtype=torch.bool)
         iterations = torch.zeros_like(kept, dtype=torch.int64)
         for passed in self.passing.passed.unique().tolist():
@@ -192,7 +192,7 @@ class Racer:
             plan, cost=self.t[:, -1] - now, violation=violation, shifted=kept, iterations=iterations,
             spacing=self.spacing,
         )  # fmt: skip
-        return plan, time.perf_counter() - began
+        return plan, clock.seconds() - began
 
     def first(self, x: Tensor) -> tuple[Problem, Solution]:
         """The whole problems as planned from plants x (B, 17), and their solutions."""

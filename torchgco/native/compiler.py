@@ -23,6 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
 
+from torchgco.base.clock import setting_up
 from torchgco.base.notices import notice
 from torchgco.base.signals import handled
 from torchgco.native import store
@@ -110,7 +111,8 @@ def build(source: str | Sequence[Unit], flags: Sequence[str] = ()) -> ctypes.CDL
             raise NativeError(
                 "no C compiler found: install gcc or clang, or `pip install ziglang`, or name one in TORCHGCO_CC"
             )
-        library = _load(compiler, units, (*compiler.flags, *flags, *compiler.further))
+        with setting_up():
+            library = _load(compiler, units, (*compiler.flags, *flags, *compiler.further))
         weakref.finalize(library, _ctypes.dlclose, library._handle).atexit = False  # functions of it hold it, too
     _loaded[known] = library  # the most recent one is the last
     store.trim(_loaded, _KEPT)
@@ -369,6 +371,7 @@ def _ended(returncode: int) -> str:
 
 
 @functools.cache
+@setting_up()
 def _find_compiler(named: str | None, usual: str | None, path: str | None, further: str | None) -> Compiler | None:
     for words in _candidates(named, usual):
         place = shutil.which(words[0], path=path)

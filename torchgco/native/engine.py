@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgco.base.clock import setting_up
 from torchgco.base.errors import InputError
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.norms import NormBounds
@@ -57,6 +58,7 @@ class Engine:
         NativeError: no compiler, or it refuses the source.
     """
 
+    @setting_up()
     def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
@@ -88,7 +90,8 @@ class Engine:
     def further(self, name: Hashable, units: Callable[[], Sequence[Unit]]) -> ctypes.CDLL:
         """A further library of this form, which this engine and those with other shared numbers keep."""
         if name not in self._libraries:
-            self._libraries[name] = load(units(), STRUCTURES)
+            with setting_up():
+                self._libraries[name] = load(units(), STRUCTURES)
         return self._libraries[name]
 
     def forget_values(self) -> None:

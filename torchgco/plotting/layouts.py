@@ -275,7 +275,7 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane:
     return drawn
 
 
-def ends(flights: Mapping[str, list[Flight]], boxes: list[np.ndarray], columns: int) -> list[Artist]:
+def ends(scene: Scene, flights: Mapping[str, list[Flight]], boxes: list[np.ndarray], columns: int) -> list[Artist]:
     """Entries of a legend for the ways in which flights end short of the goal without contact.
 
     Args:
@@ -287,7 +287,25 @@ def ends(flights: Mapping[str, list[Flight]], boxes: list[np.ndarray], columns: 
             box, path = boxes[i // columns][:, ABOVE], flown(flight.path)
             if not flight.still:
                 kinds |= _ended(flight, leaving(box, path[:, ABOVE]) is not None)
-    return [Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in MARKED if kind in kinds]
+    return marked(kinds, scene)
+
+
+def marked(kinds: set[str], scene: Scene) -> list[Artist]:
+    """Entries of a legend for these marks; what isn't known to keep clear is not said to."""
+    said = MARKED if scene.sized else MARKED | {"infeasible": INFEASIBLE}
+    return [Line2D([], [], color=INK, label=said[kind], **marker(kind)) for kind in MARKED if kind in kinds]
+
+
+def ends_shown(scene: Scene) -> list[Line2D]:
+    """Entries of a legend for start and goal, where they are known."""
+    point: dict[str, Any] = {"color": INK, "linestyle": "none"}
+    disc = " and its radius" if np.isfinite(scene.goal_radius) else ""
+    shown = (scene.start, "s", 5, "start"), (scene.goal, "*", 10, f"goal{disc}")
+    return [
+        Line2D([], [], marker=mark, markersize=size, label=label, **point)
+        for places, mark, size, label in shown
+        if np.isfinite(places).all(-1).any()
+    ]
 
 
 def _ended(flight: Flight, away: bool) -> set[str]:
@@ -340,11 +358,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str])
         handles.append(
             Line2D([], [], color=colours[solver], label=f"{solver}: stays at the start" if still else solver, **look)
         )
-    disc = " and its radius" if np.isfinite(scene.goal_radius) else ""
-    point: dict[str, Any] = {"color": INK, "linestyle": "none"}
-    handles.append(Line2D([], [], marker="s", markersize=5, label="start", **point))
-    handles.append(Line2D([], [], marker="*", markersize=10, label=f"goal{disc}", **point))
-    handles += [Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in MARKED if kind in drawn]
+    handles += [*ends_shown(scene), *marked(drawn, scene)]
     first = next(iter(flights), "the flight")
     where = f", cut at the height (below: at the y) of {first}" if scene.dimension == 3 else ""
     outline: dict[str, Any] = {"facecolor": "none", "edgecolor": EDGE}

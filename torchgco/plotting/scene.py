@@ -29,7 +29,7 @@ class Scene:
     Args:
         bodies: the obstacles present in each layout.
         start, goal: (L, d), nan where unknown.
-        margin: the vehicle's radius.
+        margin: the vehicle's radius, 0 where unknown.
         goal_radius: nan where unknown.
         dt: s, 0 where unknown: moving obstacles are then drawn where they start.
         ids: (L,) index of each layout in its file or generator.
@@ -48,6 +48,7 @@ class Scene:
     map: DistanceField | None = None
     gates: np.ndarray | None = None
     body: BoundBody | None = None
+    sized: bool = True  # the vehicle's size is known, and with it what is in contact
 
     @property
     def dimension(self) -> int:
@@ -85,6 +86,7 @@ def scene_of(layouts: Arrays, body: BoundBody | None = None) -> Scene:
         map=map_of(layouts),
         gates=gates_in(layouts),
         body=body,
+        sized=body is not None or "vehicle_radius" in layouts,
     )
 
 

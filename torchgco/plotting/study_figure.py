@@ -18,7 +18,7 @@ from matplotlib.ticker import PercentFormatter
 from torchgco.base.errors import InputError
 from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE
-from torchgco.plotting.layouts import draw_layout, ends, flights_of, views
+from torchgco.plotting.layouts import draw_layout, ends, ends_shown, flights_of, views
 from torchgco.plotting.maps import unknown_handles
 from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.scene import Arrays, Scene, scene_of
@@ -82,7 +82,7 @@ def study_figure(
     count = min(len(layouts["radii"]), 2 * form.maps)
     flights = flights_of(scene, {name: np.asarray(X[:count]) for name, X in trajectories.items()}, trials)
     boxes = views(scene, flights, count, min(form.maps, count))
-    handles = _handles(summary, form, scene, ends(flights, boxes, min(form.maps, count)))
+    handles = _handles(summary, form, scene, ends(scene, flights, boxes, min(form.maps, count)))
     figure, maps, charts = _frame(boxes, count, form, handles)
     for i, ax in enumerate(maps):
         draw_layout({ABOVE: ax}, scene, i, flights)
@@ -130,13 +130,13 @@ def _frame(
 
 
 def _handles(summary: pd.DataFrame, form: Print, scene: Scene, ends: list[Artist]) -> list[Artist]:
-    look: dict[str, Any] = {"color": INK, "linestyle": "none", "markersize": 9 * form.thin}
     lines: list[Artist] = []
     for name, colour in solver_colours(summary["solver"]).items():
         dashed: dict[str, Any] = {"color": colour, "linestyle": solver_dash(name), "linewidth": 1.2}
         lines.append(Line2D([], [], label=name, **dashed))
-    marks = {"s": "start", "*": "goal", "X": "contact"}
-    points = [Line2D([], [], marker=mark, label=label, **look) for mark, label in marks.items()]
+    points = [*ends_shown(scene), Line2D([], [], color=INK, marker="X", linestyle="none", label="contact")]
+    for point in points:
+        point.set_markersize(9 * form.thin)
     return [*lines, *points, *ends, *unknown_handles(scene.map)]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import INCREASING, Above, AtMost, Within, check_value
+from torchgco.base.shapes import bound_of
 from torchgco.obstacles.boxes import UNIT_WITHIN
 
 TOO_LARGE = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
@@ -255,10 +256,11 @@ def required(value: Any) -> bool | None:
 
 
 def control_bounds(lower: Any, upper: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Bounds (m,) of the controls, either of them possibly None, infinite where unbounded."""
+    """Bounds (m,) of the controls, either of them possibly None, infinite or None where unbounded."""
     bounds: list[np.ndarray | None] = []
-    for value, field in ((lower, "layouts.control_lower"), (upper, "layouts.control_upper")):
-        bound = None if value is None else array(value, field)
+    both = (lower, "layouts.control_lower", -math.inf), (upper, "layouts.control_upper", math.inf)
+    for value, field, none in both:
+        bound = None if value is None else array(bound_of(value, none), field)
         if bound is not None and (bound.ndim != 1 or not bound.size or np.isnan(bound).any()):
             raise InputError(field, "shape (m,) without NaN", f"{bound.tolist()} of shape {bound.shape}")
         bounds.append(bound)

@@ -62,7 +62,7 @@ class Layouts:
             the vehicle rests; or None.
         vehicle_radius, goal_radius, dt: m, m, s; each one number for all layouts, or None.
         stages: N, one number for all layouts, or (L,) where they differ, or None.
-        control_lower, control_upper: (m,) in the units of the inputs, infinite where unbounded, or None.
+        control_lower, control_upper: (m,) in the units of the inputs, infinite or None where unbounded; or None.
         best_cost: (L,) J_var of the best solution known, NaN where none is, or None.
         box_centers, box_half_sizes: (L, K, d) m, rows of NaN where a box is absent, or None if there are none; half the
             sides' lengths.

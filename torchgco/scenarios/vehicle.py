@@ -49,7 +49,7 @@ class Task:
     U0: Tensor  # (B, N, m), the vehicle at rest; N is the most stages of a layout
     goal: Tensor  # (B, d), m
     goal_radius: float  # m
-    layouts: Layouts
+    layouts: Layouts  # with the vehicle's own numbers where they gave none
 
 
 @dataclass(frozen=True)
@@ -203,17 +203,16 @@ class Vehicle:
             given = layouts.start if layouts.start is not None else layouts.goal
             wanted = fitting(layouts.dimension, None if given is None else given.shape[1])
             raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
-        layouts = self.at_rest(layouts)
-        start, goal = self._states(layouts, "start"), self._states(layouts, "goal")
+        whole = self.completed(layouts)
+        assert whole.vehicle_radius is not None and whole.goal_radius is not None and whole.stages is not None
 
         def tensor(value: object) -> Tensor:
             return torch.as_tensor(value, dtype=dtype, device=device)
 
         dynamics = self.dynamics if layouts.dt is None else replace(self.dynamics, dt=layouts.dt)  # type: ignore
-        stages = _given(layouts.stages, self.stages)
-        longest = int(np.max(stages))
-        horizon = torch.as_tensor(stages, device=device) if np.ndim(stages) else None
-        radius = self.body or _given(layouts.vehicle_radius, self.radius)
+        longest = int(np.max(whole.stages))
+        horizon = torch.as_tensor(whole.stages, device=device) if np.ndim(whole.stages) else None
+        radius = self.body or whole.vehicle_radius
         constraints: list[Constraint] = [
             Spheres(
                 tensor(layouts.centers),
@@ -242,16 +241,16 @@ class Vehicle:
         rest, moving = (1.0, 1.0) if time is None else (0.0, BESIDE_TIME * dynamics.dt)
         cost = QuadraticCost(
             Q=rest * tensor(list(self.state_weight)), R=moving * tensor(list(self.control_weight)),
-            Qf=rest * tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
+            Qf=rest * tensor(list(self.terminal_weight)), x_ref=tensor(whole.goal).unsqueeze(1),
             u_ref=tensor(list(self.control_reference)),
         )  # fmt: skip
-        goal_radius = _given(layouts.goal_radius, self.goal_radius)
-        center = tensor(goal)[:, dynamics.position]
+        goal, goal_radius = tensor(whole.goal), whole.goal_radius
+        center = goal[:, dynamics.position]
         binds = time is not None or layouts.goal_required is True
-        end = self._required(tensor(goal), center, goal_radius) if binds else Goal(center, goal_radius)
-        problem = Problem(dynamics, cost, constraints, tensor(start), longest, end, horizon, time=time)
+        end = self._required(goal, center, goal_radius) if binds else Goal(center, goal_radius)
+        problem = Problem(dynamics, cost, constraints, tensor(whole.start), longest, end, horizon, time=time)
         U0 = tensor(list(self.control_reference)).expand(layouts.count, longest, -1).contiguous()
-        return Task(problem, U0, center, goal_radius, layouts)
+        return Task(problem, U0, center, goal_radius, whole)
 
     @property
     def _state_bounds(self) -> list[StateBounds]:
@@ -271,6 +270,21 @@ class Vehicle:
         free = torch.ones_like(goal[0], dtype=torch.bool)
         free[list(self.arrives)] = False
         return Goal(state=goal.masked_fill(free, nan), radius=radius, required=True)
+
+    def completed(self, layouts: Layouts) -> Layouts:
+        """The layouts with this vehicle's radius, start, goal and further numbers where they have none.
+
+        These are the ones of `task`, and what a picture of its problems has to show.
+
+        Raises:
+            InputError: states of another length than the vehicle's.
+        """
+        layouts = self.at_rest(layouts)
+        own: dict[str, Any] = {"vehicle_radius": self.radius, "goal_radius": self.goal_radius, "stages": self.stages}
+        own = {name: _given(getattr(layouts, name), default) for name, default in own.items()}
+        own |= {name: self._states(layouts, name) for name in ("start", "goal")}
+        dt = self.dynamics.dt if layouts.dt is None else layouts.dt
+        return replace(layouts, dt=dt if isinstance(dt, float | int) else None, **own)
 
     def at_rest(self, layouts: Layouts) -> Layouts:
         """The layouts with states where they give positions alone: the vehicle's own start or goal, moved there."""

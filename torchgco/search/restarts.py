@@ -78,10 +78,12 @@ class Restarts(Solver):
         """
         import pandas as pd
 
+        from torchgco.search.shown import Sentences
+
         rows = [(name, type(row).__name__, row.problems, row.does) for name, row in self.passes.items()]
         table = pd.DataFrame(rows, pd.RangeIndex(1, len(rows) + 1, name="row"), TABLE_COLUMNS)
         kind = None if problem is None else kind_of(problem)
-        return table if kind is None else table[[kind in row.kinds for row in self.passes]]
+        return Sentences(table if kind is None else table[[kind in row.kinds for row in self.passes]])
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
         """The passes but the last solves, as the next plan continues this one; and the local solver, unguided."""

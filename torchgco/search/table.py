@@ -94,6 +94,10 @@ class Passes(tuple[Row, ...]):
             raise AttributeError(name)
         return self[name]
 
+    def keys(self) -> tuple[str, ...]:
+        """The names: with these, `{**passes, "paths": ...}` and `dict(passes)` are mappings of rows by name."""
+        return self.names
+
     def items(self) -> Iterator[tuple[str, Row]]:
         """Names and rows."""
         return zip(self.names, self, strict=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.brief import Brief
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError, StartWarning
@@ -20,7 +20,7 @@ from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
-from torchgco.kernels import cost_unit, current, open_loop, used
+from torchgco.kernels import cost_unit, current, interior_of, kernels_of, open_loop, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.horizons import at_rest_after, for_solvers
@@ -74,7 +74,7 @@ class Call:
     outer: Tensor  # (B,) int64: outer iterations that this call continues; draws are keyed by their number
     warm: Multipliers | None
     callback: Callback | None
-    deadline: float | None = None  # of `time.monotonic`, s; after it the solve ends with the best trajectory so far
+    deadline: float | None = None  # of `clock.seconds`; after it the solve ends with the best trajectory so far
     X0: Tensor | None = None  # (B, N+1, n): states to begin with; None: those that U0 leads to
 
     @classmethod
@@ -96,7 +96,7 @@ class Call:
         seed = check_value(seed, Seed, "seed")
         max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
         check_value(callback, Callable | None, "callback")
-        deadline = None if max_seconds is None else time.monotonic() + max_seconds
+        deadline = None if max_seconds is None else clock.seconds() + max_seconds
         problem.check_controls(U0)
         rows = torch.arange(problem.B, device=problem.x0.device)
         if ids is None:
@@ -112,12 +112,12 @@ class Call:
     @property
     def late(self) -> bool:
         """Whether the time limit has passed."""
-        return self.deadline is not None and time.monotonic() >= self.deadline
+        return self.deadline is not None and clock.seconds() >= self.deadline
 
     @property
     def seconds_left(self) -> float:
         """Until the time limit, s, at least 0; infinite without one."""
-        return math.inf if self.deadline is None else max(0.0, self.deadline - time.monotonic())
+        return math.inf if self.deadline is None else max(0.0, self.deadline - clock.seconds())
 
     def take(self, index: Rows) -> Self:
         """The same call for the problems in `index`; itself for all of them in their order."""
@@ -181,7 +181,8 @@ class Solver(Brief):
             warm: multipliers and penalties of an earlier solution, for solvers that use them.
             callback: called with the progress after every pass.
             max_seconds: the batched solvers check the time after every pass; once it is over, they return the best
-                trajectories so far. Results then depend on the speed of the machine. The baselines ignore it.
+                trajectories so far. Results then depend on the speed of the machine. Compiling, which a form of problem
+                needs once, doesn't count. The baselines ignore it.
             X0: states to begin with (B, N+1, n), which U0 need not lead to, for solvers that `take_states`; where one
                 isn't finite, the problem begins with its start held. The first states are those of the problem, but
                 where these are free.
@@ -270,7 +271,12 @@ class Solver(Brief):
         return False
 
     def prepare(self, problem: Problem) -> Solver:
-        """The solver with everything built that this batch needs, so that a caller can time the solve alone."""
+        """The solver with everything built that this batch needs, so that nothing is compiled beside the solve."""
+        whole = for_solvers(current_problem(problem), self.joins_knots)
+        with computing_on(whole.x0.device):
+            self.announce(whole)
+            if whole.B > 0 and kernels_of(whole).compiled and whole.known.expects_interior:
+                interior_of(whole)
         return self
 
     def recording(self) -> Solver:

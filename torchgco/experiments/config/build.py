@@ -26,6 +26,7 @@ from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import settings_of
 from torchgco.kernels import use_native
 from torchgco.missions import Mission, RaceMission
+from torchgco.missions.mission import OTHER_MODELS
 from torchgco.missions.plant import Plant, flown
 from torchgco.scenarios import GateForest, Layouts, Race, Scenario, Task, Vehicle
 from torchgco.scenarios.base import Family
@@ -35,7 +36,7 @@ from torchgco.solvers.memory import least_bytes
 DEFAULT_LAYOUTS = 64
 FLOWN = (
     "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, trefoils, walls, "
-    "woods, or a layout file"
+    f"woods, or a layout file ({OTHER_MODELS})"
 )
 RACED = "race, or a layout file with gates and a free time, for mission=race"
 MAX_PROCESSES = 1024  # threads, too: PyTorch ends with an error of the system long before the system's own limit

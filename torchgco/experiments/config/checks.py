@@ -35,6 +35,9 @@ def hydra_words(words: Iterable[str]) -> list[str]:
 
 
 def _hydra_word(word: str) -> str:
+    if word.startswith("-"):  # a flag, where words alone are taken
+        folder = "; a folder of configs is 'hydra.searchpath=[file://FOLDER]' there" if "config" in word else ""
+        raise InputError("overrides", f"KEY=VALUE or GROUP=OPTION{folder}", word)
     if re.fullmatch(r"~[\w.]+\.\d+", word):  # Hydra fails there, too
         raise InputError(word[1:], "a key: a row of a list can be changed by its index, but not deleted", word)
     key, equals, value = word.lstrip("+").partition("=")

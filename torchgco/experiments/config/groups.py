@@ -89,7 +89,7 @@ def _model_of(made: Any) -> str:
 
 def register() -> None:
     """Store the options of all groups; to be called before Hydra composes anything."""
-    register_resolver(BY_DIMENSION, lambda dimension, plane, space: space if dimension == 3 else plane)
+    register_resolver(BY_DIMENSION, _by_dimension)
     register_resolver("torchgco.drawn", _drawn)
     register_resolver("torchgco.options", _help)
     register_resolver("torchgco.radius", _radius)
@@ -134,6 +134,12 @@ def _store(group: str, name: str, node: dict[str, Any], *trees: Any) -> None:
     """Store an option of a group; `trees` are its nodes without interpolations, where it has some."""
     ConfigStore.instance().store(group=group, name=name, node=node)
     _targets.setdefault(group, set()).update(_named(list(trees or (node,))))
+
+
+def _by_dimension(dimension: int, plane: Any, space: Any) -> Any:
+    """The value for this dimension of space, in a form that OmegaConf takes when it resolves a configuration."""
+    chosen = space if dimension == 3 else plane
+    return OmegaConf.create(chosen) if isinstance(chosen, list | dict) else chosen
 
 
 def _drawn(count: int, _root_: Any) -> int | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -15,6 +16,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Within, check_options
 from torchgco.base.status import Status
@@ -26,9 +28,9 @@ from torchgco.experiments.results.durations import durations, with_lengths
 from torchgco.judging.certificate import certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
 from torchgco.judging.judge import frame_columns, gates_passed, judge
-from torchgco.kernels import kernels_of, use_native
+from torchgco.kernels import use_native
 from torchgco.problem.problem import Problem
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import Layouts, Task
 from torchgco.search.reach import short_horizons
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Progress
@@ -117,6 +119,10 @@ class Batch(ABC):
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
         """Rows (without success), and what is kept of each flight (L, ...)."""
 
+    def compile(self) -> None:
+        """Compile what is known to be needed: where several processes fly, once for all, and beside no solve."""
+        return  # a mission's problems are posed on the way
+
     def show(self, done: float) -> None:
         """Move the bar to so many layouts."""
         self.bar.update(max(0.0, done - self.shown))
@@ -146,6 +152,15 @@ class Flight(Batch):
         longest = max(self.stages or 0, *(U.shape[1] for _, U in flown))
         return rows, np.concatenate([self._lengthened(U, longest) for _, U in flown])[order]
 
+    def compile(self) -> None:
+        """See `Batch`; solvers of other libraries build what they need in the process that flies."""
+        if self.solver.kernels is None:
+            with warnings.catch_warnings(action="ignore"):  # the processes give them
+                self.solver.prepare(self._task(self.layouts.take(self.layouts.alike()[0])).problem)
+
+    def _task(self, layouts: Layouts) -> Task:
+        return self.setup.vehicle.task(layouts, self.setup.device, self.setup.dtype)
+
     def _lengthened(self, U: np.ndarray, stages: int) -> np.ndarray:
         """Controls (L, N, m) with those at rest after them, up to so many stages."""
         rest = np.array(self.setup.vehicle.control_reference, np.float64)
@@ -155,7 +170,7 @@ class Flight(Batch):
     def _fly(self, layouts: Layouts) -> tuple[pd.DataFrame, np.ndarray]:
         """The same of layouts with as many stages and gates."""
         setup, self.shown = self.setup, 0
-        task = setup.vehicle.task(layouts, setup.device, setup.dtype)
+        task = self._task(layouts)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
         if (told := short_horizons(task.problem)) is not None:
             self.bar.write(f"{self.name}: {told.replace('problem', 'layout')} (scenario.stages)", sys.stderr)
@@ -192,7 +207,6 @@ class Flight(Batch):
         Each time memory runs out, half as many run at once. A solver that reports no pass runs all of them together.
         """
         # Building and compiling for a batch are set-up: the clock starts after them.
-        kernels_of(problem)
         solver, at_once = self.solver.prepare(problem), problem.B
         if solver.in_slots(1) is not None:
             plan = plan_of(self.setup)
@@ -235,7 +249,7 @@ class Flight(Batch):
 def _now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    return time.perf_counter()
+    return clock.seconds()
 
 
 # Functions of worker processes. They are here, not in `study`, so that no worker loads the report's figures.

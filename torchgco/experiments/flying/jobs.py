@@ -30,7 +30,6 @@ from torchgco.experiments.ending import Refused
 from torchgco.experiments.results.files import write
 
 CUT_BY = ("study.jobs", "study.job")  # keys in which the jobs of one study differ
-EXTRAS = {"ray": "ray"}  # extra of the package by launcher; the others are in "cluster"
 
 
 @dataclass(frozen=True)
@@ -125,8 +124,8 @@ def _check(config: DictConfig) -> None:
     except ModuleNotFoundError:
         known = False
     if not known:
-        install = f"an installed launcher: pip install -e '.[{EXTRAS.get(name, 'cluster')}]'"
-        raise InputError("hydra/launcher", install, name)
+        plugin = package.removeprefix("hydra_plugins.").split(".")[0].replace("_", "-")
+        raise InputError("hydra/launcher", f"an installed launcher: pip install {plugin}", name)
     jobs_at_once(config.hydra.launcher)
 
 

@@ -42,7 +42,6 @@ from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.success import with_success
 from torchgco.kernels import native
 from torchgco.missions import Mission
-from torchgco.plotting.silhouettes import body_of
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.
@@ -160,8 +159,9 @@ def _report(study: _Study, folder: Path) -> str:
     if study.setup.mission is not None:
         return write_mission_report(folder, study.setup, figures=study.plan.figures)
     plan = study.plan
-    body = body_of(study.setup.task(study.layouts.take([0])).problem)
-    return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, body)
+    return write_report(
+        folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, study.setup.vehicle
+    )
 
 
 def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
@@ -263,10 +263,15 @@ def _fly_side_by_side(
         shown = max(shown, finished)
         bar.set_postfix_str(f"solved {int(shown)}/{total}", refresh=True)
 
+    flights = [_flight(study, name, ids, Shared()) for name, ids in batches]
+    bar.set_description("compiling")
+    for name in study.solvers:
+        if first := next((flight for flight in flights if flight.name == name), None):
+            first.compile()
     bar.set_description(f"{workers} processes")
     run_all(
         fly,
-        [_flight(study, name, ids, Shared()) for name, ids in batches],
+        flights,
         workers,
         prepare=prepare,
         options=(torch.get_num_threads(), native()),

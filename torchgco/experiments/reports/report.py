@@ -33,9 +33,10 @@ from torchgco.plotting.distributions import clearance_figure, is_spread, violati
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
 from torchgco.plotting.rates import rates_figure, sweep_figure
+from torchgco.plotting.silhouettes import body_of
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
-from torchgco.scenarios.layouts import Layouts
+from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
 FACETS = 6  # most tasks that have panels of their own; more are pooled over the swept variables
@@ -47,7 +48,7 @@ def write_report(
     trajectories: Callable[[Arrays], Arrays] | None = None,
     figures: bool = True,
     printed: Columns | None = None,
-    body: BoundBody | None = None,
+    vehicle: Vehicle | None = None,
     trials: pd.DataFrame | None = None,
     form: str = "table",
 ) -> str:
@@ -58,7 +59,7 @@ def write_report(
             the arrays of `solutions.npz`; None: no such picture.
         figures: False: tables alone.
         printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
-        body: of the vehicle, which these pictures draw; None: a ball.
+        vehicle: whose numbers these pictures show where layouts have none; None: layouts have all that is known.
         trials: the table in that file, where it is known.
         form: of the table that is returned, one of OUTPUTS.
 
@@ -70,7 +71,7 @@ def write_report(
     write_tables(folder, parts)
     held = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
-        layouts = Layouts.load(folder / LAYOUTS).arrays()
+        layouts, body = _posed(Layouts.load(folder / LAYOUTS), vehicle)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
             states = trajectories(solutions)
         if figures:
@@ -80,6 +81,13 @@ def write_report(
                 held[f"study.{ending}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed, body)
     draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
     return format_report(parts, form)
+
+
+def _posed(layouts: Layouts, vehicle: Vehicle | None) -> tuple[Arrays, BoundBody | None]:
+    """The arrays of layouts as problems were made of them, and the vehicle's body where it is no ball."""
+    if vehicle is None:
+        return layouts.arrays(), None
+    return vehicle.completed(layouts).arrays(), body_of(vehicle.task(layouts.take([0])).problem)
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:

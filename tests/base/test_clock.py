@@ -1,0 +1,104 @@
+"""By the clock of solves, compiling takes no time: every library that is loaded takes an hour of the clocks here."""
+
+import threading
+from collections.abc import Callable
+
+import pytest
+
+import torchgco
+from tests.problems import planar_batch, quick_gco
+from torchgco import Status
+from torchgco.base import clock
+from torchgco.experiments.config.build import compose
+from torchgco.experiments.flying.flight import Flight
+from torchgco.experiments.flying.progress import NoBar
+from torchgco.kernels import choice
+from torchgco.native import compiler
+from torchgco.roadmap import native as roadmap
+
+HOUR = 3600.0
+
+
+@pytest.fixture
+def loads(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The clocks, which move by loads alone, one entry a load; no library is loaded yet."""
+    found, load = list[float](), compiler._load
+
+    def slow(*words: object) -> object:
+        found.append(HOUR)
+        return load(*words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(clock, "_left", clock._Left())
+    monkeypatch.setattr(clock, "_now", lambda: (sum(found), sum(found)))
+    monkeypatch.setattr(compiler, "_load", slow)
+    monkeypatch.setattr(compiler, "_loaded", {})
+    monkeypatch.setattr(choice, "_engines", {})
+    roadmap._library.cache_clear()
+    return found
+
+
+@pytest.mark.parametrize("B", [1, 9])
+def test_solves_and_their_limits(B: int, loads: list[float]) -> None:
+    """Few problems have libraries of their own."""
+    problem, U0 = planar_batch(B=B, N=30, obstacles=9, seed=B)
+    began = clock.seconds(), clock.processor_seconds()
+    solution = quick_gco(problem).solve(problem, U0, max_seconds=HOUR / 2)
+    assert len(loads) >= 2 and (clock.seconds(), clock.processor_seconds()) == began
+    assert Status.TIME_LIMIT not in solution.statuses
+
+
+def test_a_comparison(loads: list[float]) -> None:
+    problem, U0 = planar_batch(B=2, N=20, obstacles=5, seed=1)
+    table = torchgco.compare(problem, ["gco", "al_ilqr", "mppi"], U0)
+    assert len(loads) >= 3 and (table["seconds"] == 0.0).all()
+
+
+def test_compiled_problems(loads: list[float]) -> None:
+    problem, _ = planar_batch(B=2, N=20, obstacles=5, seed=2)
+    answer = torchgco.compile(problem)(max_seconds=HOUR / 2)
+    assert len(loads) >= 2 and answer.seconds == 0.0 and Status.TIME_LIMIT not in answer.statuses
+
+
+def test_the_rows_of_a_study(loads: list[float]) -> None:
+    setup = compose(["scenario=planar_trap", "study.layouts=3"])
+    flight = Flight(setup, setup.layouts(), "gco", setup.solver, NoBar())
+    flight.compile()
+    assert len(loads) >= 2  # the interior point's, too: no process compiles it while another one solves
+    rows, _ = flight.fly()
+    assert (rows["seconds"] == 0.0).all()
+
+
+def test_missions(loads: list[float]) -> None:
+    setup = compose(["experiment=mission", "study.layouts=1", "mission.duration=0.2"])
+    assert setup.mission is not None
+    log = setup.mission.fly(setup.task().problem, seed=0)
+    assert len(loads) >= 2
+    for name in ("planner_seconds", "tracker_seconds"):
+        assert float(getattr(log, name).nan_to_num(0.0).max()) == 0.0
+
+
+def test_every_thread_has_its_own(loads: list[float]) -> None:
+    """What one thread sets up, another one's clock counts; blocks may lie in each other and end with an error."""
+
+    def in_thread(work: Callable[[], None]) -> None:
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+
+    def fails() -> None:
+        with clock.setting_up(), clock.setting_up():
+            loads.append(HOUR)
+            raise ValueError
+
+    began, other = clock.seconds(), list[float]()
+    in_thread(lambda: other.append(clock.seconds()))
+    with pytest.raises(ValueError):
+        fails()
+    assert clock.seconds() == began
+    in_thread(lambda: other.append(clock.seconds()))
+    assert other == [began, began + HOUR]
+    with clock.setting_up():
+        loads.append(HOUR)
+        assert clock.seconds() == began
+    loads.append(HOUR)
+    assert clock.seconds() == began + HOUR

@@ -1,0 +1,92 @@
+"""What a study draws is what was judged, whether a number stands in the layouts or in the vehicle."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import torchgco
+from tests.trials import flights, trials
+from torchgco.dynamics import Unicycle
+from torchgco.experiments.reports import report
+from torchgco.plotting.layouts import layout_grid
+from torchgco.plotting.scene import contacts, scene_of
+from torchgco.plotting.study_figure import study_figure
+from torchgco.scenarios import Layouts, Vehicle
+
+L = 6
+NUMBERS = ("start", "goal", "vehicle_radius", "goal_radius", "dt", "stages")
+
+
+def drawn(seed: int) -> tuple[Vehicle, Layouts]:
+    """A vehicle with numbers of its own, and discs, one of which moves; the layouts have some of the numbers."""
+    rng = np.random.default_rng(seed)
+    vehicle = Vehicle(
+        name="own", dynamics=Unicycle(dt=rng.uniform(0.05, 0.3)), state_weight=[1] * 4, control_weight=[1, 1],
+        terminal_weight=[1] * 4, control_reference=[0, 0], control_lower=[-2, -2], control_upper=[2, 2],
+        start=rng.uniform(-1, 1, 4).tolist(), goal=rng.uniform(4, 6, 4).tolist(), radius=rng.uniform(0.1, 0.5),
+        goal_radius=rng.uniform(0.2, 1), stages=int(rng.integers(10, 20)),
+    )  # fmt: skip
+    given: dict[str, Any] = {
+        "start": rng.uniform(-1, 1, (L, 4)), "goal": rng.uniform(4, 6, (L, 4)), "dt": rng.uniform(0.05, 0.3),
+        "vehicle_radius": rng.uniform(0.1, 0.5), "goal_radius": rng.uniform(0.2, 1),
+        "stages": int(rng.integers(10, 20)),
+    }  # fmt: skip
+    kept = {name: given[name] for name in NUMBERS if rng.random() < 0.5}
+    centers, velocities = rng.uniform(0, 5, (L, 3, 2)), np.zeros((L, 3, 2))
+    velocities[:, 0] = rng.uniform(-2, 2, (L, 2))
+    return vehicle, Layouts(centers, rng.uniform(0.1, 0.6, (L, 3)), velocities=velocities, **kept)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle, layouts = drawn(seed)
+    task = vehicle.task(layouts)
+    problem, (spheres, *_) = task.problem, task.problem.obstacles
+    U = torch.randn(L, problem.N, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    verdict = torchgco.judge(problem, U)
+    X = [problem.x0]
+    for k in range(problem.N):
+        X.append(problem.dynamics.step(X[-1], U[:, k]))
+    states = {"gco": torch.stack(X, 1).numpy()}
+
+    layouts.save(tmp_path / "layouts.npz")
+    rows = flights("gco", verdict.reached.tolist())
+    trials(*(row | {"feasible": ok} for row, ok in zip(rows, verdict.feasible.tolist(), strict=True))).to_parquet(
+        tmp_path / "trials.parquet", index=False
+    )
+    np.savez(tmp_path / "solutions.npz", U=U.numpy()[None], solver=np.array(["gco"]))
+    shown = []
+    for name, draw in (("layout_grid", layout_grid), ("study_figure", study_figure)):
+        def keep(arrays: Any, *words: Any, draw: Any = draw, **more: Any) -> Any:
+            shown.append((scene_of(arrays), draw(arrays, *words, **more)))
+            return shown[-1][1]
+
+        monkeypatch.setattr(report, name, keep)
+    monkeypatch.setattr(report, "_draw", lambda folder, name, figure: name[:5] in ("layou", "study") and figure())
+    report.write_report(tmp_path, lambda flown: states, printed="one", vehicle=vehicle)
+
+    assert len(shown) == 3  # one of them as a png and as a pdf
+    for scene, figure in shown:
+        np.testing.assert_array_equal(scene.start, problem.x0[:, :2])
+        np.testing.assert_array_equal(scene.goal, task.goal)
+        assert scene.margin == float(spheres.vehicle_radius[0]) and scene.goal_radius == task.goal_radius
+        assert scene.dt == problem.dynamics.dt
+        touching = [len(contacts(scene, i, states["gco"][i, :, :2])) > 0 for i in range(L)]
+        assert touching == (verdict.clearance < 0).tolist()
+        words = {text.get_text() for box in figure.legends for text in box.get_texts()}
+        assert {"start", "goal and its radius", "contact"} <= words or not any(touching)
+
+
+def test_what_is_unknown_is_not_claimed() -> None:
+    """Of layouts alone, without a vehicle, nobody knows what is in contact, nor where a flight was to end."""
+    layouts = Layouts(np.array([[[0.0, 0.4]]]), np.array([[0.3]]))
+    states = {"gco": np.linspace([[-5.0, 0]], [[5.0, 0]], 9).transpose(1, 0, 2)}
+    rows = trials({"solver": "gco", "feasible": False, "reached": False})
+    figure = layout_grid(layouts.arrays(), states, rows)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["gco", "infeasible", "obstacle"]
+    more = {"vehicle_radius": np.array(0.05), "start": np.array([-5.0, 0]), "goal": np.array([5.0, 0])}
+    known = layout_grid(layouts.arrays() | more, states, rows)
+    assert "infeasible without contact" in [text.get_text() for text in known.legends[0].get_texts()]
