@@ -63,6 +63,13 @@ def short_horizons(problem: Problem) -> str | None:
     )
 
 
+def within_reach(problem: Problem) -> Tensor:
+    """Whether horizons suffice for the straight way to the goal, (B,) bool; as far as is known."""
+    assert problem.goal is not None
+    limit, far = limit_of(problem), problem.goal.distance(problem.x0[:, problem.position])
+    return torch.ones_like(far).bool() if limit is None else far <= limit.reach(problem) + problem.goal.radius
+
+
 class Step(NamedTuple):
     """The longest way of a stage, (B,), m."""
 
