@@ -103,3 +103,23 @@ def test_the_widest_way_is_that_of_a_plain_search(shape: tuple[int, ...]) -> Non
         wide = bottleneck(values, *(beside(node, values.shape) for node in (start, goal)))
         assert found[-1] == pytest.approx(max(wide, 0.0), abs=1e-6)
     assert len(set(found)) > 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_off_a_map_that_is_occupied_all_around_is_named(seed: int) -> None:
+    """On any side, of the start or the goal; not where the outside is free, nor a place on the map."""
+    rng = np.random.default_rng(seed)
+    axis, side = int(rng.integers(2)), int(rng.integers(2))
+    place = rng.uniform([1.0, 1.0], [9.0, 5.0])
+    place[axis] = (10.0, 6.0)[axis] + rng.uniform(0.5, 30.0) if side else -rng.uniform(0.5, 30.0)
+    off, open_room = (float(place[0]), float(place[1])), np.zeros((200, 120), bool)
+    closed = np.pad(open_room[1:-1, 1:-1], 1, constant_values=True)
+    text = told(problem(closed, 0.2, off))
+    assert "The goal lies outside of the map, which is occupied all around" in text
+    assert 'outside="free"' in text and "scenario.outside=free" in text and "horizon" not in text
+    turned = problem(closed, 0.2, (2.0, 3.0))
+    x0 = turned.x0.clone()
+    x0[0, :2] = torch.tensor(off)
+    assert "The start lies outside" in told(Problem(turned.dynamics, turned.cost, list(turned.constraints), x0, 80, turned.goal))
+    for cells, goal in ((open_room, off), (room(), (8.0, 3.0))):
+        assert "outside" not in told(problem(cells, 0.3, goal))
