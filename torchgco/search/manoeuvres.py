@@ -28,7 +28,7 @@ from torchgco.search.solved_candidates import solved
 from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
 
 GROWTH_ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
-SPOT_TURN = 0.25  # rad that a vehicle turns on the spot from one pose to the next
+SPOT_TURN = 0.125  # rad that a vehicle turns on the spot from one pose to the next
 PATH_PACES = 0.6, 0.8, 1.0  # shares of the horizon in which a path is driven: each is a start of the interior point
 MANOEUVRES_TEXT = f"a path of poses, forwards and backwards, at {len(PATH_PACES)} paces; interior point from each"
 
@@ -106,7 +106,8 @@ def manoeuvre(search: Search, on_the_spot: bool) -> None:
         good = ends.cost.isfinite()
         clearance = torch.full_like(ends.cost, torch.inf)
         some = good.nonzero().flatten()
-        clearance[some] = chord_clearance(made.of(some), ends.candidates.X[some])
+        if some.numel() > 0:  # a map has no distances from nowhere
+            clearance[some] = chord_clearance(made.of(some), ends.candidates.X[some])
         lacks = torch.where(good, clearance, -torch.inf).view(-1, made.count).amax(1)
         again = ((lacks < 0.0) & torch.isfinite(lacks)).nonzero().flatten()
         if again.numel() == 0 or search.call.late:

@@ -28,6 +28,7 @@ TIGHTEST = 0.9  # share of the vehicle's largest curvature: steering from side t
 ARC_LENGTH = 0.5  # length of an arc in radii of the largest ball
 CELL = 0.6  # side of a cell as a share of an arc: each arc leaves its cell; with 0.7 two of 12 slots had no path
 CUSP = 2.0  # arcs that a change between forwards and backwards costs: the vehicle stops and steers again
+GREED = 1.3  # times the rest of the way through rooms counts: a tenth of the poses, for a way hardly longer
 END_POSE_ARCS = 0.5  # arcs within which a pose counts as that at the end of the path
 POSES_AT_ONCE = 2048  # poses that are measured together: bounds the memory
 MOST_POSES = 1_000_000  # poses that are kept, at most: bounds the time, to about six seconds
@@ -119,7 +120,7 @@ class _Wave:
 
     def _push(self, pose: Array, way: Array, ahead: Array, place: NDArray[np.int64]) -> None:
         straight = np.hypot(*(pose[:, :2] - self.target[:2]).T)
-        left = (straight if self.space.rest is None else self.space.rest(pose)) / self.space.step
+        left = (straight if self.space.rest is None else GREED * self.space.rest(pose)) / self.space.step
         if not math.isnan(self.target[2]):
             turn = np.abs(pose[:, 2] - self.target[2]) / (TIGHTEST * self.space.curvature * self.space.step)
             left = np.maximum(left, turn)
