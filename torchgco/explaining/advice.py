@@ -36,8 +36,8 @@ MISSED = "The goal is required, and no trajectory that was found meets it: the b
 COVERED = "The goal is required, and an obstacle, grown by the vehicle's radius, covers all of it."
 SHORT = "{longer}or a larger terminal weight: the trajectory stops short of the goal."
 ENOUGH = (
-    'Another guess U0, solver="gco_max", or a larger terminal weight: the trajectory stops short of the goal, for whose '
-    "way the horizon suffices."
+    'Another guess U0, solver="gco_max", or a larger terminal weight: the trajectory stops short of the goal, though '
+    "the horizon suffices for the way."
 )
 NEARER = (
     "{longer}weaker limits, or a larger radius of the goal; without required=True the solve tells how near it gets."

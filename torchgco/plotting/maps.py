@@ -1,4 +1,4 @@
-"""Maps of cells or points, drawn by their distance fields; unknown cells have a colour of their own, and cells an edge."""
+"""Maps of cells or points, drawn by their distance fields; unknown cells have a colour of their own, a grid an edge."""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ from torchgco.scenarios.layouts import Layouts
 VEHICLE_RADIUS, GOAL_RADIUS = 0.25, 0.3  # m, where neither the command nor the file says them
 CLEAR = 1.2  # drawn places are as free as for a vehicle of this many radii
 DRAWN_PACES = {2: 0.7, 3: 2.0}  # m/s, by the dimension of space
-READ = "resolution", "radius", "origin", "height", "topic", "layer", "box", "solid", "outside"  # fields that `read` takes
+# Fields that `read` takes.
+READ = "resolution", "radius", "origin", "height", "topic", "layer", "box", "solid", "outside"
 ENDS_APART = 0.4  # share of the free space's diagonal that drawn starts and goals are apart, at least
 
 

@@ -84,7 +84,8 @@ def car(problem: Problem) -> Car | None:
 def manoeuvre(search: Search, on_the_spot: bool) -> None:
     """Solve the problems of bodies that haven't arrived from manoeuvres.
 
-    Of vehicles that turn on the spot, or of others, of these also the ones that touch between knots. Where every trajectory from these touches between knots, too, they are solved again among obstacles that have grown.
+    Of vehicles that turn on the spot, or of others, of these also the ones that touch between knots. Where every
+    trajectory from these touches between knots, too, they are solved again among obstacles that have grown.
     """
     if not any(isinstance(part, BoundBody) for part in search.call.problem.obstacles):
         return

@@ -2,8 +2,9 @@
 
 A path of the ball that a body holds says nothing of the heading: before an opening hardly wider than the body it leads
 in from aside, where the body can't turn. This search is over positions and heading: from one pose to the next the
-vehicle drives a short arc of a curvature that it can steer, or turns on the spot where it can. Dolgov, Thrun, Montemerlo, Diebel, Path planning for
-autonomous vehicles in unknown semi-structured environments, IJRR 29 (2010): the cells of their hybrid A*.
+vehicle drives a short arc of a curvature that it can steer, or turns on the spot where it can. Dolgov, Thrun,
+Montemerlo, Diebel, Path planning for autonomous vehicles in unknown semi-structured environments, IJRR 29 (2010): the
+cells of their hybrid A*.
 """
 
 from __future__ import annotations

@@ -95,7 +95,8 @@ def _driven(part: Part, b: int, around: Scene | None) -> tuple[list[Array], int,
     duration = float(one.stages[0]) * float(one.dynamics.dt)
     straight = float((part.scene.goal[b] - part.scene.start[b]).square().sum().sqrt())
     free = part.free(FREE_ITERATIONS)
-    return ways, len(near), driven(one, vehicle, _tracks(vehicle, ways, duration, float((free.share * free.slower)[b]) / straight))
+    tracks = _tracks(vehicle, ways, duration, float((free.share * free.slower)[b]) / straight)
+    return ways, len(near), driven(one, vehicle, tracks)
 
 
 def _ways(part: Part, b: int) -> list[Array]:

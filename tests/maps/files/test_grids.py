@@ -45,7 +45,7 @@ def test_cells_lie_where_the_format_says(name: str, corner: tuple[int, int], tmp
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, -2.0])
 def test_what_lies_outside_of_a_map_servers_map_is_occupied(yaw: float, tmp_path: Path) -> None:
-    """By its yaml file and by its image, of which the yaml file beside it tells; other plans and heights have no rim."""
+    """By its yaml file, and by its image, of which that tells; other plans and heights have no rim."""
     path = described(tmp_path)
     (tmp_path / "map.yaml").write_text(path.with_suffix(".yaml").read_text().replace("2.0, 0]", f"2.0, {yaw}]"))
     for name, options in (("map.yaml", {}), ("map.pgm", {}), ("map.pgm", {"resolution": 0.05})):
