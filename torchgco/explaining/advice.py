@@ -34,7 +34,7 @@ OTHER_START = (
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
 COVERED = "The goal is required, and an obstacle, grown by the vehicle's radius, covers all of it."
-SHORT = "{longer}or a larger terminal weight: the trajectory stops short of the goal."
+STOPS_SHORT = "{longer}or a larger terminal weight: the trajectory stops short of the goal."
 ENOUGH = (
     'Another guess U0, solver="gco_max", or a larger terminal weight: the trajectory stops short of the goal, though '
     "the horizon suffices for the way."
@@ -142,7 +142,7 @@ def advice(facts: Facts) -> list[str]:
         found.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
     if facts.status in FITS and facts.reached is False:
         suffices = facts.horizon is not None and facts.horizon.suffices
-        found.append(ENOUGH if suffices else capital(SHORT.format(longer=facts.longer).removeprefix("or ")))
+        found.append(ENOUGH if suffices else capital(STOPS_SHORT.format(longer=facts.longer).removeprefix("or ")))
     elif facts.missed is not None and facts.status is Status.INFEASIBLE:
         found.append(OTHER_GOAL if facts.covered else capital(NEARER.format(longer=facts.longer)))
     elif facts.status in BY_STATUS:

@@ -27,7 +27,7 @@ CLIMBS = 40  # rounds of ascent from the samples, which halve a step of half the
 WIDER, GROWN = 100.0, 0.01  # times that range, in which what has no bounds may raise the acceleration by this share
 LEAST_SPEED = 1e-12  # m^2/s^2: squared speeds below it count as it
 FEWER = 4  # one in so many samples shows how strong the acceleration is
-SPARE = 1.25  # times the least stages: so many leave room for accelerating and turning, which that least hasn't
+LEEWAY = 1.25  # times the least stages: so many leave room for accelerating and turning, which that least hasn't
 SHORT_TIME = 1e-6  # s, over which a change of velocity is measured
 REACH_SEED = 0x5EED
 
@@ -76,7 +76,7 @@ class Horizon(NamedTuple):
     @property
     def suffices(self) -> bool | None:
         """Whether it isn't what keeps the vehicle from the goal; None where it may be, but needn't."""
-        return False if self.needed > self.stages else True if self.stages >= SPARE * self.needed else None
+        return False if self.needed > self.stages else True if self.stages >= LEEWAY * self.needed else None
 
     def __str__(self) -> str:
         """A sentence on one that is too short."""

@@ -144,10 +144,7 @@ def read(
     for name, value in given.items():
         if value is not None and name not in format.options:
             raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
-    lengths = (("resolution", resolution, LEAST_CELL), ("radius", radius, 0.0), ("height", height, LEAST_CELL))
-    for name, value, least in lengths:
-        if value is not None and not least <= number(value, f"{field}.{name}") <= FARTHEST_AT:
-            raise InputError(f"{field}.{name}", f"a length from {least:g} to {FARTHEST_AT:g} m", shown(value))
+    _check_lengths(field, ("resolution", resolution, LEAST_CELL), ("radius", radius, 0.0), ("height", height, LEAST_CELL))
     if origin is not None:
         given["origin"] = origin = coordinates(origin, f"{field}.origin")
         if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST_AT).all():
@@ -158,10 +155,8 @@ def read(
     given["layer"] = layer = None if layer is None else checked_layer(layer, f"{field}.layer")
     given["box"] = box = None if box is None else checked_box(box, f"{field}.box")
     found = format.reader(source, **{name: given[name] for name in format.options})
-    if box is not None:
-        found = part(source, found, box, radius)
-    if layer is not None:
-        found = flat(source, found, layer, radius)
+    found = found if box is None else part(source, found, box, radius)
+    found = found if layer is None else flat(source, found, layer, radius)
     if isinstance(found, OccupancyGrid):
         if radius is not None:
             raise InputError(f"{field}.radius", f"none: {source.path} holds cells, no points", radius)
@@ -172,8 +167,15 @@ def read(
     return PointCloud(found, radius)
 
 
+def _check_lengths(field: str, *lengths: tuple[str, Any, float]) -> None:
+    """Check options by name, value and least length, m; None is none."""
+    for name, value, least in lengths:
+        if value is not None and not least <= number(value, f"{field}.{name}") <= FARTHEST_AT:
+            raise InputError(f"{field}.{name}", f"a length from {least:g} to {FARTHEST_AT:g} m", shown(value))
+
+
 def usual_outside(path: Any, height: float | None = None, field: str = "map") -> Unknown:
-    """What lies around the cells of a file's map unless `read` is told otherwise; arguments and errors as there."""
+    """What lies around the cells of a file's map unless `read` is asked for something else; arguments and errors as there."""
     source, format = _find(path, field)
     image = format.reader is _read_image and height is None
     return "occupied" if format.reader is read_map_server or (image and beside(source) is not None) else "free"
