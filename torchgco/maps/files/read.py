@@ -144,7 +144,8 @@ def read(
     for name, value in given.items():
         if value is not None and name not in format.options:
             raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
-    _check_lengths(field, ("resolution", resolution, LEAST_CELL), ("radius", radius, 0.0), ("height", height, LEAST_CELL))
+    cell = ("resolution", resolution, LEAST_CELL)
+    _check_lengths(field, cell, ("radius", radius, 0.0), ("height", height, LEAST_CELL))
     if origin is not None:
         given["origin"] = origin = coordinates(origin, f"{field}.origin")
         if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST_AT).all():
@@ -175,7 +176,7 @@ def _check_lengths(field: str, *lengths: tuple[str, Any, float]) -> None:
 
 
 def usual_outside(path: Any, height: float | None = None, field: str = "map") -> Unknown:
-    """What lies around the cells of a file's map unless `read` is asked for something else; arguments and errors as there."""
+    """What lies around the cells of a file's map where `read` isn't given it; arguments and errors as there."""
     source, format = _find(path, field)
     image = format.reader is _read_image and height is None
     return "occupied" if format.reader is read_map_server or (image and beside(source) is not None) else "free"
