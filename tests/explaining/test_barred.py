@@ -1,6 +1,8 @@
 """What a map says of a goal that no path reaches, and of a start in unknown cells."""
 
 import heapq
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +10,23 @@ import torch
 
 import torchgco
 from tests.slow import mostly
-from torchgco import ControlBounds, Field, Goal, OccupancyGrid, Problem, QuadraticCost, Status, Unicycle
+from torchgco import (
+    Body,
+    ControlBounds,
+    Field,
+    Goal,
+    OccupancyGrid,
+    Problem,
+    QuadraticCost,
+    StateBounds,
+    Status,
+    Unicycle,
+    presets,
+)
+from torchgco.base.errors import HorizonWarning
 from torchgco.maps import DistanceField
 from torchgco.maps.passage import widest_passage
+from torchgco.search import Solve
 
 RESOLUTION = 0.05
 Node = tuple[int, ...]
@@ -103,3 +119,57 @@ def test_the_widest_way_is_that_of_a_plain_search(shape: tuple[int, ...]) -> Non
         wide = bottleneck(values, *(beside(node, values.shape) for node in (start, goal)))
         assert found[-1] == pytest.approx(max(wide, 0.0), abs=1e-6)
     assert len(set(found)) > 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_off_a_map_that_is_occupied_all_around_is_named(seed: int) -> None:
+    """On any side, of the start or the goal; not where the outside is free, nor a place on the map."""
+    rng = np.random.default_rng(seed)
+    axis, side = int(rng.integers(2)), int(rng.integers(2))
+    place = rng.uniform([1.0, 1.0], [9.0, 5.0])
+    place[axis] = (10.0, 6.0)[axis] + rng.uniform(0.5, 30.0) if side else -rng.uniform(0.5, 30.0)
+    off, open_room = (float(place[0]), float(place[1])), np.zeros((200, 120), bool)
+    closed = np.pad(open_room[1:-1, 1:-1], 1, constant_values=True)
+    text = told(problem(closed, 0.2, off))
+    assert "The goal lies outside of the map, which is occupied all around" in text
+    assert 'outside="free"' in text and "scenario.outside=free" in text and "horizon" not in text
+    turned = problem(closed, 0.2, (2.0, 3.0))
+    x0 = turned.x0.clone()
+    x0[0, :2] = torch.tensor(off)
+    moved = Problem(turned.dynamics, turned.cost, list(turned.constraints), x0, 80, turned.goal)
+    assert "The start lies outside" in told(moved)
+    for cells, goal in ((open_room, off), (room(), (8.0, 3.0))):
+        assert "outside" not in told(problem(cells, 0.3, goal))
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 3.0])
+def test_a_longer_horizon_is_advised_only_where_the_way_asks_for_it(speed: float) -> None:
+    """A vehicle that stays where it is, square to a way around a wall: about 8 m, where 6 are straight."""
+    cells = room()
+    cells[100:102, :108], cells[100:102, 108:119] = 1, 0
+    limits = [torch.inf] * 3
+    bounds = StateBounds([-x for x in limits] + [-speed], [*limits, speed])
+    held = problem(cells, 0.2)
+    x0 = torch.tensor([[2.0, 3.0, 0.5 * torch.pi, 0.0]]).double()
+    still = replace(presets.gco(2), passes=[Solve()])
+    body = Body([[0.2, 0.0], [-0.2, 0.0]], 0.2)
+    for radius in (0.2, body):
+        parts = [Field(OccupancyGrid(cells, [0, 0], RESOLUTION), radius), *held.constraints[1:], bounds]
+        for times, said in ((0.3, "short"), (0.9, "short"), (2.5, "enough")):
+            task = Problem(held.dynamics, held.cost, parts, x0, round(times * 8.0 / speed / 0.1), held.goal)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", HorizonWarning)
+                text = " ".join(torchgco.solve(task, solver=still).explain(0).split())
+            assert "goal not reached" in text
+            assert ("A longer horizon: the way to the goal is" in text) == (said == "short")
+            assert ("though the horizon suffices for the way" in text) == (said == "enough")
+            assert "A longer horizon N" not in text
+
+
+def test_a_body_whose_inside_fits_through_no_way_is_told() -> None:
+    held = problem(room(), 0.3)
+    body = Body([[0.25, 0.0], [-0.25, 0.0]], 0.35)
+    field = Field(OccupancyGrid(room(), [0, 0], RESOLUTION), body)
+    text = told(Problem(held.dynamics, held.cost, [field, held.constraints[1]], held.x0, 80, held.goal))
+    assert f"leads the ball inside the body, of radius {body.inscribed_radius:.3g} m to the goal" in text
+    assert "a narrower body" in text and "vehicle_radius" not in text

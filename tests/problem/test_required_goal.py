@@ -153,7 +153,7 @@ def test_one_out_of_reach_or_covered_is_infeasible_and_told() -> None:
     told = " ".join(far.explain(0).split())
     assert "goal is required, and no trajectory that was found meets it" in told
     missed = float((far.X[0, -1, :2] - 0.5).norm()) - 0.2
-    assert f"misses it by {missed:.4g} m" in told and "A longer horizon N" in told
+    assert f"misses it by {missed:.4g} m" in told and "A longer horizon: the way to the goal is" in told
     place = torch.tensor([[0.5, 0.5], [0.5, 0.5], [-1.0, -1.0]], dtype=D)
     cover = Spheres(place.unsqueeze(1), [[0.6]] * 3, 0.1)
     mixed = torchgco.solve(points(BALL, cover))

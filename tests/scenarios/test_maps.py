@@ -12,6 +12,7 @@ import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from PIL import Image
 
 from tests.maps.files import samples
 from torchgco import Hold, InputError, judge
@@ -78,6 +79,21 @@ def test_what_lies_around_the_cells_is_free_or_occupied(tmp_path: Path) -> None:
     np.save(cloud, np.zeros((3, 2)))
     with pytest.raises(InputError, match=r"scenario.outside: expected free"):
         MapFile(cloud, radius=0.1, outside="occupied")
+
+
+@pytest.mark.parametrize("place", [[-0.1, 1.0], [4.2, 1.0], [1.0, -3.0], [2.0, 30.0]])
+def test_a_place_outside_of_a_map_servers_map_is_refused_unless_it_is_free_there(
+    place: list[float], tmp_path: Path
+) -> None:
+    Image.fromarray(np.full((40, 80), 255, np.uint8)).save(tmp_path / "hall.pgm")
+    path = samples.write(tmp_path, "hall.yaml", samples.yaml(image="hall.pgm", resolution=0.05, origin=[0, 0, 0]))
+    within = MapFile(path, start=[0.4, 0.4], goal=[3.6, 1.6])
+    assert within.outside == "occupied" and within.draw([0], 0).goal.tolist() == [[3.6, 1.6]]
+    for name in ("start", "goal"):
+        with pytest.raises(InputError, match=r"a place on the map, .* unless scenario.outside=free") as error:
+            MapFile(path, **{"start": [0.4, 0.4], "goal": [3.6, 1.6]} | {name: place})
+        assert error.value.field == f"scenario.{name}"
+    assert MapFile(path, outside="free", start=[0.4, 0.4], goal=place).draw([0], 0).goal.tolist() == [place]
 
 
 def test_unknown_cells_count_as_asked(tmp_path: Path) -> None:

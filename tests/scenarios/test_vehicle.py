@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from torch import inf
 
 from torchgco import InputError
 from torchgco.dynamics import Planar, Unicycle
@@ -114,10 +115,11 @@ def test_a_file_may_give_positions_alone(name: str, positions: list, tmp_path) -
 
 def test_a_yard_makes_the_unicycles_problem() -> None:
     task = vehicle("unicycle").task(Yard().draw(range(3), 0))
-    spheres, bounds, boxes = task.problem.constraints
-    assert task.problem.dynamics == Unicycle(dt=0.1) and task.problem.N == 100
+    spheres, bounds, boxes, speed = task.problem.constraints
+    assert task.problem.dynamics == Unicycle(dt=0.1) and task.problem.N == 150
     assert spheres.centers.shape == (3, 8, 2) and boxes.centers.shape == (3, 6, 2)
     assert bounds.upper[0].tolist() == [2, 1.5]
+    assert speed.upper[0].tolist() == [inf] * 3 + [1] and speed.lower[0].tolist() == [-inf] * 3 + [-1]
     assert task.problem.x0.tolist() == [[-5, 0, 0, 0]] * 3 and task.goal.tolist() == [[5, 0]] * 3
 
 

@@ -59,7 +59,8 @@ def test_a_car_is_known_by_its_equations_and_its_body() -> None:
     assert found is not None and (found.heading, found.speed, found.radius) == (2, 3, 0.4)
     assert found.curvature == pytest.approx(TIGHT, rel=1e-12)
     assert car(corridor([[0.0, 1.2, 0.1]], vehicle=0.4)) is None
-    assert car(corridor([[0.0, 1.2, 0.1]], dynamics=Unicycle(0.1))) is None  # it turns on the spot
+    turns = car(corridor([[0.0, 1.2, 0.1]], dynamics=Unicycle(0.1)))
+    assert turns is not None and turns.on_the_spot and not found.on_the_spot
 
 
 def test_poses_are_clear_ball_by_ball() -> None:

@@ -21,7 +21,7 @@ BY_STATUS = {
     "in dynamics, cost and constraints.",
     Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost.",
     Status.NON_FINITE: 'Another U0, bounds on the controls, a smaller dt, or integrator="rk4".',
-    Status.INFEASIBLE: "Another guess U0, a longer horizon N, wider bounds; or loosen {row}, to see whether it is what "
+    Status.INFEASIBLE: "Another guess U0, {longer}wider bounds; or loosen {row}, to see whether it is what "
     "makes the problem infeasible.",
     Status.TIME_LIMIT: 'A larger max_seconds, or solver="gco_fast".',
     Status.UNBOUNDED: "Bounds on what grows, or a cost that keeps it small.",
@@ -35,9 +35,17 @@ MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
 TOUCHES = "All constraints hold at the knots, and the vehicle touches an obstacle between two of them."
 COVERED = "The goal is required, and an obstacle, grown by the vehicle's radius, covers all of it."
+STOPS_SHORT = "{longer}or a larger terminal weight: the trajectory stops short of the goal."
+ENOUGH = (
+    'Another guess U0, solver="gco_max", or a larger terminal weight: the trajectory stops short of the goal, though '
+    "the horizon suffices for the way."
+)
 NEARER = (
-    "A longer horizon N, weaker limits, or a larger radius of the goal; without required=True the solve tells how near "
-    "it gets."
+    "{longer}weaker limits, or a larger radius of the goal; without required=True the solve tells how near it gets."
+)
+OFF_MAP = (
+    'A {off} on the map; or read(path, outside="free"), on the command line scenario.outside=free, where there is room '
+    "around it."
 )
 OTHER_GOAL = "A goal that no obstacle covers, or a larger radius of it."
 KNOWN_START = (
@@ -62,6 +70,9 @@ class Facts:
         passage: the largest radius, m, that some way has room for; 0: none.
         in_unknown: whether the start is invalid for unknown cells of a map alone.
         unmoved: whether all violated rows have the same values for all controls.
+        horizon: of the stages and the way to the goal, with `suffices`, and a sentence as its text; None: unknown.
+        body: whether the vehicle isn't a ball: `radius` is then that of the ball about its position that it holds.
+        off_map: "start" or "goal", where that lies outside of a map that is occupied all around.
         named: whether the row that is violated most is named to the reader before.
         missed: by how much a required goal is missed, with its unit; None: it isn't, or isn't required.
         covered: whether one obstacle covers all of a required goal.
@@ -83,6 +94,9 @@ class Facts:
     named: bool = False
     missed: str | None = None
     covered: bool = False
+    horizon: Any = None
+    body: bool = False
+    off_map: str | None = None
 
     @property
     def touches(self) -> bool:
@@ -102,8 +116,16 @@ class Facts:
         if self.radius is None:
             return [self.status.sentence]
         room = "none of any radius" if self.passage == 0.0 else f"the widest has room for {self.passage:.3g} m"
-        no_way = f"No way through the map leads a vehicle of radius {self.radius:.3g} m to the goal: {room}."
+        what = "the ball inside the body," if self.body else "a vehicle"
+        no_way = f"No way through the map leads {what} of radius {self.radius:.3g} m to the goal: {room}."
+        if self.off_map is not None:
+            no_way += f" The {self.off_map} lies outside of the map, which is occupied all around."
         return [self.status.sentence, no_way]
+
+    @property
+    def longer(self) -> str:
+        """The horizon among other things to try, unless the way to the goal tells whether it is too short."""
+        return "a longer horizon N, " if self.horizon is None or self.horizon.suffices is None else ""
 
 
 def advice(facts: Facts) -> list[str]:
@@ -112,27 +134,39 @@ def advice(facts: Facts) -> list[str]:
         return [KNOWN_START]
     if facts.unmoved:
         return [MOVED]
+    if facts.off_map is not None:
+        return [OFF_MAP.format(off=facts.off_map)]
     if facts.radius is not None:
-        smaller = f", or a vehicle_radius of at most {facts.passage:.3g} m" if facts.passage > 0 else ""
+        size = "a narrower body" if facts.body else f"a vehicle_radius of at most {facts.passage:.3g} m"
+        smaller = f", or {size}" if facts.passage > 0 else ""
         return [f"A goal on the start's side of the walls, or a map with a wider way{smaller}."]
     found = list[str]()
     if facts.among_obstacles and facts.seeks_paths is False and not (facts.status in FITS and facts.reached):
         found.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')
+    if facts.horizon is not None and facts.horizon.suffices is False and not facts.reached:
+        found.append(str(facts.horizon))
     if facts.pathless and not facts.reached:
         found.append("A look at the scene (torchgco.plot): no path to the goal was found between the obstacles.")
     if facts.touches:
         found.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
     elif facts.status in FITS and facts.reached is False:
-        found.append("A longer horizon N, or a larger terminal weight: the trajectory stops short of the goal.")
+        suffices = facts.horizon is not None and facts.horizon.suffices
+        found.append(ENOUGH if suffices else capital(STOPS_SHORT.format(longer=facts.longer).removeprefix("or ")))
     elif facts.missed is not None and facts.status is Status.INFEASIBLE:
-        found.append(OTHER_GOAL if facts.covered else NEARER)
+        found.append(OTHER_GOAL if facts.covered else capital(NEARER.format(longer=facts.longer)))
     elif facts.status in BY_STATUS:
         limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
         row = "the row named above" if facts.named else "one constraint after the other"
-        found.append(BY_STATUS[facts.status].format(limits=f" ({', '.join(limits)})" if limits else "", row=row))
+        limited = f" ({', '.join(limits)})" if limits else ""
+        found.append(BY_STATUS[facts.status].format(limits=limited, row=row, longer=facts.longer))
     if tells_to_record(facts):
         found.append("torchgco.solve(..., record=True), after which explain tells what each pass did.")
     return found
+
+
+def capital(text: str) -> str:
+    """The text with a capital letter at its beginning."""
+    return text[:1].upper() + text[1:]
 
 
 def tells_to_record(facts: Facts) -> bool:

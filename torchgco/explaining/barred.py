@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from torchgco.base.status import Status
@@ -11,7 +12,7 @@ from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.maps.field import BoundField, distance_within
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.passage import widest_passage
-from torchgco.obstacles.base import ADMITTED
+from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.problem.covered import covered_goals
 from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
@@ -32,23 +33,37 @@ def goal_facts(problem: Problem, X: Tensor, U: Tensor) -> dict[str, Any]:
 
 def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]:
     """Those of `Facts` that maps know, for a batch of one; none where the vehicle arrived without contact."""
-    fields = [part for part in problem.obstacles if isinstance(part, BoundField)]
+    fields = [part for part in problem.obstacles if isinstance(part.inscribed, BoundField)]
     if status is Status.INVALID_START:
-        return {"in_unknown": any(_is_unknown(problem, field) for field in fields)}
+        return {"in_unknown": any(_is_unknown(problem, one) for one in fields if isinstance(one, BoundField))}
     if arrived or problem.goal is None:
         return {}
     found = [fact for field in fields if field.holds_at(problem.N) and (fact := _barred(problem, field)) is not None]
     return min(found, key=lambda fact: fact["passage"], default={})
 
 
-def _barred(problem: Problem, field: BoundField) -> dict[str, float] | None:
+def _barred(problem: Problem, part: Obstacles) -> dict[str, Any] | None:
     """The vehicle's radius and the largest that gets to the goal, where this one touches the map on every way."""
-    assert problem.goal is not None
+    field = part.inscribed  # of a body, as the ball meets it that the body holds
+    assert problem.goal is not None and isinstance(field, BoundField)
     start = problem.x0[0, problem.position].detach().cpu().double().numpy()
     goal = problem.goal.position[0].detach().cpu().double().numpy()
     radius, goal_radius = float(field.vehicle_radius[0]), float(problem.goal.radius[0])
     passage = widest_passage(field.field, int(field.which[0]), start, goal, goal_radius, CONTACT_FACTOR * radius)
-    return None if passage is None else {"radius": radius, "passage": passage}
+    if passage is None:
+        return None
+    ends = {"start": start, "goal": goal}
+    off = [name for name, place in ends.items() if passage == 0.0 and _shuts_out(field, place)]
+    return {"radius": radius, "passage": passage, "body": part is not field, "off_map": off[0] if off else None}
+
+
+def _shuts_out(field: BoundField, place: np.ndarray) -> bool:
+    """Whether a place lies outside of a grid whose outermost cells are all occupied."""
+    source = field.field.single(int(field.which[0])).source
+    if not isinstance(source, OccupancyGrid) or source.holds(place):
+        return False
+    (held,) = source.held(field.field.unknown)
+    return all(bool(held.take((0, -1), axis).all()) for axis in range(source.d))
 
 
 def _is_unknown(problem: Problem, field: BoundField) -> bool:

@@ -147,6 +147,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
         unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.full_X, one.full_U, ADMITTED)),
+        horizon=None if reached or not hasattr(solver, "horizon") else solver.horizon(one.problem),
         named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,
         **goal_facts(one.problem, one.X, one.U),
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),

@@ -184,6 +184,10 @@ class OccupancyGrid:
         cells = np.pad(self.occupied, rim, constant_values=1)
         return OccupancyGrid(cells, self.origin - self.resolution, self.resolution)
 
+    def holds(self, point: Any) -> bool:
+        """Whether a point (d,), m, lies on a grid that all problems share."""
+        return bool(((point >= self.origin) & (point <= self.upper)).all())
+
     def cell(self, points: Any) -> np.ndarray:
         """Indices (..., d) of the cells that hold points (..., d), m; outside of the grid they aren't in its shape.
 

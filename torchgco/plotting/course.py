@@ -21,7 +21,7 @@ from torchgco.obstacles.body import BoundBody
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import Ball, Solid
 from torchgco.plotting.gates import Outline, draw_gates
-from torchgco.plotting.maps import draw_map, unknown_handles
+from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Scene, contacts, view
 from torchgco.plotting.silhouettes import balls_at, silhouettes
 from torchgco.plotting.style import INK, PALETTE
@@ -157,7 +157,7 @@ def draw_contacts(ax: Axes, places: np.ndarray, plane: draw.Plane) -> None:
 def handles(course: Course, touched: bool) -> list[Artist]:
     """Entries of a legend: the contacts, where there are any, and what a map doesn't know."""
     found: list[Artist] = [Line2D([], [], label="contact", **CONTACT)] if touched else []
-    return [*found, *unknown_handles(course.map)]
+    return [*found, *map_handles(course.map)]
 
 
 def _is_still(body: Solid) -> bool:

@@ -21,7 +21,7 @@ from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid
 from torchgco.plotting.gates import draw_gates
 from torchgco.plotting.grid import grid, put_head
-from torchgco.plotting.maps import draw_map, unknown_handles
+from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
 from torchgco.plotting.silhouettes import draw_body, extent
 from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
@@ -370,4 +370,4 @@ def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str])
     }
     handles += [handle for kind, handle in shapes.items() if kind in drawn]
     handles += moving_handles(first, colours.get(first, EDGE)) if "moving" in drawn else []
-    return [*handles, *unknown_handles(scene.map)]
+    return [*handles, *map_handles(scene.map)]

@@ -1,4 +1,4 @@
-"""Maps of occupied cells or points, drawn by their distance fields; unknown cells have a colour of their own."""
+"""Maps of cells or points, drawn by their distance fields; unknown cells have a colour of their own, a grid an edge."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 
 from torchgco.maps.distance import DistanceField
 from torchgco.maps.grid import OccupancyGrid
@@ -14,6 +14,7 @@ from torchgco.plotting.bodies import Plane
 
 INSIDE_WITHIN = 0.01  # spacings of the lattice: so near counts as inside
 PICTURE_NODES = 1500  # along an axis of a picture
+EDGE_OF_MAP = {"fill": False, "edgecolor": "#555555", "linewidth": 0.9, "linestyle": (0, (7, 3))}
 UNSEEN = "#BFD3EA"  # blue and pale, as free is white and what is occupied brown
 
 
@@ -46,6 +47,9 @@ def draw_map(
     if has_unknown(field):
         _draw_unknown(ax, field, path, plane)
         drawn.add("unknown")
+    if isinstance(field.source, OccupancyGrid):
+        (x0, y0), (x1, y1) = ((end[0, plane[0]], end[0, plane[1]]) for end in (field.origin, field.upper))
+        ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, zorder=0.4, **EDGE_OF_MAP))
     ax.set_xlim(limits[0])
     ax.set_ylim(limits[1])
     return drawn
@@ -56,11 +60,12 @@ def has_unknown(field: DistanceField | None) -> bool:
     return field is not None and isinstance(field.source, OccupancyGrid) and bool(field.source.is_unknown.any())
 
 
-def unknown_handles(field: DistanceField | None) -> list[Artist]:
-    """The legend's entry of the unknown cells, where there are any."""
-    if field is None or not has_unknown(field):
+def map_handles(field: DistanceField | None) -> list[Artist]:
+    """The legend's entries of unknown cells, where there are any, and of the edge of a map of cells."""
+    if field is None or not isinstance(field.source, OccupancyGrid):
         return []
-    return [Patch(facecolor=UNSEEN, label=f"unknown, counts as {field.unknown}")]
+    unknown = [Patch(facecolor=UNSEEN, label=f"unknown, counts as {field.unknown}")] if has_unknown(field) else []
+    return [*unknown, Patch(label="edge of the map", **EDGE_OF_MAP)]
 
 
 def _draw_unknown(ax: Axes, field: DistanceField, path: np.ndarray, plane: Plane) -> None:

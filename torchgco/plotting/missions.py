@@ -44,7 +44,7 @@ ENDS = {
     Outcome.DIVERGED: "#4D4D4D",
 }
 NARROW_BAR = 0.06  # share of a bar below which no count is written into it
-FLOOR = 1e-16  # N: smallest violation on a logarithmic axis
+FLOOR, LEAST_TIME = 1e-16, 1e-6  # N and s: the smallest violation and time on logarithmic axes
 POSITION_AXES = ("x", "y", "z")
 
 
@@ -222,20 +222,20 @@ def tracking_figure(frame: pd.DataFrame, part: Literal["both", "violation", "tim
         frame: with columns t, tracking_violation and tracker_seconds; a time is that of all solves of a control step.
         part: a panel each, or one of them alone.
 
-    Violations below 1e-16 N, zero included, are drawn there. Raises InputError as `compute_figure`.
+    Violations below 1e-16 N, zero included, are drawn there, times below a microsecond there. Raises InputError as
+    `compute_figure`.
     """
     values = flight(frame, "t", "tracking_violation", "tracker_seconds")
     series = {
-        "violation": (np.maximum(values["tracking_violation"], FLOOR), "violation [N]", "log"),
-        "time": (1e3 * values["tracker_seconds"], "tracker's time\nper control step [ms]", "linear"),
+        "violation": (np.maximum(values["tracking_violation"], FLOOR), "violation [N]"),
+        # The first step may have compiled a kernel: on a linear axis all others would lie on its end.
+        "time": (1e3 * np.maximum(values["tracker_seconds"], LEAST_TIME), "tracker's time\nper control step [ms]"),
     }
     shown = [series[name] for name in (series if part == "both" else (part,))]
     figure, axes = panels(len(shown), 1, (7.2, 2.4))
-    for ax, (y, label, scale) in zip(axes, shown, strict=True):
+    for ax, (y, label) in zip(axes, shown, strict=True):
         ax.plot(values["t"], y, color=PALETTE[0], linewidth=1.2, drawstyle="steps-post")
-        ax.set(yscale=scale, ylabel=label)
-        if scale == "linear":
-            ax.set_ylim(bottom=0.0)
+        ax.set(yscale="log", ylabel=label)
         tidy(ax)
     axes[-1].set_xlabel("time in the mission [s]")
     return figure

@@ -32,7 +32,7 @@ from torchgco.plotting.layouts import (
     moving_corners,
     moving_handles,
 )
-from torchgco.plotting.maps import draw_map, unknown_handles
+from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import flown, leaving, passes, view
 from torchgco.plotting.silhouettes import draw_body, extent
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
@@ -46,7 +46,7 @@ from torchgco.solution import Solution
 WIDTH = 9.0  # inches
 PANELS_ACROSS = 4  # of histories
 PANEL = 1.45  # inches, the height of a history
-TALLEST_SCENE = 4.2  # inches, the height of a scene
+TALLEST_SCENE, TALLEST_MAP = 4.2, 7.5  # inches, the height of a scene, and of one with a map, which has fine parts
 SHOWN_PROBLEMS = 6  # problems that are shown where none are named
 LIMIT_SPANS = 1.0  # spans of the data within which a limit is shown
 
@@ -180,7 +180,8 @@ class _Map:
 
     def height(self, wide: float) -> float:
         """Inches, for a width in inches."""
-        return min(TALLEST_SCENE, wide * sum(self.shares)) + 0.45 * len(self.planes)
+        tallest = TALLEST_SCENE if all(scene.map is None for scene in self.world.scenes) else TALLEST_MAP
+        return min(tallest, wide * sum(self.shares)) + 0.45 * len(self.planes)
 
     def draw(self, figure: SubFigure) -> set[str]:
         """Draw each plane into axes of its own; returns the kinds of what is drawn, for the legend."""
@@ -257,9 +258,9 @@ def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
     points: list[Artist] = [
         Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in ("contact", "away") if kind in drawn
     ]
-    unknown = [handle for one in maps for scene in one.world.scenes for handle in unknown_handles(scene.map)]
+    of_maps = [handle for one in maps for scene in one.world.scenes for handle in map_handles(scene.map)]
     moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []
-    known = {handle.get_label(): handle for handle in reversed(unknown)}
+    known = {handle.get_label(): handle for handle in reversed(of_maps)}
     return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *known.values()]
 
 

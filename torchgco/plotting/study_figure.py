@@ -19,7 +19,7 @@ from torchgco.base.errors import InputError
 from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE
 from torchgco.plotting.layouts import draw_layout, ends, ends_shown, flights_of, views
-from torchgco.plotting.maps import unknown_handles
+from torchgco.plotting.maps import map_handles
 from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.scene import Arrays, Scene, scene_of
 from torchgco.plotting.style import INK, TEXT, legend_columns, solver_colours, solver_dash, tidy
@@ -137,7 +137,7 @@ def _handles(summary: pd.DataFrame, form: Print, scene: Scene, ends: list[Artist
     points = [*ends_shown(scene), Line2D([], [], color=INK, marker="X", linestyle="none", label="contact")]
     for point in points:
         point.set_markersize(9 * form.thin)
-    return [*lines, *points, *ends, *unknown_handles(scene.map)]
+    return [*lines, *points, *ends, *map_handles(scene.map)]
 
 
 def _rates(ax: Axes, summary: pd.DataFrame) -> None:

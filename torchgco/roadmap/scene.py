@@ -56,13 +56,14 @@ def has_maps(problem: Problem) -> bool:
 
 
 def around_body(problem: Problem, scene: Scene) -> Scene | None:
-    """The same scene as the ball meets it that holds the body; None without a body, and among maps."""
+    """The same scene as the ball meets it that holds the body; None without a body."""
     bodies = [part for part in problem.obstacles if isinstance(part, BoundBody)]
-    if not bodies or scene.obstacles.maps:
+    if not bodies:
         return None
     more = torch.stack([part.overhang for part in bodies]).amax(0)
-    spheres, boxes, _ = scene.obstacles
-    return replace(scene, obstacles=Inflated(spheres.grown(more), None if boxes is None else boxes.grown(more)))
+    spheres, boxes, maps = scene.obstacles
+    grown = None if boxes is None else boxes.grown(more)
+    return replace(scene, obstacles=Inflated(spheres.grown(more), grown, tuple(part.grown(more) for part in maps)))
 
 
 def has_paths(problem: Problem) -> bool:

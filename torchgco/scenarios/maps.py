@@ -15,8 +15,8 @@ import numpy as np
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Seed, check_options, check_value
 from torchgco.maps.distance import DistanceField, Unknown
-from torchgco.maps.files import read, read_task
-from torchgco.maps.grid import OccupancyGrid, coordinates
+from torchgco.maps.files import read, read_task, usual_outside
+from torchgco.maps.grid import coordinates
 from torchgco.roadmap.shortest import shortest_way
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import MAX_DRAWS, Scenario, generator
@@ -25,7 +25,8 @@ from torchgco.scenarios.layouts import Layouts
 VEHICLE_RADIUS, GOAL_RADIUS = 0.25, 0.3  # m, where neither the command nor the file says them
 CLEAR = 1.2  # drawn places are as free as for a vehicle of this many radii
 DRAWN_PACES = {2: 0.7, 3: 2.0}  # m/s, by the dimension of space
-READ = "resolution", "radius", "origin", "height", "topic", "layer", "box", "solid"  # fields that `read` takes
+# Fields that `read` takes.
+READ = "resolution", "radius", "origin", "height", "topic", "layer", "box", "solid", "outside"
 ENDS_APART = 0.4  # share of the free space's diagonal that drawn starts and goals are apart, at least
 
 
@@ -37,9 +38,8 @@ class MapFile(Scenario):
     space that is free for the vehicle, at least 0.4 of its diagonal apart, else as far as can be.
 
     Args:
-        path, resolution, radius, origin, height, topic, layer, box, solid: see `read`.
+        path, resolution, radius, origin, height, topic, layer, box, solid, outside: see `read`.
         unknown: what unknown cells count as.
-        outside: what lies around a map's cells: "free", or "occupied", a rim of one cell.
         start, goal: positions (d,), m.
         vehicle_radius, goal_radius: m; None: the file's, or 0.25 and 0.3.
         pace: mean speed for which horizons have room, m/s; None: 0.7 in the plane, 2 in space.
@@ -61,7 +61,7 @@ class MapFile(Scenario):
     box: Any = None
     solid: bool | None = None
     unknown: Unknown = "occupied"
-    outside: Unknown = "free"
+    outside: Unknown | None = None
     start: Any = None
     goal: Any = None
     vehicle_radius: checks.Length | None = None
@@ -79,11 +79,8 @@ class MapFile(Scenario):
         put("name", "map")
         check_options(self, "scenario")
         put("path", os.path.expanduser(self.path))
+        put("outside", self.outside or usual_outside(self.path, self.height, "scenario"))
         found = read(self.path, field="scenario", **{key: getattr(self, key) for key in READ})
-        if self.outside == "occupied":
-            if not isinstance(found, OccupancyGrid):
-                raise InputError("scenario.outside", "free: a cloud of points has no edge", self.outside)
-            found = found.enclosed()
         put("map", DistanceField.of(found, self.unknown))
         put("name", Path(self.path).stem)
         task = read_task(Path(self.path)) | {
@@ -125,6 +122,9 @@ class MapFile(Scenario):
         place = coordinates(value, f"scenario.{name}")
         if place.shape != (self.dimension,) or not (np.abs(place) <= checks.TOO_LARGE).all():
             expected = f"{self.dimension} coordinates within {checks.TOO_LARGE:g} m, as the map is {self.dimension}-D"
+            raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
+        if self.outside == "occupied" and not self.map.source.holds(place):
+            expected = "a place on the map, around which all is occupied unless scenario.outside=free"
             raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
         return place
 

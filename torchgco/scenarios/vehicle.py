@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import AtLeast, Count, Extended, Meters, Natural, check_options, check_value
+from torchgco.base.options import Above, AtLeast, Count, Extended, Meters, Natural, check_options, check_value
 from torchgco.base.shapes import check_device
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
@@ -69,6 +69,7 @@ class Vehicle:
         stages: N.
         state_lower, state_upper: (n,), bounds on the states at all knots but the first; None for a state, or for all:
             no bound.
+        speed: the largest, m/s, forwards and backwards, of a model with a state of this name; None: no bound.
         arrives: which states must be those of the goal at the end, where layouts require the goal or leave the time
             free; None: the position, within the goal's radius.
         footprint: corners [lower, upper] of the box that the vehicle fills, (d,) each from its position along its own
@@ -96,6 +97,7 @@ class Vehicle:
     stages: Count
     state_lower: Sequence[Extended | None] | None = None
     state_upper: Sequence[Extended | None] | None = None
+    speed: Annotated[float, Above(0, "m/s")] | None = None
     arrives: Sequence[Natural] | None = None
     footprint: Sequence[Sequence[float]] | None = None
     cells: Sequence[Count] | None = None
@@ -106,6 +108,8 @@ class Vehicle:
         for name in ("state_lower", "state_upper"):
             if getattr(self, name) is not None and len(getattr(self, name)) != n:
                 raise InputError(f"vehicle.{name}", f"{n} numbers", repr(getattr(self, name)))
+        if self.speed is not None and "speed" not in self.dynamics.state_names:
+            raise InputError("vehicle.speed", "none for a model without a state of this name", self.speed)
         if self.arrives is not None and not all(i < n for i in self.arrives):
             raise InputError("vehicle.arrives", f"some of the states 0..{n - 1}", repr(self.arrives))
         if (self.footprint is None) != (self.cells is None):
@@ -255,12 +259,15 @@ class Vehicle:
     @property
     def _state_bounds(self) -> list[StateBounds]:
         """Bounds on the states, where there are any."""
-        if self.state_lower is None and self.state_upper is None:
+        if self.state_lower is None and self.state_upper is None and self.speed is None:
             return []
         given = (self.state_lower, -inf), (self.state_upper, inf)
         lower, upper = (
             [none if bound is None else bound for bound in side or [None] * self.dynamics.n] for side, none in given
         )
+        if self.speed is not None:
+            i = self.dynamics.state_names.index("speed")
+            lower[i], upper[i] = max(lower[i], -self.speed), min(upper[i], self.speed)
         return [StateBounds(lower, upper)]
 
     def _required(self, goal: Tensor, center: Tensor, radius: float) -> Goal:

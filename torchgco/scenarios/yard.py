@@ -32,7 +32,7 @@ class Yard(Family):
     start: checks.Point2 = (-5.0, 0.0)
     goal: checks.Point2 = (5.0, 0.0)
     goal_radius: checks.Size = 0.5
-    stages: checks.Stages = 100
+    stages: checks.Stages = 150
     dt: checks.TimeStep = 0.1
     num_discs: checks.Number = 8
     num_boxes: checks.Number = 6

@@ -1,4 +1,4 @@
-"""Cars with a body, solved from manoeuvres: paths of the whole pose through what is hardly wider than the body.
+"""Bodies with a heading, solved from manoeuvres: paths of the whole pose through what is hardly wider than the body.
 
 The roadmap's paths are of the ball that the body holds. They lead from aside into openings where the body can't turn,
 and no candidate along them backs up. A path of poses does, and the interior point starts close to it.
@@ -10,43 +10,50 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from torchgco.kernels import chord_clearance
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.lattice import Array
+from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.lattice import Array, Lattice
+from torchgco.roadmap.mapped import Price, Ways, in_one, ways_of
 from torchgco.roadmap.scene import scales, scene_of
 from torchgco.search.candidates import Candidates
 from torchgco.search.chords import EXTRA
-from torchgco.search.poses import ARC_LENGTH, Poses, clear_at
+from torchgco.search.poses import ARC_LENGTH, TIGHTEST, Poses, clear_at
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solved
 from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
 
 GROWTH_ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
+SPOT_TURN = 0.125  # rad that a vehicle turns on the spot from one pose to the next
 PATH_PACES = 0.6, 0.8, 1.0  # shares of the horizon in which a path is driven: each is a start of the interior point
 MANOEUVRES_TEXT = f"a path of poses, forwards and backwards, at {len(PATH_PACES)} paces; interior point from each"
 
 
 @dataclass(frozen=True)
 class Car:
-    """A vehicle that drives along its heading, and turns by a curvature.
+    """A vehicle that drives along its heading, and turns by a curvature or on the spot.
 
     Args:
         heading, speed: places in the state.
-        curvature: the largest that it can steer either way, 1/m.
+        curvature: the largest that it can steer either way, 1/m; of one that turns on the spot, by which it turns
+            over an arc as far as it is looked at there.
         radius: of the body's largest ball, m.
+        on_the_spot: whether it turns at rest, too.
     """
 
     heading: int
     speed: int
     curvature: float
     radius: float
+    on_the_spot: bool = False
 
 
 def car(problem: Problem) -> Car | None:
-    """The car with a body of a batch of one, by its equations; None of another vehicle."""
+    """The vehicle with a body of a batch of one that drives along its heading, by its equations; None of another."""
     bodies = [part for part in problem.obstacles if isinstance(part, BoundBody)]
     if not bodies or not bool(torch.isfinite(problem.x0).all()):
         return None
@@ -58,8 +65,10 @@ def car(problem: Problem) -> Car | None:
     if places is None or any(part.points.attitude.of != places[0] for part in bodies):
         return None
     heading, speed = places
+    radius = max(float(part.vehicle_radius.max()) for part in bodies)
     if not alike(seen.rates[:, heading], z[0, :, speed] * seen.slopes[:, heading, speed]):
-        return None  # it turns at rest, too
+        arc = TIGHTEST * ARC_LENGTH * radius
+        return Car(heading, speed, SPOT_TURN / arc, radius, True) if radius > 0.0 else None
     on = (seen.slopes[:, heading].abs() > SAME_MODEL).any(0)
     on[speed] = False
     corners = z.repeat(1, 2, 1)
@@ -69,24 +78,26 @@ def car(problem: Problem) -> Car | None:
     corners[..., speed] = 1.0
     turns = problem.dynamics.field(corners[..., :n], corners[..., n:])[0, :, heading]
     curvature = min(float(turns.max()), -float(turns.min()))
-    radius = max(float(part.vehicle_radius.max()) for part in bodies)
     return Car(heading, speed, curvature, radius) if curvature > 0.0 and radius > 0.0 else None
 
 
-def manoeuvre(search: Search) -> None:
-    """Solve the problems of cars with a body that haven't arrived, or touch between knots, from manoeuvres.
+def manoeuvre(search: Search, on_the_spot: bool) -> None:
+    """Solve the problems of bodies that haven't arrived from manoeuvres.
 
-    Where every trajectory from these touches between knots, too, they are solved again among obstacles that have grown.
+    Of vehicles that turn on the spot, or of others, of these also the ones that touch between knots. Where every
+    trajectory from these touches between knots, too, they are solved again among obstacles that have grown.
     """
     if not any(isinstance(part, BoundBody) for part in search.call.problem.obstacles):
         return
     best, limit = search.best.end.best, search.solver.violation_tolerance
-    left = (best.violation <= limit) & (chord_clearance(search.call.problem, best.X) < 0.0)
+    left = torch.zeros_like(best.violation, dtype=torch.bool)
+    if not on_the_spot:
+        left = (best.violation <= limit) & (chord_clearance(search.call.problem, best.X) < 0.0)
     left[search.rows("unarrived")] = True
     rows = left.nonzero().flatten()
     if rows.numel() == 0:
         return
-    made = _made(search, rows)
+    made = _made(search, rows, on_the_spot)
     if made is None:
         return
     rows, made = made
@@ -96,7 +107,8 @@ def manoeuvre(search: Search) -> None:
         good = ends.cost.isfinite()
         clearance = torch.full_like(ends.cost, torch.inf)
         some = good.nonzero().flatten()
-        clearance[some] = chord_clearance(made.of(some), ends.candidates.X[some])
+        if some.numel() > 0:  # a map has no distances from nowhere
+            clearance[some] = chord_clearance(made.of(some), ends.candidates.X[some])
         lacks = torch.where(good, clearance, -torch.inf).view(-1, made.count).amax(1)
         again = ((lacks < 0.0) & torch.isfinite(lacks)).nonzero().flatten()
         if again.numel() == 0 or search.call.late:
@@ -105,14 +117,16 @@ def manoeuvre(search: Search) -> None:
         rows, made = rows[again], made.of_problems(again)
 
 
-def _made(search: Search, rows: Tensor) -> tuple[Tensor, Candidates] | None:
+def _made(search: Search, rows: Tensor, on_the_spot: bool) -> tuple[Tensor, Candidates] | None:
     """Those of the problems in `rows` that have manoeuvres, and these as candidates; None without any."""
     problem = search.call.problem.take(rows)
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
     scene = scene_of(problem, rest)
     if scene is None or scene.gates is not None:
         return None
-    found = [_driven(problem.take(torch.tensor([b], device=rows.device))) for b in range(problem.B)]
+    found = [
+        _driven(problem.take(torch.tensor([b], device=rows.device)), scene, b, on_the_spot) for b in range(problem.B)
+    ]
     some = [b for b, one in enumerate(found) if one is not None]
     if not some:
         return None
@@ -124,10 +138,14 @@ def _made(search: Search, rows: Tensor) -> tuple[Tensor, Candidates] | None:
     return rows[at], replace(made, X=torch.cat([one for one in found if one is not None]))
 
 
-def _driven(problem: Problem) -> Tensor | None:
-    """States (len(PATH_PACES), N+1, n) of a batch of one along a manoeuvre to the goal; None where none is found."""
+def _driven(problem: Problem, scene: Scene, b: int, on_the_spot: bool) -> Tensor | None:
+    """States (len(PATH_PACES), N+1, n) of a batch of one along a manoeuvre to the goal; None where none is found.
+
+    Args:
+        scene, b: the problem as the search sees it, at a place among others.
+    """
     vehicle = car(problem)
-    if vehicle is None:
+    if vehicle is None or vehicle.on_the_spot != on_the_spot:
         return None
     goal, at, heading = problem.goal, problem.position, vehicle.heading
     assert goal is not None
@@ -135,9 +153,14 @@ def _driven(problem: Problem) -> Tensor | None:
     end = np.append(goal.position[0].double().cpu().numpy(), np.nan)
     if goal.state is not None:
         end[2] = float(goal.state[0, heading])
-    space = Poses(clear_at(problem, heading), vehicle.curvature, ARC_LENGTH * vehicle.radius)
-    # Where the pose at the end is known, it is the one with less room, and the search begins there.
     known = not np.isnan(end[2])
+    rest = None
+    if on_the_spot or scene.obstacles.maps:  # through rooms, or around all sides: the straight way says little
+        rest = Rest.of(scene, b, int(not known))
+        if rest is None:
+            return None
+    space = Poses(clear_at(problem, heading), vehicle.curvature, ARC_LENGTH * vehicle.radius, on_the_spot, rest)
+    # Where the pose at the end is known, it is the one with less room, and the search begins there.
     path = space.path(end, start) if known else space.path(start, end)
     if path is None or len(path) < 2:
         return None
@@ -153,16 +176,55 @@ def _driven(problem: Problem) -> Tensor | None:
     return X
 
 
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """The ways of the ball that a body holds from anywhere to start or goal, over the blocks of the roadmap.
+
+    Args:
+        lattice: of the roadmap.
+        side: of a cell, in spacings of the nodes.
+        ways: from each cell (X, Y), m; infinite where there is none. Next to one that has a way, a cell has its way.
+    """
+
+    lattice: Lattice
+    side: int
+    ways: Array
+
+    @classmethod
+    def of(cls, scene: Scene, b: int, end: int) -> Rest | None:
+        """Those to the start (0) or goal (1) of the problem at place b of a scene; None where no way joins them."""
+        found = list[Ways]()
+
+        def search(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> list[Array]:
+            ways = ways_of(lattice, ends, lambda points: np.ones(len(points)), radius, 0.0)
+            found.extend([] if ways is None else [ways])
+            return []
+
+        in_one(scene, b, 0.0, search)
+        if not found:
+            return None
+        blocks = found[0].blocks
+        ways = np.append(found[0].costs[end], np.inf)[blocks.block].reshape(blocks.counts)[..., 0]
+        ways = np.where(np.isfinite(ways), ways, minimum_filter(ways, 3, mode="nearest"))
+        return cls(blocks.lattice, blocks.side, ways)
+
+    def __call__(self, poses: Array) -> Array:
+        """From poses (K, 3), (K,), m."""
+        return self.ways[tuple((self.lattice.node(poses[:, :2]) // self.side).T)]
+
+
 def driven_in_time(path: Array, K: int, share: float, duration: float) -> tuple[Array, Array]:
     """Poses (K + 1, 3) and speeds (K + 1,) at the knots of a drive along poses (P, 3) in a share of the duration, s.
 
     From one change of direction to the next the vehicle drives from rest to rest, in a time that grows with the root of
-    the length: so the integral of the squared acceleration is least.
+    the length: so the integral of the squared acceleration is least. A turn on the spot counts as long as a step.
     """
     steps = np.diff(path, axis=0)
     mean = 0.5 * (path[1:, 2] + path[:-1, 2])
-    sign = np.where(steps[:, 0] * np.cos(mean) + steps[:, 1] * np.sin(mean) < 0.0, -1.0, 1.0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
+    sign = np.where(steps[:, 0] * np.cos(mean) + steps[:, 1] * np.sin(mean) < 0.0, -1.0, 1.0)
+    still = lengths == 0.0
+    sign[still], lengths[still] = 0.0, lengths.max(initial=0.0) or 1.0
     along = np.append(0.0, np.cumsum(lengths))
     turns = np.flatnonzero(np.diff(sign)) + 1
     first, last = np.append(0, turns), np.append(turns, len(steps))

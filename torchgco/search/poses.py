@@ -1,9 +1,10 @@
-"""Manoeuvres of a car-like body: paths of its whole pose, forwards and backwards, that keep every ball clear.
+"""Manoeuvres of a body with a heading: paths of its whole pose, forwards and backwards, that keep every ball clear.
 
 A path of the ball that a body holds says nothing of the heading: before an opening hardly wider than the body it leads
 in from aside, where the body can't turn. This search is over positions and heading: from one pose to the next the
-vehicle drives a short arc of a curvature that it can steer. Dolgov, Thrun, Montemerlo, Diebel, Path planning for
-autonomous vehicles in unknown semi-structured environments, IJRR 29 (2010): the cells of their hybrid A*.
+vehicle drives a short arc of a curvature that it can steer, or turns on the spot where it can. Dolgov, Thrun,
+Montemerlo, Diebel, Path planning for autonomous vehicles in unknown semi-structured environments, IJRR 29 (2010): the
+cells of their hybrid A*.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ TIGHTEST = 0.9  # share of the vehicle's largest curvature: steering from side t
 ARC_LENGTH = 0.5  # length of an arc in radii of the largest ball
 CELL = 0.6  # side of a cell as a share of an arc: each arc leaves its cell; with 0.7 two of 12 slots had no path
 CUSP = 2.0  # arcs that a change between forwards and backwards costs: the vehicle stops and steers again
+GREED = 1.3  # times the rest of the way through rooms counts: a tenth of the poses, for a way hardly longer
 END_POSE_ARCS = 0.5  # arcs within which a pose counts as that at the end of the path
 POSES_AT_ONCE = 2048  # poses that are measured together: bounds the memory
 MOST_POSES = 1_000_000  # poses that are kept, at most: bounds the time, to about six seconds
@@ -40,11 +42,15 @@ class Poses:
         clear: whether the body keeps clear at poses (K, 3): x and y, m, and heading, rad.
         curvature: the largest, 1/m.
         step: length of an arc, m.
+        on_the_spot: whether the vehicle turns where it stands, too, by as much as over an arc of that curvature.
+        rest: ways (K,), m, from poses (K, 3) to the target, at least; infinite where none leads there. None: straight.
     """
 
     clear: Callable[[Array], NDArray[np.bool_]]
     curvature: float
     step: float
+    on_the_spot: bool = False
+    rest: Callable[[Array], Array] | None = None
 
     def path(self, root: Array, target: Array) -> Array | None:
         """Poses (P, 3) from a root to a target, (3,), whose heading may be NaN: free; None where none is found."""
@@ -78,10 +84,11 @@ class _Wave:
             self.open.clear()
             return None
         s, k = self.space.step, TIGHTEST * self.space.curvature
-        arcs = np.array([(sign * s, c * k) for sign in (1.0, -1.0) for c in CURVATURES])
-        ds, bend = (np.tile(part, len(pose)) for part in arcs.T)
+        arcs = [(sign * s, sign * s * (c * k)) for sign in (1.0, -1.0) for c in CURVATURES]
+        arcs += [(0.0, s * k), (0.0, -s * k)] if self.space.on_the_spot else []
+        ds, by = (np.tile(part, len(pose)) for part in np.array(arcs).T)
         old, parent, from_, was = (np.repeat(part, len(arcs), axis=0) for part in (pose, place, way, ahead))
-        turned = old[:, 2] + ds * bend
+        turned = old[:, 2] + by
         mean = 0.5 * (old[:, 2] + turned)
         new = np.stack((old[:, 0] + ds * np.cos(mean), old[:, 1] + ds * np.sin(mean), turned), axis=1)
         far = from_ + 1.0 + CUSP * (was * ds < 0)
@@ -112,10 +119,13 @@ class _Wave:
         return poses[found[::-1]]
 
     def _push(self, pose: Array, way: Array, ahead: Array, place: NDArray[np.int64]) -> None:
-        left = np.hypot(*(pose[:, :2] - self.target[:2]).T) / self.space.step
+        straight = np.hypot(*(pose[:, :2] - self.target[:2]).T)
+        left = (straight if self.space.rest is None else GREED * self.space.rest(pose)) / self.space.step
         if not math.isnan(self.target[2]):
             turn = np.abs(pose[:, 2] - self.target[2]) / (TIGHTEST * self.space.curvature * self.space.step)
             left = np.maximum(left, turn)
+        some = np.isfinite(left)
+        pose, way, ahead, place, left = (part[some] for part in (pose, way, ahead, place, left))
         bucket = np.floor(way + left).astype(np.int64)
         for one in np.unique(bucket):
             some = bucket == one
@@ -131,7 +141,10 @@ class _Wave:
         """A number for the cell of each pose, and the way it is driven to."""
         side = CELL * self.space.step
         x, y = (np.floor(pose[:, a] / side).astype(np.int64) + 2**19 for a in (0, 1))
-        turn = np.floor(pose[:, 2] / (CELL * self.space.curvature * self.space.step)).astype(np.int64) + 2**15
+        heading = pose[:, 2]
+        if self.space.on_the_spot and math.isnan(self.target[2]):
+            heading = heading % (2.0 * math.pi)  # it needn't turn back
+        turn = np.floor(heading / (CELL * self.space.curvature * self.space.step)).astype(np.int64) + 2**15
         return ((x << 20 | y) << 17 | turn << 1) | (ahead < 0)
 
 

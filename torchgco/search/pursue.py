@@ -17,9 +17,11 @@ from torchgco.kernels import open_loop
 from torchgco.maps.ways import length
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import clear_ways, evenly, smoothed
+from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.mapped import even
 from torchgco.roadmap.roadmap import Roadmap
+from torchgco.roadmap.scene import around_body
 from torchgco.roadmap.search import HOPS
 from torchgco.search.candidates import Candidates
 from torchgco.search.following import Paths
@@ -43,7 +45,8 @@ ROUNDED = 2.0  # R: the standard deviation over which its corners are averaged
 LOOK_AHEAD = 2.4  # R that the vehicle looks ahead
 PURSUIT_TEXT = (
     f"what drives along its heading is steered along ways that keep clear, of {WAYS} to {2 * WAYS} classes, "
-    f"{WAY_PACES} paces, forwards and backwards; interior point from the {SOLVED_WAYS} cheapest"
+    f"{WAY_PACES} paces, forwards and backwards; interior point from the {SOLVED_WAYS} cheapest, "
+    f"with a body in maps also from the {SOLVED_WAYS} cheapest along ways of the ball around it"
 )
 EACH = 2 * WAY_PACES  # candidates of a way: forwards and backwards at each pace
 
@@ -53,33 +56,47 @@ def pursue(search: Search, rows: Tensor) -> None:
     part = search.part(rows)
     if part.scene is None or part.scene.gates is not None:  # to which these ways don't lead
         return
-    found = [_driven(part, b) for b in range(rows.numel())]
-    if not any(ways for ways, _ in found):
+    around = around_body(part.problem, part.scene) if part.scene.obstacles.maps else None
+    found = [_driven(part, b, around) for b in range(rows.numel())]
+    if not any(ways for ways, _, _ in found):
         return
     search.best.worked[rows] = True
-    paths, candidates = _candidates(part, found)
-    solve_cheapest(search, rows, part, paths, candidates, SOLVED_WAYS)
-    for place, (ways, _) in enumerate(found):
+    paths, candidates = _candidates(part, [(ways, controls) for ways, _, controls in found])
+    wide = torch.zeros_like(candidates.live).view(rows.numel(), -1)
+    for b, (ways, first, _) in enumerate(found):
+        wide[b, EACH * first : EACH * len(ways)] = True
+    solve_cheapest(search, rows, part, paths, candidates, SOLVED_WAYS, wide.flatten() if around is not None else None)
+    for place, (ways, _, _) in enumerate(found):
         search.steered[rows[place]] |= bool(ways) and not part.scene.obstacles.maps
 
 
-def _driven(part: Part, b: int) -> tuple[list[Array], Array]:
-    """Ways of the problem at place b, and controls (W * EACH, N, m) along these; none for other vehicles."""
+def _driven(part: Part, b: int, around: Scene | None) -> tuple[list[Array], int, Array]:
+    """Ways of the problem at place b, and controls (W * EACH, N, m) along these; none for other vehicles.
+
+    Args:
+        around: the scene as the ball meets it that holds the body; the ways through it come last.
+
+    Returns:
+        The ways, the place of the first such one among them, and the controls.
+    """
     assert part.scene is not None
     one = part.problem.take(torch.tensor([b], device=part.rest.device))
     R, unit = (float(scale[b]) for scale in part.scales)
     vehicle = steered(one) if np.isfinite(unit) and unit > 0 and bool(torch.isfinite(one.x0).all()) else None
     none = np.empty((0, one.N, one.m))
     if vehicle is None:
-        return [], none
+        return [], 0, none
     step = FINE * (radius_of(one) or 0.5 * R)
-    ways = [smoothed(evenly(way, step), ROUNDED / FINE) for way in _ways(part, b) if length(way) > 0.0]
+    near, far = _ways(part, b), [] if around is None else clear_ways(around, b, 1)
+    near, far = ([smoothed(evenly(w, step), ROUNDED / FINE) for w in some if length(w) > 0.0] for some in (near, far))
+    ways = [*near, *far]
     if not ways:
-        return [], none
+        return [], 0, none
     duration = float(one.stages[0]) * float(one.dynamics.dt)
     straight = float((part.scene.goal[b] - part.scene.start[b]).square().sum().sqrt())
     free = part.free(FREE_ITERATIONS)
-    return ways, driven(one, vehicle, _tracks(vehicle, ways, duration, float((free.share * free.slower)[b]) / straight))
+    tracks = _tracks(vehicle, ways, duration, float((free.share * free.slower)[b]) / straight)
+    return ways, len(near), driven(one, vehicle, tracks)
 
 
 def _ways(part: Part, b: int) -> list[Array]:

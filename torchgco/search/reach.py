@@ -27,6 +27,7 @@ CLIMBS = 40  # rounds of ascent from the samples, which halve a step of half the
 WIDER, GROWN = 100.0, 0.01  # times that range, in which what has no bounds may raise the acceleration by this share
 LEAST_SPEED = 1e-12  # m^2/s^2: squared speeds below it count as it
 FEWER = 4  # one in so many samples shows how strong the acceleration is
+LEEWAY = 1.25  # times the least stages: so many leave room for accelerating and turning, which that least hasn't
 SHORT_TIME = 1e-6  # s, over which a change of velocity is measured
 REACH_SEED = 0x5EED
 
@@ -61,6 +62,53 @@ def short_horizons(problem: Problem) -> str | None:
         f"{float(far[first]):.3g} m long, of which {int(problem.stages[first])} stages cover at most "
         f"{float(limit.reach(problem)[first]):.3g} m; {limit.advice(needed)}"
     )
+
+
+class Horizon(NamedTuple):
+    """A horizon and the way to the goal, of one problem."""
+
+    way: float  # m
+    reach: float  # m, at most, within the stages
+    stages: int
+    needed: int  # stages, at least
+    advice: str  # which horizon would do
+
+    @property
+    def suffices(self) -> bool | None:
+        """Whether it isn't what keeps the vehicle from the goal; None where it may be, but needn't."""
+        return False if self.needed > self.stages else True if self.stages >= LEEWAY * self.needed else None
+
+    def __str__(self) -> str:
+        """A sentence on one that is too short."""
+        return (
+            f"A longer horizon: the way to the goal is {self.way:.3g} m long, of which {self.stages} stages cover at "
+            f"most {self.reach:.3g} m; {self.advice}."
+        )
+
+
+def horizon_of(problem: Problem) -> Horizon | None:
+    """The horizon of a batch of one; None where no goal is stated, or nothing limits the way within it."""
+    goal = problem.goal
+    if goal is None or goal.assumed or problem.time is not None:
+        return None
+    with computing_on(problem.x0.device):
+        limit = limit_of(problem, CLIMBS)
+        if limit is None:
+            return None
+        far = goal.distance(problem.x0[:, problem.position])
+        far = torch.maximum(far, _ways(problem, torch.isfinite(far)))
+        needed = float(limit.stages(problem, (far - goal.radius).clamp(min=0.0))[0])
+        if not math.isfinite(needed):
+            return None
+        stages, reach = int(problem.stages[0]), float(limit.reach(problem)[0])
+        return Horizon(float(far[0]), reach, stages, math.ceil(needed), limit.advice(math.ceil(needed)))
+
+
+def within_reach(problem: Problem) -> Tensor:
+    """Whether horizons suffice for the straight way to the goal, (B,) bool; as far as is known."""
+    assert problem.goal is not None
+    limit, far = limit_of(problem), problem.goal.distance(problem.x0[:, problem.position])
+    return torch.ones_like(far).bool() if limit is None else far <= limit.reach(problem) + problem.goal.radius
 
 
 class Step(NamedTuple):

@@ -21,6 +21,7 @@ from torchgco.search.converge import Converge
 from torchgco.search.freed import Freed
 from torchgco.search.nearby import among_nearby
 from torchgco.search.proposals import PathProposals
+from torchgco.search.reach import Horizon, horizon_of
 from torchgco.search.search import Late, Search
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.suitability import suited_paths
@@ -120,6 +121,10 @@ class Restarts(Solver):
         through = partial(solved_through_gates, self.interior, limit)
         rounds = max((one.rounds for one in self.passes.steps if isinstance(one, ClearChords)), default=0)
         return Chooser(self, Freed(self.interior, limit, rounds), limit, paces=paces, through=through)
+
+    def horizon(self, problem: Problem) -> Horizon | None:
+        """What `Solution.explain` asks of the horizon of a batch of one; see `reach.horizon_of`."""
+        return horizon_of(problem)
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""

@@ -65,6 +65,8 @@ class Search:
         self.round: tuple[Tensor, Round] | None = None  # the problems (b,) with proposals, and these
         self.waiting: list[tuple[Tensor, SolveEnd]] = []  # rows and results that compete at the end
         self.proposed = torch.zeros_like(call.ids, dtype=torch.bool)  # (B,): whether there was ever a proposal
+        # (B,): whether the first solve, which wasn't stopped, ended short of a goal that is within reach.
+        self.stalled = torch.zeros_like(call.ids, dtype=torch.bool)
         # (B,): whether the vehicle has been steered along all paths, so that there is no use in tracking these.
         self.steered = torch.zeros_like(call.ids, dtype=torch.bool)
         self.rejected = torch.full_like(call.U0[:, 0, 0], torch.nan)  # (B,): mu of the proposals rejected so far
@@ -111,12 +113,12 @@ class Search:
         return self.record.in_costs(unit, constant)
 
     def rows(self, when: str) -> Tensor:
-        """The problems (b,) that a word describes, all among those that were caught.
+        """The problems (b,) that a word describes, all among those that were caught, or stalled.
 
         "caught": all of them; "unarrived": no attempt has arrived yet; "far": none ends close to the goal either;
         "close": the best one does, but has not arrived; "unproposed": not arrived, and there was never a proposal.
         """
-        rows = (self.caught.status == STOPPED).nonzero().flatten()
+        rows = ((self.caught.status == STOPPED) | self.stalled).nonzero().flatten()
         if when == "caught" or rows.numel() == 0:
             return rows
         rows = rows[~self.best.arrived()[rows]]

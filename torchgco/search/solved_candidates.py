@@ -76,13 +76,25 @@ def solved(search: Search, rows: Tensor, chosen: Candidates, grown: Tensor | Non
     return Refined(replace(chosen, X=X, U=U), multipliers, best, cost)
 
 
-def solve_cheapest(search: Search, rows: Tensor, part: Part, paths: Paths, candidates: Candidates, count: int) -> None:
+def solve_cheapest(
+    search: Search,
+    rows: Tensor,
+    part: Part,
+    paths: Paths,
+    candidates: Candidates,
+    count: int,
+    others: Tensor | None = None,
+) -> None:
     """Solve the first of the candidates `in_order`, `count` for each problem in `rows`, and record what became of all.
 
     Args:
         part: the same problems, with the paths that the candidates follow.
+        others: (B * candidates,) bool: candidates of which as many are solved beside the first of the rest.
     """
-    chosen = candidates.pick(in_order(candidates)[:, :count])
+    kinds = [candidates.live] if others is None else [candidates.live & ~others, candidates.live & others]
+    orders = [in_order(replace(candidates, live=live))[:, :count] for live in kinds]
+    live = [kind.view(rows.numel(), -1).gather(1, order) for kind, order in zip(kinds, orders, strict=True)]
+    chosen = replace(candidates.pick(torch.cat(orders, dim=1)), live=torch.cat(live, dim=1).flatten())
     search.best.end.iterations[rows] += part.proposal.iterations  # of the trajectories without constraints
     ends = solved(search, rows, chosen)
     if search.record is not None:

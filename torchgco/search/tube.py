@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count
+from torchgco.base.status import STOPPED
 from torchgco.kernels import open_loop
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import clear_path
@@ -26,6 +27,7 @@ from torchgco.search.candidates import Candidates
 from torchgco.search.following import Follow, Free, Paths
 from torchgco.search.manoeuvres import MANOEUVRES_TEXT, manoeuvre
 from torchgco.search.pursue import PURSUED_AT_ONCE, PURSUIT_TEXT, pursue
+from torchgco.search.reach import within_reach
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solve_cheapest
 from torchgco.search.table import Row
@@ -48,6 +50,7 @@ class Tube(Row):
 
     A car with a `Body` is solved from manoeuvres of its whole pose first (`manoeuvre`).
     In maps, a vehicle that drives along its heading is steered along ways that keep clear of them first (`pursue`).
+    One with a body that turns on the spot, too, is then solved from manoeuvres where that doesn't arrive.
     Where that doesn't arrive, and for all others, paths are tracked; among these is one that keeps clear of a map's
     obstacles, with its corners averaged, and among spheres and boxes one of the ball that holds a body, which has room
     along all of it. A vehicle that can turn on the spot follows each from rest and after either
@@ -76,7 +79,7 @@ class Tube(Row):
 
     @property
     def problems(self) -> str:
-        return f"{'in maps' if self.among == 'maps' else 'among spheres and boxes'}: caught, not arrived"
+        return "in maps: not arrived" if self.among == "maps" else "among spheres and boxes: caught, not arrived"
 
     @property
     def does(self) -> str:
@@ -84,22 +87,24 @@ class Tube(Row):
         if self.among == "maps":
             more, first = " and one that keeps clear", f"{PURSUIT_TEXT}; others, or without success: "
         tracked = f"{self.num_paths} paths{more}: {FOLLOW}, {PACES} paces"
-        cars = f"cars with a body: {MANOEUVRES_TEXT}; without success, and others: "
+        cars = f"bodies that drive along their heading: {MANOEUVRES_TEXT}; without success, and others: "
         return f"{cars}{first}{tracked}; not relaxed; interior point from the {TOP} cheapest"
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         if not search.has_paths or has_maps(search.call.problem) != (self.among == "maps"):
             return
-        manoeuvre(search)
-        rows = search.rows("unarrived")
-        if rows.numel() == 0:
-            return
         if self.among == "maps":
-            for some in rows.split(PURSUED_AT_ONCE):
+            search.stalled |= _stalled(search)
+        manoeuvre(search, on_the_spot=False)
+        rows = search.rows("unarrived")
+        if self.among == "maps":
+            for some in rows.split(PURSUED_AT_ONCE) if rows.numel() > 0 else ():
                 if not search.call.late:
                     pursue(search, some)
-            rows = search.rows("unarrived")
+        if not search.call.late:
+            manoeuvre(search, on_the_spot=True)
+        rows = search.rows("unarrived")
         rows = rows[~search.steered[rows]]
         if rows.numel() == 0:
             return
@@ -136,6 +141,17 @@ class Tube(Row):
         first = own.nan_to_num(torch.inf).clamp(min=2.0 * torch.finfo(own.dtype).eps, max=LATEST_FIRST)
         later = torch.linspace(0.0, 1.0, PACES, dtype=first.dtype, device=first.device)
         return (first.unsqueeze(-1) + (1.0 - first.unsqueeze(-1)) * later).flatten()
+
+
+def _stalled(search: Search) -> Tensor:
+    """Which problems' first solve ended short of the goal, (B,) bool, though it was stated and is within reach.
+
+    No obstacle has to stop it: a vehicle that can't move sideways may rest where no control lowers the cost.
+    """
+    problem, left = search.call.problem, ~search.best.arrived() & (search.caught.status != STOPPED)
+    if problem.goal is None or problem.goal.assumed or problem.time is not None or not bool(left.any()):
+        return torch.zeros_like(left)
+    return left & within_reach(problem)
 
 
 def _starts(problem: Problem, rest: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,8 @@ POST = (2, 1)  # the room's post, in cells from the lower left
 
 
 def grid_of(path: Path, **options: Any) -> OccupancyGrid:
-    grid = read(path, **options)
+    """The grid as the file has it, without a rim."""
+    grid = read(path, **{"outside": "free"} | options)
     assert isinstance(grid, OccupancyGrid)
     return grid
 
@@ -40,6 +41,26 @@ def test_cells_lie_where_the_format_says(name: str, corner: tuple[int, int], tmp
     assert at(grid, x + 0.5 * POST[0] + 0.25, y + 0.5 * POST[1] + 0.25) == 1
     assert at(grid, x + 2.75, y + 0.75) == 0  # the door, to the right, in the second row from below
     assert (grid.is_occupied == ROOM[::-1].T).all() and not grid.is_unknown.any()
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4, -2.0])
+def test_what_lies_outside_of_a_map_servers_map_is_occupied(yaw: float, tmp_path: Path) -> None:
+    """By its yaml file, and by its image, of which that tells; other plans and heights have no rim."""
+    path = described(tmp_path)
+    (tmp_path / "map.yaml").write_text(path.with_suffix(".yaml").read_text().replace("2.0, 0]", f"2.0, {yaw}]"))
+    for name, options in (("map.yaml", {}), ("map.pgm", {}), ("map.pgm", {"resolution": 0.05})):
+        open_, closed = (read(tmp_path / name, outside=how, **options) for how in ("free", "occupied"))
+        usual = read(tmp_path / name, **options)
+        for grid in (usual, closed):
+            assert isinstance(open_, OccupancyGrid) and isinstance(grid, OccupancyGrid)
+            np.testing.assert_array_equal(grid.occupied, open_.enclosed().occupied)
+            np.testing.assert_allclose(grid.origin, open_.origin - 0.05)
+    assert grid_of(path, resolution=0.1, height=2.0).shape[:2] == read(path, resolution=0.1, height=2.0).shape[:2]
+    path.with_suffix(".yaml").unlink()
+    assert grid_of(path, resolution=0.05).shape == (6, 4) == read(path, resolution=0.05).shape
+    cloud = samples.write(tmp_path, "points.xyz")
+    with pytest.raises(InputError, match=r"^map.outside: expected free: a cloud of points has no edge"):
+        read(cloud, radius=0.1, outside="occupied")
 
 
 def test_an_origin_can_be_given(tmp_path: Path) -> None:

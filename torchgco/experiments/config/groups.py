@@ -26,7 +26,8 @@ from torchgco.dynamics import Airframe
 from torchgco.exploration import SensorMission
 from torchgco.missions import Disturbance, Planner, RaceMission, RacePlanner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
-from torchgco.scenarios import FAMILIES, LayoutFile, MapFile
+from torchgco.scenarios import FAMILIES, Floors, LayoutFile, MapFile
+from torchgco.scenarios.maps import DRAWN_PACES
 from torchgco.scenarios.quadrotor import PLANNING_STATES
 from torchgco.scenarios.vehicle import BUILT_IN
 from torchgco.search import Passes
@@ -93,11 +94,12 @@ def register() -> None:
     register_resolver("torchgco.drawn", _drawn)
     register_resolver("torchgco.options", _help)
     register_resolver("torchgco.radius", _radius)
+    register_resolver("torchgco.pace", _pace)
     register_resolver("torchgco.hover", lambda _root_: _root_.vehicle.mass * _root_.vehicle.gravity / 4.0)
     # Hydra copies the whole store for each composition, 40 % of its time, and copies again what it takes from it.
     setattr(ConfigStore, "__deepcopy__", lambda store, memo: store)  # noqa: B010
     _store("scenario", "layouts", _fields_of(LayoutFile))
-    _store("scenario", "map", _fields_of(MapFile))
+    _store("scenario", "map", _fields_of(MapFile) | {"pace": "${torchgco.pace:null}"})
     for family in FAMILIES:
         made = family()
         picked = {"defaults": [{"override /model@_global_.model": _model_of(made)}, "_self_"]}
@@ -194,8 +196,9 @@ def _literal(value: Any) -> str:
 
 
 def _sizes(made: Any) -> dict[str, Any]:
-    """Lengths of a family that are the vehicle's, where a command has chosen one."""
-    return {"vehicle_radius": f"${{torchgco.radius:{made.vehicle_radius}}}"} if made.states == PLANNING_STATES else {}
+    """Lengths and paces of a family that are the vehicle's, where a command has chosen one."""
+    sizes = {"vehicle_radius": f"${{torchgco.radius:{made.vehicle_radius}}}"} if made.states == PLANNING_STATES else {}
+    return sizes | ({"pace": f"${{torchgco.pace:{made.pace}}}"} if isinstance(made, Floors) else {})
 
 
 def _radius(usual: float, _root_: Any) -> float:
@@ -203,6 +206,12 @@ def _radius(usual: float, _root_: Any) -> float:
     vehicle = _root_.get("vehicle")
     own = vehicle.get("radius") if OmegaConf.is_dict(vehicle) else None
     return usual if own is None or own == Airframe().radius else own
+
+
+def _pace(usual: float | None, _root_: Any) -> float | None:
+    """The mean speed that horizons have room for, m/s, lower for vehicles that are slower than 1 m/s."""
+    speed = OmegaConf.select(_root_, "model.vehicle.speed")
+    return usual if speed is None else (usual or DRAWN_PACES[2]) * min(1.0, float(speed))
 
 
 def _help(_root_: Any) -> str:

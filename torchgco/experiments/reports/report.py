@@ -113,7 +113,7 @@ def drawings(part: Part) -> Drawings:
     if len(summary[[*TASK, *swept]].drop_duplicates()) > FACETS:
         trials = trials.drop(columns=swept)
         summary = again(trials)
-    if not mission:
+    if not mission and summary["n"].max() > 1:  # of a single trial nothing is a rate
         held["rates"] = lambda: rates_figure(summary)
     elif len(shown := several(trials)):
         held["outcomes"] = lambda: outcomes_figure(shown)

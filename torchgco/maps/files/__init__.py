@@ -7,3 +7,4 @@ file is one InputError with its name.
 from torchgco.maps.files.arrays import read_task as read_task
 from torchgco.maps.files.read import FORMATS as FORMATS
 from torchgco.maps.files.read import read as read
+from torchgco.maps.files.read import usual_outside as usual_outside

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_value
+from torchgco.maps.distance import Unknown
 from torchgco.maps.files.arrays import read_npy, read_npz
 from torchgco.maps.files.gazebo import read_world
 from torchgco.maps.files.images import read_image
@@ -109,6 +111,7 @@ def read(
     layer: Any = None,
     box: Any = None,
     solid: bool | None = None,
+    outside: Unknown | None = None,
     field: str = "map",
 ) -> OccupancyGrid | PointCloud:
     """The map in a file: a grid, or a cloud where the file holds points. What has no unit is in metres.
@@ -128,6 +131,8 @@ def read(
         box: two corners (low, high), each of as many coordinates as the map has, m: what lies outside isn't read. Cells
             that touch the box are kept whole.
         solid: of a mesh, whether its inside is occupied, too; None: where its surface is closed.
+        outside: what lies around a grid's cells: "free", or "occupied", a rim of one cell. None: as unknown cells are,
+            "occupied", around a map_server's map; "free" around others.
         field: what errors call the file and these arguments: `<field>.path`, `<field>.resolution`.
 
     Raises:
@@ -139,29 +144,42 @@ def read(
     for name, value in given.items():
         if value is not None and name not in format.options:
             raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
-    lengths = (("resolution", resolution, LEAST_CELL), ("radius", radius, 0.0), ("height", height, LEAST_CELL))
-    for name, value, least in lengths:
-        if value is not None and not least <= number(value, f"{field}.{name}") <= FARTHEST_AT:
-            raise InputError(f"{field}.{name}", f"a length from {least:g} to {FARTHEST_AT:g} m", shown(value))
+    cell = ("resolution", resolution, LEAST_CELL)
+    _check_lengths(field, cell, ("radius", radius, 0.0), ("height", height, LEAST_CELL))
     if origin is not None:
         given["origin"] = origin = coordinates(origin, f"{field}.origin")
         if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST_AT).all():
             raise InputError(f"{field}.origin", f"2 or 3 coordinates within {FARTHEST_AT:g} m", shown(origin.tolist()))
     if solid is not None and not isinstance(solid, bool):
         raise InputError(f"{field}.solid", "True, False or None", shown(solid))
+    check_value(outside, Unknown | None, f"{field}.outside")
     given["layer"] = layer = None if layer is None else checked_layer(layer, f"{field}.layer")
     given["box"] = box = None if box is None else checked_box(box, f"{field}.box")
     found = format.reader(source, **{name: given[name] for name in format.options})
-    if box is not None:
-        found = part(source, found, box, radius)
-    if layer is not None:
-        found = flat(source, found, layer, radius)
+    found = found if box is None else part(source, found, box, radius)
+    found = found if layer is None else flat(source, found, layer, radius)
     if isinstance(found, OccupancyGrid):
         if radius is not None:
             raise InputError(f"{field}.radius", f"none: {source.path} holds cells, no points", radius)
-        return found
+        return found.enclosed() if (outside or usual_outside(path, height, field)) == "occupied" else found
+    if outside == "occupied":
+        raise InputError(f"{field}.outside", "free: a cloud of points has no edge", outside)
     source.needs("radius", radius, "the radius of the ball around each point, m")
     return PointCloud(found, radius)
+
+
+def _check_lengths(field: str, *lengths: tuple[str, Any, float]) -> None:
+    """Check options by name, value and least length, m; None is none."""
+    for name, value, least in lengths:
+        if value is not None and not least <= number(value, f"{field}.{name}") <= FARTHEST_AT:
+            raise InputError(f"{field}.{name}", f"a length from {least:g} to {FARTHEST_AT:g} m", shown(value))
+
+
+def usual_outside(path: Any, height: float | None = None, field: str = "map") -> Unknown:
+    """What lies around the cells of a file's map where `read` isn't given it; arguments and errors as there."""
+    source, format = _find(path, field)
+    image = format.reader is _read_image and height is None
+    return "occupied" if format.reader is read_map_server or (image and beside(source) is not None) else "free"
 
 
 def _find(path: Any, field: str) -> tuple[Source, Format]:
