@@ -31,6 +31,8 @@ OTHER_START = (
     "No control moves the row named above: the start x0 breaks it. The controls returned are those found for all other "
     "rows."
 )
+FLAT = "The violated rows have no slope where it ended, as a comparison or a rounding has none: no step lowers them."
+SLOPED = "Rows that change smoothly with states and controls, such as x - 1 in the place of (x > 1) * 1.0."
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
 COVERED = "The goal is required, and an obstacle, grown by the vehicle's radius, covers all of it."
@@ -61,6 +63,7 @@ class Facts:
         passage: the largest radius, m, that some way has room for; 0: none.
         in_unknown: whether the start is invalid for unknown cells of a map alone.
         unmoved: whether all violated rows have the same values for all controls.
+        flat: whether no violated row has a slope where the solve ended.
         named: whether the row that is violated most is named to the reader before.
         missed: by how much a required goal is missed, with its unit; None: it isn't, or isn't required.
         covered: whether one obstacle covers all of a required goal.
@@ -79,6 +82,7 @@ class Facts:
     passage: float = 0.0
     in_unknown: bool = False
     unmoved: bool = False
+    flat: bool = False
     named: bool = False
     missed: str | None = None
     covered: bool = False
@@ -88,6 +92,8 @@ class Facts:
         """Why the solve ended so, in sentences."""
         if self.unmoved:
             return [OTHER_START]
+        if self.flat:
+            return [self.status.sentence, FLAT]
         if self.radius is None and self.missed is not None:
             return [self.status.sentence, COVERED if self.covered else MISSED.format(missed=self.missed)]
         if self.radius is None:
@@ -103,6 +109,8 @@ def advice(facts: Facts) -> list[str]:
         return [KNOWN_START]
     if facts.unmoved:
         return [MOVED]
+    if facts.flat:
+        return [SLOPED]
     if facts.radius is not None:
         smaller = f", or a vehicle_radius of at most {facts.passage:.3g} m" if facts.passage > 0 else ""
         return [f"A goal on the start's side of the walls, or a map with a wider way{smaller}."]
