@@ -83,7 +83,8 @@ def solve(
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
-            states X0, or an argument is of another kind or out of its range.
+            states X0, or an argument is of another kind or out of its range; a function that branches on values, and
+            that mixes knots or problems along what was found.
     """
     check_untransformed("solve")
     asked = problem = current_problem(problem)

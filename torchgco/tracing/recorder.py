@@ -16,7 +16,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.shapes import MISTAKES
-from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.decompositions import DECOMPOSITIONS
 from torchgco.tracing.operations import OPERATIONS
 
@@ -359,9 +358,15 @@ def replay_all(operations: Iterable[Operation], known: dict[Slot, Any]) -> None:
     """Apply PyTorch's operations in order, each with the default type that it was recorded with."""
     with torch.no_grad():
         for default, some in groupby(operations, key=lambda operation: operation.default):
-            with whole_numbers_become(default):
+            usual = torch.get_default_dtype()
+            if default is not usual:  # it was changed since
+                torch.set_default_dtype(default)
+            try:
                 for operation in some:
                     operation.replay(known)
+            finally:
+                if default is not usual:
+                    torch.set_default_dtype(usual)
 
 
 def _is_reproduced(recording: Recording, result: Tensor) -> bool:
