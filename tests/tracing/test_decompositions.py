@@ -87,6 +87,7 @@ VALUES: dict[str, Function] = {  # steps, and those whose derivatives PyTorch ha
     "xor": lambda x: torch.logical_xor(x > 0, x.flip(-1) > 0.3).to(D),
     "heaviside": lambda x: torch.heaviside(x, A[0]),
     "cdist": lambda x: torch.cdist(x.reshape(-1, 2, 2), LEFT).flatten(1),
+    "softshrink": lambda x: F.softshrink(x, 0.3) + F.softshrink(x.sqrt()),
     "one of four": lambda x: F.one_hot(torch.tensor([2]), 4).to(x) * x.sign(),
 }
 POINTS = 1.5 * torch.randn(6, 4, dtype=D, generator=torch.Generator().manual_seed(1))

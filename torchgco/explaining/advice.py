@@ -31,8 +31,10 @@ OTHER_START = (
     "No control moves the row named above: the start x0 breaks it. The controls returned are those found for all other "
     "rows."
 )
-FLAT = "The violated rows have no slope where it ended, as a comparison or a rounding has none: no step lowers them."
-SLOPED = "Rows that change smoothly with states and controls, such as x - 1 in the place of (x > 1) * 1.0."
+NO_SLOPE = (
+    "The violated rows have no slope where it ended, as a comparison or a rounding has none: no step lowers them."
+)
+SMOOTH_ROWS = "Rows that change smoothly with states and controls, such as x - 1 in the place of (x > 1) * 1.0."
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
 COVERED = "The goal is required, and an obstacle, grown by the vehicle's radius, covers all of it."
@@ -93,7 +95,7 @@ class Facts:
         if self.unmoved:
             return [OTHER_START]
         if self.flat:
-            return [self.status.sentence, FLAT]
+            return [self.status.sentence, NO_SLOPE]
         if self.radius is None and self.missed is not None:
             return [self.status.sentence, COVERED if self.covered else MISSED.format(missed=self.missed)]
         if self.radius is None:
@@ -110,7 +112,7 @@ def advice(facts: Facts) -> list[str]:
     if facts.unmoved:
         return [MOVED]
     if facts.flat:
-        return [SLOPED]
+        return [SMOOTH_ROWS]
     if facts.radius is not None:
         smaller = f", or a vehicle_radius of at most {facts.passage:.3g} m" if facts.passage > 0 else ""
         return [f"A goal on the start's side of the walls, or a map with a wider way{smaller}."]

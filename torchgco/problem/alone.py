@@ -7,12 +7,14 @@ nothing proves that it keeps them apart. What it gives for a row alone is what t
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import suppress
+from functools import cache, partial
 from typing import Any, Self, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import MISTAKES
@@ -27,24 +29,30 @@ from torchgco.problem.joined import unlike
 from torchgco.problem.problem import Problem
 from torchgco.tracing.recorder import looks_at_values
 
+_looking: MutableMapping[Any, bool] = WeakIdKeyDictionary()  # whether parts do, by identity
 # Values (b, ...) of a problem along X, U, of all knots at once or, where they can be had so, one knot after the other.
 Values: TypeAlias = Callable[[Problem, Tensor, Tensor, bool], Tensor]
 
 
-def row_by_row(problem: Problem) -> Problem:
-    """The problem, whose parts that look at values are evaluated row by row; itself where none does."""
+def row_by_row(problem: Problem, again: bool = False) -> Problem:
+    """The problem, whose parts that look at values are evaluated row by row; itself where none does.
+
+    Args:
+        again: each part's code is tried, also where it was before.
+    """
     first = problem.take(slice(0, 1))
+    looks = partial(_looks, again)
     x = torch.where(torch.isfinite(first.x0), first.x0, 0.0)
     X, U = x.unsqueeze(1).repeat(1, problem.N + 1, 1), x.new_zeros(1, problem.N, problem.m)
     parts: dict[str, Any] = {}
-    if _looks(first.dynamics, first.along.step, X[:, 1:], U):
+    if looks(problem.dynamics, first.along.step, X[:, 1:], U):
         integrated = type(first.dynamics).step is Dynamics.step
         parts["dynamics"] = _made(problem.dynamics, _Field if integrated else _Step)
-    if _looks(first.cost, first.cost.total, X, U):
+    if looks(problem.cost, first.cost.total, X, U):
         parts["cost"] = _made(problem.cost, _Cost if type(problem.cost).total is Cost.total else _Total)
     rows = list(problem.constraints)
     for i, part in enumerate(first.constraints):
-        if _looks(part, part.value, X, U):
+        if looks(rows[i], part.value, X, U):
             rows[i] = _made(rows[i], _Function if isinstance(part, FunctionConstraint) else _Constraint)
             parts["constraints"] = tuple(rows)
     return problem._with(parts, problem.known) if parts else problem
@@ -61,7 +69,7 @@ def check_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
     Raises:
         InputError: names the part at fault, as `Problem` does where that is seen when the problem is made.
     """
-    apart = row_by_row(problem)
+    apart = row_by_row(problem, again=True)
     rows = (torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)).nonzero().flatten()
     if apart is problem or rows.numel() == 0:
         return
@@ -116,8 +124,15 @@ def _told(found: Tensor, own: Tensor, wrong: Tensor, rows: Tensor) -> str:
     return f"other values among other knots and problems: {numbers} (problem {int(rows[b])}{knot})"
 
 
-def _looks(part: Any, values: Callable[..., Tensor], *arguments: Tensor) -> bool:
-    return is_users(part) and looks_at_values(values, *arguments)
+def _looks(again: bool, part: Any, values: Callable[..., Tensor], *arguments: Tensor) -> bool:
+    if not is_users(part):
+        return False
+    found = None if again else _looking.get(part)
+    if found is None:
+        found = looks_at_values(values, *arguments)
+        with suppress(TypeError):  # no weak reference to it
+            _looking[part] = found
+    return found
 
 
 def _made(part: Any, mixin: type) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -106,8 +107,12 @@ def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence
         arguments: (2, K, ...).
         reads_k: every knot is tried, as a number finds places that a tensor doesn't: those of a dict, for instance.
     """
-    with whole_numbers_become(arguments[0].dtype):
-        return _forms_differ(function, rows, k, arguments, reads_k)
+
+    def precise(*z: Any) -> Tensor:
+        with whole_numbers_become(arguments[0].dtype):
+            return function(*z)
+
+    return _forms_differ(precise, rows, k, arguments, reads_k)
 
 
 def _forms_differ(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor], reads_k: bool) -> bool:

@@ -250,6 +250,7 @@ DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "aten.fmax": _other_where_nan(torch.maximum),
     "aten.fmin": _other_where_nan(torch.minimum),
     "aten.exp2": lambda x: 2.0**x,
+    "aten.softshrink": lambda x, size=0.5: torch.where(x.abs() <= size, 0.0, x - size * x.sign()),  # NaN stays one
     "aten.ldexp": lambda a, b: a * 2.0**b,
     "aten._softmax": _softmax,
     "aten._log_softmax": _log_softmax,

@@ -20,7 +20,7 @@ from torchgco.tracing.decompositions import DECOMPOSITIONS
 from torchgco.tracing.operations import OPERATIONS
 
 OF_SHAPES = "aten.is_same_size", "aten._has_same_storage_numel"  # operations that look at shapes alone
-COMPARED = 64  # numbers of a tensor that are compared
+READ_NUMBERS = 64  # numbers of a tensor, made by Python code, that are compared
 SHAPED_BY_VALUES = torch.Tag.dynamic_output_shape
 
 
@@ -291,7 +291,7 @@ class _Reading(TorchDispatchMode):
 
     def _number(self, kind: str, leaf: Any) -> Any:
         if isinstance(leaf, Tensor) and id(leaf) not in self._known:
-            return leaf.tolist() if leaf.numel() <= COMPARED else id(leaf)
+            return leaf.tolist() if leaf.numel() <= READ_NUMBERS else id(leaf)
         return leaf if isinstance(leaf, (bool, float)) or (isinstance(leaf, int) and "int" not in kind) else None
 
     @classmethod
