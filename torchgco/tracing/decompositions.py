@@ -76,9 +76,9 @@ def _group_norm(
 
 
 def _batch_norm(x: Tensor, weight: Any, bias: Any, mean: Tensor, var: Tensor, _: float, eps: float) -> Any:
-    parts = [None if p is None else p.reshape(-1, *[1] * (x.dim() - 2)) for p in (mean, var, weight, bias)]
-    found = _scaled((x - parts[0]) * (parts[1] + eps).rsqrt(), *parts[2:])
-    return found, mean.new_zeros(0), mean.new_zeros(0)
+    of_channels: Callable[..., Any] = lambda p: None if p is None else p.reshape(-1, *[1] * (x.dim() - 2))
+    centered = (x - of_channels(mean)) * (of_channels(var) + eps).rsqrt()
+    return _scaled(centered, of_channels(weight), of_channels(bias)), mean.new_zeros(0), mean.new_zeros(0)
 
 
 def _scaled(x: Tensor, weight: Tensor | None, bias: Tensor | None) -> Tensor:
@@ -223,12 +223,12 @@ def _scatter(accumulate: bool) -> Callable[..., Any]:
     def scattered(x: Tensor, dim: int, index: Tensor, source: Any, reduce: Any = None) -> Any:
         if reduce is not None or x.dim() == 0:
             return NotImplemented
-        at = list(torch.meshgrid(*(torch.arange(n, device=x.device) for n in index.shape), indexing="ij"))
+        at: Any = list(torch.meshgrid(*(torch.arange(n, device=x.device) for n in index.shape), indexing="ij"))
         at[dim] = index
-        if isinstance(source, Tensor) and source.dim():
+        if isinstance(source, Tensor):
             source = source[tuple(slice(n) for n in index.shape)]
         else:
-            source = torch.full(index.shape, source, dtype=x.dtype, device=x.device)
+            source = torch.full(index.shape, float(source), dtype=x.dtype, device=x.device)
         return x.index_put(at, source, accumulate)
 
     return scattered
