@@ -84,8 +84,9 @@ def solve(
             solver's, FEASIBLE, whose gradients are smooth; `solution.reason` where none is found. None: the solver's.
 
     Raises:
-        InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
-            states X0, or an argument is of another kind, out of its range, or one that solve doesn't have.
+        InputError: U0, ids, warm, X0 or an argument don't fit, no preset has this name, the solver can't begin with
+            states X0, an argument is one that solve doesn't have, or a function that branches on values mixes knots or
+            problems along what was found.
     """
     check_untransformed("solve")
     asked = problem = current_problem(problem)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -92,6 +93,56 @@ def test_functions_of_the_knot_leave_pytorchs_precision_as_it_was() -> None:
     slow.join()
     fast.join()
     assert torch.get_default_dtype() is torch.float32
+
+
+def test_another_threads_numbers_keep_their_precision_while_a_function_of_the_knot_runs() -> None:
+    inside, asked, seen = threading.Event(), threading.Event(), []
+
+    def function(x: Tensor, k: Tensor) -> Tensor:
+        inside.set()
+        asked.wait(timeout=5.0)
+        return x * (0.3 * k).unsqueeze(-1)
+
+    def other() -> None:
+        inside.wait(timeout=5.0)
+        seen.append(torch.tensor(1.0).dtype)
+        asked.set()
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    rows = NO_VALUES.call(function, torch.ones(1, 4, 1, dtype=D), k=torch.arange(4))
+    thread.join()
+    assert seen == [torch.float32] and rows.flatten().tolist() == [0.3 * k for k in range(4)]
+
+
+OF_KNOTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "product": lambda k: 0.3 * k,
+    "quotient": lambda k: k / 7,
+    "root": lambda k: k.sqrt() + (0.1 * k).sin(),
+    "choice": lambda k: torch.where(k > 2, 0.1, 0.2),
+    "by name": lambda k: torch.where(input=torch.tensor(0.1), condition=k > 2, other=0.3),
+    "truth": lambda k: (k > 2) * 0.3,
+    "table": lambda k: torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5])[k] + torch.eye(5)[k, 0],
+    "made": lambda k: torch.full((5,), 0.1) * k + torch.linspace(0, 1, 5) - torch.zeros(5),
+    "single": lambda k: 0.1 * k.float() + torch.tensor(0.3, dtype=torch.float32),
+    "remainder": lambda k: k % 0.7 + k.clamp(max=2.5),
+    "stack": lambda k: torch.stack([0.1 * k, k / 7]).sum(0) + torch.atan2(k, k + 1),
+}
+
+
+@pytest.mark.parametrize("usual", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", OF_KNOTS)
+def test_functions_of_the_knot_are_as_precise_as_with_another_default(name: str, usual: torch.dtype) -> None:
+    k, function = torch.arange(5), OF_KNOTS[name]
+    for dtype in (torch.float64, torch.float32):
+        torch.set_default_dtype(dtype)
+        due = function(k)
+        torch.set_default_dtype(usual)
+        try:
+            found = NO_VALUES.call(lambda x, k: function(k), torch.ones(1, 5, 1, dtype=dtype), k=k)
+        finally:
+            torch.set_default_dtype(torch.float32)
+        assert found.dtype is due.dtype and torch.equal(found, due)
 
 
 @compiled

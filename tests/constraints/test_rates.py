@@ -310,7 +310,7 @@ def test_rates_that_do_not_fit_are_named(make: Any, line: str) -> None:
 
 
 def test_one_stage_has_no_change_without_the_controls_before() -> None:
-    with pytest.raises(InputError, match=r"rate_bounds.knots: expected at least one knot"):
+    with pytest.raises(InputError, match=r"rate_bounds: expected two stages at least.*N = 1"):
         carts(RateBounds(-1.0, 1.0), stages=1)
     solution = torchgco.solve(carts(RateBounds(-1.0, 1.0, previous=0.5), stages=1))
     assert bool(((solution.U - 0.5).abs() <= 1.001).all())

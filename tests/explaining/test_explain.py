@@ -242,3 +242,16 @@ def test_a_row_that_the_start_breaks_is_named_as_the_starts() -> None:
     assert "lower bound of state 1, knot 0" in told and "No control moves" in told and "knots=slice(1" in told
     told = str(torchgco.solve(Problem(cart, cost, [ControlBounds(-1, 1), wall], [[0.0, 0.0]], 20)).explain(0))
     assert "No control moves" not in told and "Another guess" in told
+
+
+def test_a_row_without_a_slope_ends_infeasible_and_is_named() -> None:
+    """It isn't a number that isn't finite; and a row that only may be flat elsewhere isn't named so."""
+    cart = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0]), dim=-1), 2, 1, 0.1, "rk4")
+    cost = QuadraticCost([1.0, 0.0], [0.2], [0.0, 0.0], [1.0, 0.0])
+    jump = FunctionConstraint(lambda x: (x[..., :1] > 0).to(x.dtype) - 0.5, knots=[-1])
+    steep = FunctionConstraint(lambda x: 50.0 - x[..., :1].relu(), knots=[-1])
+    for row, is_flat in ((jump, True), (steep, False)):
+        found = torchgco.solve(Problem(cart, cost, [ControlBounds(-3, 3), row], [[0.5, -0.3], [0.8, 0.2]], 20))
+        assert all(status is Status.INFEASIBLE for status in found.statuses)
+        told = str(found.explain(1))
+        assert ("have no slope" in told and "change smoothly" in told) == is_flat

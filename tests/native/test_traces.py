@@ -93,7 +93,7 @@ def ring(x: Tensor) -> Tensor:
 
 
 EAGER: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
-    "circular pad": (ring, "in place"),
+    "circular pad": (ring, "written by way of another"),
     "equal": (lambda x: x if torch.equal(x, torch.zeros_like(x)) else 0.5 * x, "torch.equal"),
     "allclose": (lambda x: x if torch.allclose(x, torch.zeros_like(x)) else 0.5 * x, "torch.allclose"),
     "numel of a mask": (lambda x: x if x[x != 0.0].numel() == 0 else 0.5 * x, "shapes"),

@@ -121,6 +121,10 @@ def caught(z: Tensor, look: Callable[[Tensor], object]) -> Tensor:
         return 3.0 * z
 
 
+def sampled(z: Tensor) -> Tensor:
+    return F.grid_sample(W32.double()[None, None], z[:, None, None, :2], align_corners=True)[:, 0, 0]
+
+
 REFUSED: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "equal": (lambda z: z if torch.equal(z, torch.zeros_like(z)) else 2.0 * z, "looks at.*torch.equal"),
     "allclose": (lambda z: z if torch.allclose(z, torch.zeros_like(z)) else 2.0 * z, "looks at.*torch.allclose"),
@@ -132,7 +136,7 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "unique": (lambda z: z * z.unique().numel(), "shapes that depend on the values"),
     "str": (lambda z: z if "0." in str(z) else 2.0 * z, "__repr__"),
     "format": (lambda z: z if "0." in f"{z}" else 2.0 * z, "__format__"),
-    "circular pad": (lambda z: F.pad(z[:, None], (1, 1), mode="circular")[..., 0], "writes in place"),
+    "circular pad": (lambda z: F.pad(z[:, None], (1, 1), mode="circular")[..., 0], "written by way of another"),
     "bits": (lambda z: z * ((z > 0).sum(-1, keepdim=True) & 1), "bits of integers"),
     "integers made of numbers": (lambda z: z + torch.zeros(z.shape, dtype=torch.int64).copy_(4 * z), "other numbers"),
     "sum to integers": (lambda z: z * z.sum(-1, keepdim=True, dtype=torch.int64), "other numbers"),
@@ -141,7 +145,7 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "caught number": (lambda z: caught(z, lambda z: float(z.sum()) > 0.0), "looks at.*Tensor.__float__"),
     "caught array": (lambda z: caught(z, lambda z: z.numpy().any()), "Tensor.numpy"),
     "caught failure": (lambda z: caught(z, lambda z: torch.linalg.cholesky(z * torch.eye(3))), "fails for some values"),
-    "layer_norm": (lambda z: F.layer_norm(z, (3,)), "torch.nn.functional.layer_norm.*native_layer_norm"),
+    "grid_sample": (lambda z: sampled(z), "torch.nn.functional.grid_sample.*to_copy"),
 }  # fmt: skip
 
 

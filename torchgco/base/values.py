@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
-from threading import RLock
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, tensor
 from torchgco.base.tree import PerElement
 
 Knot = int | Tensor | None
-_default = RLock()
 NAMED_PARAMETERS = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 
@@ -63,19 +62,53 @@ class Values(PerElement):
 NO_VALUES = Values()
 
 
-@contextmanager
-def whole_numbers_become(dtype: torch.dtype) -> Iterator[None]:
+def whole_numbers_become(dtype: torch.dtype) -> AbstractContextManager[Any]:
     """Knots times a number, as in 0.3 * k, have this precision: PyTorch's default one for that is single.
 
-    PyTorch has one default precision for all threads: of functions of the knot, one runs at a time.
+    In this thread alone, as PyTorch's default precision is that of all threads. TorchScript keeps the default one.
     """
-    with _default:
-        usual = torch.get_default_dtype()
-        torch.set_default_dtype(dtype)
+    return nullcontext() if torch.get_default_dtype() is dtype else _Precision(dtype)
+
+
+class _Precision(TorchFunctionMode):
+    """Functions that make numbers of whole ones, or of Python's, give them in a precision."""
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.dtype = dtype
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        out = func(*args, **kwargs)
+        if not isinstance(out, Tensor) or out.dtype is not torch.get_default_dtype() or out.dtype is self.dtype:
+            return out
+        typed = [leaf for leaf in _leaves((*args, *kwargs.values())) if hasattr(leaf, "dtype")]
+        if not all(isinstance(leaf, Tensor) and _is_whole(leaf) for leaf in typed):
+            return out  # of numbers that have a precision
+        if typed:
+            args, kwargs = self._converted(args), {name: self._converted(value) for name, value in kwargs.items()}
+        elif kwargs.get("dtype") is None:
+            kwargs = {**kwargs, "dtype": self.dtype}
         try:
-            yield
-        finally:
-            torch.set_default_dtype(usual)
+            return func(*args, **kwargs)
+        except (TypeError, RuntimeError):  # it takes no other types
+            return out
+
+    def _converted(self, leaf: Any) -> Any:
+        if isinstance(leaf, (tuple, list)):
+            return type(leaf)(self._converted(part) for part in leaf)
+        if isinstance(leaf, float):
+            return torch.tensor(leaf, dtype=self.dtype)
+        return leaf.to(self.dtype) if isinstance(leaf, Tensor) and leaf.dtype is not torch.bool else leaf
+
+
+def _leaves(tree: tuple[Any, ...] | list[Any]) -> Iterator[Any]:
+    for leaf in tree:
+        yield from _leaves(leaf) if isinstance(leaf, (tuple, list)) else (leaf,)
+
+
+def _is_whole(tensor: Tensor) -> bool:
+    return not (tensor.is_floating_point() or tensor.is_complex())
 
 
 def bound_values(

@@ -22,7 +22,8 @@ from torchgco.compiled.numbers import (
 )
 from torchgco.compiled.stages import moved, stage_of, stages_between
 from torchgco.guidance.mppi import MPPI
-from torchgco.kernels import current
+from torchgco.kernels import current, open_loop
+from torchgco.problem.alone import check_rows
 from torchgco.problem.problem import Problem, current_problem
 
 
@@ -95,7 +96,8 @@ class MPPIController:
             numbers, named: new numbers of the problem by name, such as x_ref or centers.
 
         Raises:
-            InputError: states or numbers that don't fit. Nothing is changed then.
+            InputError: states or numbers that don't fit. Nothing is changed then. A function that branches on values,
+                and that mixes knots or vehicles along the plan.
         """
         state, B = measured(x, *self._problem.x0.shape), self._problem.B
         self.numbers.write({**(numbers or {}), **named, "x0": state})
@@ -103,7 +105,10 @@ class MPPIController:
             before = moved(self.U, self._stages) if shift and self._commands else self.U
             key = DrawKey(self.seed, self._ids, torch.full_like(self._ids, self._commands))
             now = current(with_numbers_as_they_are(self._problem))
-            self.U = self.sampler.improved(now, before, key)
+            found = self.sampler.improved(now, before, key)
+            if not now.known.in_c:  # only PyTorch's kernels call code that looks at values
+                check_rows(now, open_loop(now, found), found)
+            self.U = found
         self._commands += 1
         u = self.U[:, 0].clone()
         return u[0] if state.ndim == 1 and B == 1 else u

@@ -220,6 +220,8 @@ class RateBounds(_Bounds):
 
     def bind(self, dims: Dimensions) -> Self:
         if self.previous is None:
+            if dims.N < 2:
+                raise InputError("rate_bounds", "two stages at least, or the controls `previous`", f"N = {dims.N}")
             bound = super().bind(dims)
             if bound.holds_at(0):
                 raise InputError("rate_bounds.knots", "knots from 1 on, or the controls `previous`", "knot 0")

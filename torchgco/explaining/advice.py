@@ -31,6 +31,10 @@ OTHER_START = (
     "No control moves the row named above: the start x0 breaks it. The controls returned are those found for all other "
     "rows."
 )
+NO_SLOPE = (
+    "The violated rows have no slope where it ended, as a comparison or a rounding has none: no step lowers them."
+)
+SMOOTH_ROWS = "Rows that change smoothly with states and controls, such as x - 1 in the place of (x > 1) * 1.0."
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
 TOUCHES = "All constraints hold at the knots, and the vehicle touches an obstacle between two of them."
@@ -70,6 +74,7 @@ class Facts:
         passage: the largest radius, m, that some way has room for; 0: none.
         in_unknown: whether the start is invalid for unknown cells of a map alone.
         unmoved: whether all violated rows have the same values for all controls.
+        flat: whether no violated row has a slope where the solve ended.
         horizon: of the stages and the way to the goal, with `suffices`, and a sentence as its text; None: unknown.
         body: whether the vehicle isn't a ball: `radius` is then that of the ball about its position that it holds.
         off_map: "start" or "goal", where that lies outside of a map that is occupied all around.
@@ -91,6 +96,7 @@ class Facts:
     passage: float = 0.0
     in_unknown: bool = False
     unmoved: bool = False
+    flat: bool = False
     named: bool = False
     missed: str | None = None
     covered: bool = False
@@ -111,6 +117,8 @@ class Facts:
             return [OTHER_START]
         if self.touches:
             return [TOUCHES]
+        if self.flat:
+            return [self.status.sentence, NO_SLOPE]
         if self.radius is None and self.missed is not None:
             return [self.status.sentence, COVERED if self.covered else MISSED.format(missed=self.missed)]
         if self.radius is None:
@@ -136,6 +144,8 @@ def advice(facts: Facts) -> list[str]:
         return [MOVED]
     if facts.off_map is not None:
         return [OFF_MAP.format(off=facts.off_map)]
+    if facts.flat:
+        return [SMOOTH_ROWS]
     if facts.radius is not None:
         size = "a narrower body" if facts.body else f"a vehicle_radius of at most {facts.passage:.3g} m"
         smaller = f", or {size}" if facts.passage > 0 else ""

@@ -18,7 +18,7 @@ from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, gates_told, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
-from torchgco.lagrangian.unmoved import unmoved
+from torchgco.lagrangian.unmoved import unmoved, without_slope
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times
@@ -148,6 +148,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         could_record=could,
         unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.full_X, one.full_U, ADMITTED)),
         horizon=None if reached or not hasattr(solver, "horizon") else solver.horizon(one.problem),
+        flat=one.lost_at is None and bool(without_slope(one.held, one.full_X, one.full_U, ADMITTED)),
         named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,
         **goal_facts(one.problem, one.X, one.U),
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),

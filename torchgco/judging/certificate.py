@@ -32,6 +32,7 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.alone import row_by_row
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, current_problem
@@ -101,7 +102,7 @@ def certify(
         InputError: X, U, asked or multipliers don't fit the problem.
     """
     problem = current_problem(problem)
-    problem, X, U = in_double(problem), doubled(X, "X", problem), doubled(U, "U", problem)
+    problem, X, U = row_by_row(in_double(problem)), doubled(X, "X", problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
     check_shape(X, (problem.B, problem.N + 1, problem.n), "X")
     asked = torch.ones(problem.B, dtype=torch.bool, device=U.device) if asked is None else asked

@@ -28,6 +28,7 @@ from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.alone import row_by_row
 from torchgco.problem.between import Paths, paths
 from torchgco.problem.goal import Goal
 from torchgco.problem.in_time import at_times
@@ -103,7 +104,7 @@ def judge(
     """
     problem = current_problem(problem)
     single = problem.x0.dtype == torch.float32
-    problem, U = in_double(problem), doubled(U, "U", problem)
+    problem, U = row_by_row(in_double(problem)), doubled(U, "U", problem)
     problem.check_controls(U, "U")
     more = goal, goal_radius, start
     given: list[Any] = [value.double() if single and isinstance(value, Tensor) else value for value in more]

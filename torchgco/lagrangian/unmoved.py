@@ -1,4 +1,4 @@
-"""Whether violated rows are what they are whatever the controls."""
+"""Whether violated rows are what they are whatever the controls, or near these."""
 
 from __future__ import annotations
 
@@ -40,3 +40,17 @@ def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
     if problem.free_start is not None:
         kept &= ~problem.free_start.any(-1)
     return kept & broken
+
+
+def without_slope(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
+    """Whether rows are violated by more than `tolerance`, and none of these has a slope at X, U, (B,).
+
+    A comparison, a sign or a rounding has none: no step by derivatives lowers such a row.
+    """
+    s = problem.n + 1 + problem.m
+    H, broken = X.new_zeros(*X.shape[:2], s, s), torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    for part in problem.constraints:
+        bad = part.violation(X, U) > tolerance
+        part.accumulate(X, U, bad.to(X.dtype) * part.value(X, U), bad.to(X.dtype), H)
+        broken |= bad.flatten(1).any(-1)
+    return broken & (H == 0).flatten(1).all(-1)

@@ -33,6 +33,7 @@ DERIVATIVE_SHARE = 1e-2  # share of a derivative by which differences may disagr
 NOISE = 8.0  # times the rounding error of a difference, or its change with the step
 OWN_ROW = "values of a problem that depend on its own row alone; numbers per problem belong in `values` or `batched`"
 
+STEP_OF_STAGE = "states (B, K, n) after each of which depends on its own state, control and stage, as for (B, n)"
 ANY_AXES = (
     "the same numbers of a state and control whatever axes lie before the last, (B, n), (B, K, n) or (B, S, n), and "
     "whether k is a number or a tensor (K,)"
@@ -143,7 +144,7 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
         wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
         _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
         _check_among_all(f"dynamics.{name}", method(one), rows, len(x0), (x[:, 0], u[:, 0]))
-        of_stages = _called(f"dynamics.{name}", wanted, method(several), rows, x, u)
+        of_stages = called(f"dynamics.{name}", wanted, method(several), rows, x, u)
         _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
     _check_stages(dynamics, rows, x0, N)
     weights = 1.0 + 0.5 * scattered(x)
@@ -171,11 +172,10 @@ def _check_stages(dynamics: Dynamics, rows: Tensor, x0: Tensor, N: int) -> None:
         each = [dynamics.at(int(j)).take(i).step(*(part[:, at] for part in z)) for at, j in enumerate(k)]
         return torch.stack(each, dim=1)
 
-    expected = "states (B, K, n) after each of which depends on its own state, control and stage, as for (B, n)"
-    place = _called("dynamics.step", expected, joined_knots, together, alone, rows, k, arguments)
+    place = called("dynamics.step", STEP_OF_STAGE, joined_knots, together, alone, rows, k, arguments)
     if place is not None:
         got = f"others at stage {place} where K = {N}, or where other states lie beside"
-        raise InputError("dynamics.step", expected, got)
+        raise InputError("dynamics.step", STEP_OF_STAGE, got)
 
 
 def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
@@ -263,7 +263,7 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
     arguments = tuple((X if a == "x" else U)[:, constraint.knots] for a in constraint.of)
     first = [z[:, :1] for z in arguments]
     _check_among_all(field, lambda i, *z: together(i, knots[:1], *z), rows, B, first)
-    place = _called(field, ONE_KNOT, joined_knots, together, alone, rows, knots, arguments)
+    place = called(field, ONE_KNOT, joined_knots, together, alone, rows, knots, arguments)
     if place is not None:
         got = f"rows of knot {int(knots[place])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
@@ -280,14 +280,14 @@ def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint
     X, U = x0[first].unsqueeze(1).repeat(1, N + 1, 1), x0.new_zeros(1, N, dynamics.m)
     if is_users(dynamics):
         stages = dynamics.take(first).at(torch.arange(N, device=x0.device))
-        _called("dynamics.step", wanted, stages.jacobians, X[:, :-1], U)
+        called("dynamics.step", wanted, stages.jacobians, X[:, :-1], U)
     if is_users(cost):
-        _called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
+        called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
     for i, constraint in enumerate(constraints):
         if is_users(constraint) and type(constraint.bare).accumulate is not Constraint.accumulate:
             part = constraint.take(first)
-            zero = torch.zeros_like(_called(f"constraints[{i}].value", wanted, part.value, X, U))
-            _called(f"constraints[{i}].value", wanted, part.accumulate, X, U, zero, zero, _blocks(X, U)[first])
+            zero = torch.zeros_like(called(f"constraints[{i}].value", wanted, part.value, X, U))
+            called(f"constraints[{i}].value", wanted, part.accumulate, X, U, zero, zero, _blocks(X, U)[first])
 
 
 def _check_values(
@@ -300,19 +300,19 @@ def _check_values(
 ) -> torch.Size:
     """Check function(rows, *arguments) for two problems, together and each on its own; returns the values' shape."""
     before = _versions(arguments)
-    both = _called(field, wanted, function, rows, *arguments)
+    both = called(field, wanted, function, rows, *arguments)
     if _versions(arguments) != before:
         raise InputError(
             field, "a function that leaves its arguments as they are", "one that writes into them in place"
         )
     _check_tensor(field, both, shape, arguments[0].dtype, wanted)
-    again = _called(field, wanted, function, rows, *arguments)
+    again = called(field, wanted, function, rows, *arguments)
     if not torch.equal(both.nan_to_num(), again.nan_to_num()):
         raise InputError(field, "the same values for the same arguments", "others at a second call: it draws at random")
     if both.numel() == 0:
         return both.shape
     for i in (0, 1):
-        alone = _called(field, OWN_ROW, function, rows[i : i + 1], *(z[i : i + 1] for z in arguments))
+        alone = called(field, OWN_ROW, function, rows[i : i + 1], *(z[i : i + 1] for z in arguments))
         _check_tensor(field, alone, (1, *both.shape[1:]), both.dtype, OWN_ROW)
         if bool(unlike(alone, both[i : i + 1]).any()):
             raise InputError(field, OWN_ROW, "other values for a problem alone than beside another one")
@@ -331,8 +331,8 @@ def _check_among_all(
     if B <= 2:
         return
     many = [torch.cat((z[:1].expand(B - 1, *z.shape[1:]), z[1:])) for z in arguments]
-    found = _called(field, OWN_ROW, function, torch.arange(B, device=rows.device), *many)
-    two = _called(field, OWN_ROW, function, rows, *arguments)
+    found = called(field, OWN_ROW, function, torch.arange(B, device=rows.device), *many)
+    two = called(field, OWN_ROW, function, rows, *arguments)
     if found.shape != (B, *two.shape[1:]) or bool(unlike(found[[0, -1]], two).any()):
         raise InputError(field, OWN_ROW, f"other values among {B} problems than among two")
 
@@ -347,7 +347,7 @@ def _check_axes(
     field: str, function: Callable[..., Tensor], reads_k: bool, rows: Tensor, k: Tensor, *arguments: Tensor
 ) -> None:
     """Check that function(rows, k, *arguments) doesn't look at how many axes its arguments have, nor at what k is."""
-    if _called(field, ANY_AXES, depends_on_axes, function, rows, k, arguments, reads_k):
+    if called(field, ANY_AXES, depends_on_axes, function, rows, k, arguments, reads_k):
         raise InputError(field, ANY_AXES, "others for a state by itself, and its k, than among those of all knots")
 
 
@@ -374,11 +374,11 @@ def _check_slope(
     if own is None:
         with readers, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PyTorch's, about numbers read from tensors with gradients
-            gx, gu = _called(field, expected, gradients_at_once, function, x, u)
+            gx, gu = called(field, expected, gradients_at_once, function, x, u)
         own = lambda dx, du: (gx * dx).flatten(1).sum(-1) + (gu * du).flatten(1).sum(-1)
     # States and controls apart: the derivatives by one may be too large for a mistake in the others to be seen.
     for dx, du in ((_steps(x), torch.zeros_like(u)), (torch.zeros_like(x), _steps(u))):
-        given, h = _called(field, expected, own, dx, du), eps ** (1.0 / 3.0)
+        given, h = called(field, expected, own, dx, du), eps ** (1.0 / 3.0)
         along = lambda t, dx=dx, du=du: function(x + t * dx, u + t * du)
         wide, close = ((along(t) - along(-t)) / (2.0 * t) for t in (h, 0.25 * h))
         rounding = NOISE * eps * along(0.0).abs() / (0.25 * h)
@@ -391,7 +391,8 @@ def _check_slope(
             raise InputError(field, expected, f"{got:.4g} where differences give {due:.4g}{lost}")
 
 
-def _called(field: str, wanted: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def called(field: str, wanted: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """function(*arguments), with what it raises as an InputError."""
     try:
         return function(*arguments)
     except InputError:

@@ -1,14 +1,16 @@
 """Whether a user's function keeps problems, and knots, apart: no row may change with the content of another one.
 
 Content that a function reads without effect at the points that are tried (beneath a `relu`, say) shows itself where it
-is no number, or infinite, or close to the row's own content. Python code that branches on values is exempt from this:
-it reads those of all rows by its nature, can't be traced, and so is solved as it is.
+is no number, or infinite, or close to the row's own content; of code that refuses such content, or treats it apart,
+where it is far away. Python code that then branches otherwise, as it reads the values of all rows, is exempt from this:
+it can't be traced, is solved as it is, and what is found is evaluated row by row (`alone`).
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,23 +18,31 @@ from torch import Tensor
 from torchgco.base.draws import scattered
 from torchgco.base.shapes import MISTAKES
 from torchgco.base.values import whole_numbers_become
-from torchgco.tracing.recorder import looks_at_values
+from torchgco.tracing.recorder import take_same_branches
 
 FOREIGN = (torch.nan, torch.inf, -torch.inf)
 DRAWN_SIZES = (1.0, 1e3, 1e6)  # of drawn numbers
 NEIGHBOUR_STEP = 1e-3  # by which a neighbour of a row differs, as a share of 1 + |x|
 
 Rows = Callable[..., Tensor]  # of problems (b,) int64, knots (K,) int64 and arguments (b, K, ...): rows (b, K, ...)
+Content = Callable[..., Iterator[list[Tensor]]]
 
 
 def mixes_problems(function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> bool:
     """Whether a third problem between two changes function(rows, *arguments) of these."""
     found, three = function(rows, *arguments), rows[[0, 0, 1]]
-    for others in _foreign(*arguments):
-        strange = [torch.cat((z[:1], other, z[1:])) for z, other in zip(arguments, others, strict=True)]
-        beside = _tried(function, three, *strange)
-        if beside is not None and bool(unlike(beside[::2], found).any()):
-            return not looks_at_values(function, rows, *arguments)
+    for content in (_foreign, _far):
+        is_shown = True  # the function takes such content as any other
+        for others in content(*arguments):
+            strange = [torch.cat((z[:1], other, z[1:])) for z, other in zip(arguments, others, strict=True)]
+            beside = _tried(function, three, *strange)
+            if beside is not None and not bool(unlike(beside[::2], found).any()):
+                continue
+            if beside is not None and take_same_branches((function, rows, *arguments), (function, three, *strange)):
+                return True
+            is_shown = False
+        if is_shown:
+            break
     return False
 
 
@@ -46,10 +56,43 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
         k: the numbers of the knots (K,).
         arguments: (2, K, ...).
     """
-    place = _suspect(together, alone, rows, k, arguments)
-    if place is None or not looks_at_values(together, rows, k, *arguments):
-        return place
-    return _place(alone(rows, k, *arguments), together(rows, k, *arguments))
+    for sizes in (DRAWN_SIZES, DRAWN_SIZES[:2], DRAWN_SIZES[:1], ()):
+        drawn = [torch.cat((z, *(size * scattered(z[:1]) for size in sizes))) for z in arguments]
+        more = torch.cat((rows, rows[:1].expand(len(sizes))))
+        found, each = _tried(together, more, k, *drawn), _tried(alone, more, k, *drawn)
+        if found is not None and each is not None:
+            break  # else it refuses such states
+    else:
+        found, each = together(rows, k, *arguments), alone(rows, k, *arguments)
+    exempt = False
+    if (place := _place(each, found)) is not None:
+        if take_same_branches((alone, more, k, *drawn), (together, more, k, *drawn)):
+            return place
+        exempt = True
+    one, alike = rows[:1], (together, more, k, *drawn)
+    # Any two knots differ in a digit of their places, so that one of them is kept where the other is foreign. The last
+    # two rows are kept as a whole, and foreign as a whole: another problem.
+    K = len(k)
+    digits = torch.arange(K, device=k.device) >> torch.arange((K - 1).bit_length(), device=k.device).unsqueeze(-1) & 1
+    kept = torch.cat((digits == 0, digits == 1, torch.tensor([[True], [False]], device=k.device).expand(2, K)))
+    for content in (_foreign, _far):
+        is_shown = True
+        for others in content(*(z[:1] for z in arguments)):
+            strange = [
+                torch.where(kept.view(*kept.shape, *[1] * (z.dim() - 2)), z[:1], other)
+                for z, other in zip(arguments, others, strict=True)
+            ]
+            changed = together, one.expand(len(kept)), k, *strange
+            other = _tried(*changed)
+            if other is not None and (place := _place(other, found[:1], kept)) is None:
+                continue
+            if other is not None and take_same_branches(alike, changed):
+                return place
+            is_shown, exempt = False, exempt or other is not None
+        if is_shown:
+            break
+    # Of code that branches, where the solve begins.
+    return _place(alone(rows, k, *arguments), together(rows, k, *arguments)) if exempt else None
 
 
 def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor], reads_k: bool) -> bool:
@@ -64,8 +107,12 @@ def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence
         arguments: (2, K, ...).
         reads_k: every knot is tried, as a number finds places that a tensor doesn't: those of a dict, for instance.
     """
-    with whole_numbers_become(arguments[0].dtype):
-        return _forms_differ(function, rows, k, arguments, reads_k)
+
+    def precise(*z: Any) -> Tensor:
+        with whole_numbers_become(arguments[0].dtype):
+            return function(*z)
+
+    return _forms_differ(precise, rows, k, arguments, reads_k)
 
 
 def _forms_differ(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor], reads_k: bool) -> bool:
@@ -87,37 +134,19 @@ def _forms_differ(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[T
     return False
 
 
-def _suspect(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> int | None:
-    """`joined_knots`, and the place of one that changes where the function branches on values."""
-    K, one = len(k), rows[:1]
-    drawn = [torch.cat((z, *(size * scattered(z[:1]) for size in DRAWN_SIZES))) for z in arguments]
-    more = torch.cat((rows, one.expand(len(DRAWN_SIZES))))
-    found, each = _tried(together, more, k, *drawn), _tried(alone, more, k, *drawn)
-    if found is None or each is None:  # it refuses such states
-        found, each = together(rows, k, *arguments), alone(rows, k, *arguments)
-    if (place := _place(each, found)) is not None:
-        return place
-    # Any two knots differ in a digit of their places, so that one of them is kept where the other is foreign. The last
-    # two rows are kept as a whole, and foreign as a whole: another problem.
-    digits = torch.arange(K, device=k.device) >> torch.arange((K - 1).bit_length(), device=k.device).unsqueeze(-1) & 1
-    kept = torch.cat((digits == 0, digits == 1, torch.tensor([[True], [False]], device=k.device).expand(2, K)))
-    for others in _foreign(*(z[:1] for z in arguments)):
-        strange = [
-            torch.where(kept.view(*kept.shape, *[1] * (z.dim() - 2)), z[:1], other)
-            for z, other in zip(arguments, others, strict=True)
-        ]
-        other = _tried(together, one.expand(len(kept)), k, *strange)
-        if other is not None and (place := _place(other, found[:1], kept)) is not None:
-            return place
-    return None
-
-
 def _foreign(*rows: Tensor) -> Iterator[list[Tensor]]:
     """Content (1, ...) that is put beside rows (b, ...): no numbers, and a neighbour of each row."""
     for value in FOREIGN:
         yield [torch.full_like(z[:1], value) for z in rows]
     for z in zip(*(z.split(1) for z in rows), strict=True):
         yield [part + NEIGHBOUR_STEP * (1.0 + part.abs()) * scattered(part) for part in z]
+
+
+def _far(*rows: Tensor) -> Iterator[list[Tensor]]:
+    """Finite content (1, ...) far from rows (b, ...), on both sides of 0."""
+    for size in DRAWN_SIZES:
+        for signed in (size, -size):
+            yield [signed * scattered(z[:1]) for z in rows]
 
 
 def _tried(function: Callable[..., Tensor], *arguments: Tensor | int) -> Tensor | None:

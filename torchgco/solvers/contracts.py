@@ -23,6 +23,7 @@ from torchgco.explaining.account import Account
 from torchgco.kernels import cost_unit, current, interior_of, kernels_of, open_loop, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
+from torchgco.problem.alone import check_rows
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
@@ -189,7 +190,8 @@ class Solver(Brief):
 
         Raises:
             InputError: U0, ids, warm or X0 don't fit the problem, or an option of the solver doesn't; X0 where the
-                solver can't begin with states.
+                solver can't begin with states; a function that branches on values and that, along what was found,
+                mixes knots or problems.
         """
         check_untransformed("solve")
         problem = current_problem(problem)
@@ -216,6 +218,7 @@ class Solver(Brief):
             found = self.run(call)
             found = replace(found, status=judged_between(call.problem, found.X, found.U, found.status))
             found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
+            self._check(problem, call, found)
             return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
 
     def _in_time(
@@ -238,9 +241,16 @@ class Solver(Brief):
             able = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
             raise InputError("solver", able, type(self).__name__)
         found = solve_in_time(chooser, problem, call, X0)
+        self._check(problem, call, found)
         _, X, U = at_times(problem, found.X, found.U, found.times)
         account = Account(problem, self, kernels=self.kernels or used(call.problem))
         return replace(found, status=judged_between(call.problem, X, U, found.status), account=account)
+
+    def _check(self, problem: Problem, call: Call, found: Solution) -> None:
+        """Raise InputError where code that branches on values has mixed knots or problems: only PyTorch's kernels call
+        such code."""
+        if self.kernels is None and not call.problem.known.in_c:
+            check_rows(problem, found.X, found.U, found.times)
 
     def choosing_time(self, problem: Problem) -> Chooser | None:
         """What solves problems with a free time, in the form `in_time`, for this solver; None: it can't."""

@@ -45,7 +45,7 @@ def least_violated(call: Call, end: SolveEnd, tolerance: float) -> SolveEnd:
 
 
 def left_to_close(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """The share (B,) of the squared violation that one Gauss-Newton step is predicted to save; NaN without any."""
+    """The share (B,) of the squared violation that one Gauss-Newton step is predicted to save; NaN without any step."""
     s = problem.n + 1 + problem.m
     H, squares = X.new_zeros(*X.shape[:2], s, s), X.new_zeros(X.shape[0])
     for constraint in problem.constraints:
@@ -57,4 +57,5 @@ def left_to_close(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     H = H.transpose(0, 1)
     step = backward(linearise(problem, X, U), H, STEP_REGULARISATION * H.abs().amax(dim=(0, 2, 3)))
     saved = -step.expected_change(torch.ones_like(squares)) / squares
-    return torch.where(step.failed, torch.nan, saved)
+    flat = (H == 0).all(0).flatten(1).all(-1) & (squares > 0)  # no violated row has a slope: no step saves anything
+    return torch.where(flat, 0.0, torch.where(step.failed, torch.nan, saved))

@@ -90,9 +90,10 @@ _fmin, _fmax = _binary("fmin"), _binary("fmax")  # in C, NaN where one of the tw
 
 
 def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
-    if rounding_mode == "trunc":
-        raise NoCounterpart
-    return _truediv(a, b) if rounding_mode is None else _floor_divided(a, b)
+    if rounding_mode == "floor":
+        return _floor_divided(a, b)
+    quotient = _truediv(a, b)
+    return quotient if rounding_mode is None else _where(_lt(quotient, 0.0), _unary("ceil")(quotient), _floor(quotient))
 
 
 def _excess(a: Any, b: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -222,7 +223,7 @@ def _fold(combine: Callable) -> Callable:
 
 def _norm(a: np.ndarray, ord: float = 2, dim: Any = None, keepdim: bool = False, **_: Any) -> np.ndarray:
     if ord != 2:
-        raise NoCounterpart
+        raise NoCounterpart  # with another type of its result
     square = _sum(_mul(a, a), dim, keepdim)
     return _where(_eq(square, 0.0), 0.0, _sqrt(square))  # at zero the derivative is 0, as PyTorch's
 

@@ -16,9 +16,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.shapes import MISTAKES
-from torchgco.base.values import whole_numbers_become
+from torchgco.tracing.decompositions import DECOMPOSITIONS
 from torchgco.tracing.operations import OPERATIONS
 
+OF_SHAPES = "aten.is_same_size", "aten._has_same_storage_numel"  # operations that look at shapes alone
+READ_NUMBERS = 64  # numbers of a tensor, made by Python code, that are compared
 SHAPED_BY_VALUES = torch.Tag.dynamic_output_shape
 
 
@@ -73,6 +75,7 @@ class Recording(TorchDispatchMode):
         self._calls = calls
         self._seen: dict[int, tuple[Slot, Tensor]] = {}  # holds the tensor: its id isn't reused
         self._numbers = count()
+        self._stale: set[int] = set()  # the same of tensors whose memory was written by way of another one
         self.operations: list[Operation] = []
         self.lenient = False  # whether what can't be followed is recorded nevertheless
         self.unfit: _Unfit | None = None  # why the function can't be recorded; its own code may have caught it
@@ -88,6 +91,8 @@ class Recording(TorchDispatchMode):
 
     def slot(self, tensor: Tensor) -> Slot:
         """The slot of a tensor; a tensor that no recorded operation made comes from outside, and is a constant."""
+        if id(tensor) in self._stale:
+            raise self._unfit("one that reads what was written by way of another tensor", self._calls.called)
         if id(tensor) not in self._seen:
             self.captured[self._new(tensor)] = tensor
         return self._seen[id(tensor)][0]
@@ -117,7 +122,11 @@ class Recording(TorchDispatchMode):
         if torch.Tag.inplace_view in func.tags and (out_of_place := _out_of_place(func)) and self._is_own(args[0]):
             return self._turned(func, out_of_place, args, kwargs)
         if func._schema.is_mutable and not self.lenient:  # all that can be a write into a copy has become one
+            if (out_of_place := _out_of_place(func)) and self._is_own(args[0]):  # but those of PyTorch's own functions
+                return self._written(func, out_of_place, args, kwargs)
             raise self._unfit("one that writes in place where that can't be followed", func)
+        if name_of(func) in OF_SHAPES:
+            return func(*args, **kwargs)
         if not _makes_tensors(func):
             if self._follows(args, kwargs):
                 raise self._unfit("one that looks at the values of its arguments", func, _Looks)
@@ -127,14 +136,8 @@ class Recording(TorchDispatchMode):
             raise self._unfit("one with shapes that depend on the values of its arguments", func, _Looks)
         if SHAPED_BY_VALUES in func.tags:
             self.look(*_shaping(func, args), kwargs)
-        if name_of(func) not in OPERATIONS:
-            with self:  # the parts are dispatched here in turn
-                parts = func.decompose(*args, **kwargs)
-                # The table takes half a second to load, and an operation that PyTorch computes itself may stay whole.
-                if parts is NotImplemented and self._follows(args, kwargs) and func in _decompositions():
-                    parts = _decompositions()[func](*args, **kwargs)
-            if parts is not NotImplemented:
-                return parts
+        if (parts := self._decomposed(func, args, kwargs)) is not NotImplemented:
+            return parts
         if name_of(func) == "aten.lift_fresh" and _has_own_memory(args[0]):
             self._made.add(self.slot(args[0]))
         inputs, options = _mapped(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
@@ -151,6 +154,24 @@ class Recording(TorchDispatchMode):
             self._outer.update(operation.outputs)
         return out
 
+    def _decomposed(self, func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+        """The result by operations that are dispatched here in turn; NotImplemented: the operation stays whole."""
+        name = name_of(func)
+        rule = DECOMPOSITIONS.get(name)
+        if rule is not None and self._follows(args, kwargs):
+            with self:
+                parts = rule(*args, **kwargs)
+            if parts is not NotImplemented:
+                return parts
+        if name in OPERATIONS:
+            return NotImplemented
+        with self:
+            parts = func.decompose(*args, **kwargs)
+            # The table takes half a second to load, and an operation that PyTorch computes itself may stay whole.
+            if parts is NotImplemented and self._follows(args, kwargs) and func in _decompositions():
+                parts = _decompositions()[func](*args, **kwargs)
+        return parts
+
     def _is_own(self, tensor: Tensor) -> bool:
         """Whether a recorded operation has made a tensor."""
         slot = self.slot(tensor)
@@ -165,6 +186,21 @@ class Recording(TorchDispatchMode):
         func(*args, **kwargs)
         self._seen[id(as_it_was)] = before, as_it_was
         self._seen[id(tensor)] = self.slot(view), tensor
+        return tensor
+
+    def _written(self, func: Any, out_of_place: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:
+        """A tensor that is written in place: from here on it is another one, and what shares its memory is unknown."""
+        tensor: Tensor = args[0]
+        before, as_it_was = self.slot(tensor), torch.ops.aten.alias(tensor)
+        with self:
+            after = out_of_place(*args, **kwargs)
+        if (after.shape, after.dtype) != (tensor.shape, tensor.dtype):
+            raise self._unfit("one that writes in place where that can't be followed", func)
+        func(*args, **kwargs)
+        self._stale |= {id(other) for _, other in self._seen.values() if _overlap(other, tensor)}
+        self._stale.discard(id(tensor))
+        self._seen[id(as_it_was)] = before, as_it_was
+        self._seen[id(tensor)] = self.slot(after), tensor
         return tensor
 
     def _unfit(self, what: str, operation: Any, kind: type[_Unfit] | None = None) -> _Unfit:
@@ -194,6 +230,20 @@ def _has_own_memory(tensor: Tensor) -> bool:
         return tensor.untyped_storage().resizable()
 
 
+def _overlap(one: Tensor, other: Tensor) -> bool:
+    """Whether two tensors may share memory."""
+    (first, last), (begin, end) = _memory(one), _memory(other)
+    return first < end and begin < last
+
+
+def _memory(tensor: Tensor) -> tuple[int, int]:
+    """Where a tensor's memory begins and ends."""
+    if tensor.layout is not torch.strided or tensor.numel() == 0:
+        return 0, 0
+    steps = ((size - 1) * by for size, by in zip(tensor.shape, tensor.stride(), strict=True))
+    return tensor.data_ptr(), tensor.data_ptr() + (sum(steps) + 1) * tensor.element_size()
+
+
 class _Unfit(RuntimeError):
     """A function does what a recording can't hold."""
 
@@ -213,6 +263,63 @@ def looks_at_values(function: Callable[..., Tensor], *examples: Tensor) -> bool:
     except MISTAKES:
         pass
     return isinstance(recording.unfit, _Looks) or calls.refused is not None
+
+
+class _Reading(TorchDispatchMode):
+    """Keeps what Python code reads of tensors, and with which numbers it calls which operations.
+
+    Numbers that are shapes or places aren't kept: two calls may be of other numbers of rows.
+    """
+
+    def __init__(self, arguments: Iterable[Any]) -> None:
+        super().__init__()
+        self.values, self.path = list[Any](), list[Any]()
+        self._known = {id(part): part for part in arguments}
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        out = func(*args, **kwargs)
+        if not _makes_tensors(func):
+            self.values.append(out)
+        elif SHAPED_BY_VALUES in func.tags:
+            self.values.append(tuple(out.shape) if isinstance(out, Tensor) else None)
+        kinds = {argument.name: str(argument.type) for argument in func._schema.arguments}
+        given = [*zip(kinds.values(), args, strict=False), *((kinds[name], part) for name, part in kwargs.items())]
+        self.path.append((str(func), *(self._number(kind, leaf) for kind, part in given for leaf in _leaves(part))))
+        self._known |= {id(leaf): leaf for leaf in _leaves(out)}
+        return out
+
+    def _number(self, kind: str, leaf: Any) -> Any:
+        if isinstance(leaf, Tensor) and id(leaf) not in self._known:
+            return leaf.tolist() if leaf.numel() <= READ_NUMBERS else id(leaf)
+        return leaf if isinstance(leaf, (bool, float)) or (isinstance(leaf, int) and "int" not in kind) else None
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False
+
+
+def take_same_branches(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    """Whether Python code reads the same of tensors in two calls (function, *arguments), or then does the same.
+
+    One of the calls may consist of several, one for each knot.
+    """
+    (values, path), (others, other_path) = _read(*one), _read(*other)
+    return (None not in values and _repeat(values, others)) or _repeat(path, other_path)
+
+
+def _read(function: Callable[..., Tensor], *arguments: Any) -> tuple[list[Any], list[Any]]:
+    """What Python code reads, None for what can't be followed; and the operations with numbers that it calls."""
+    calls, reading = WithoutReading(), _Reading(arguments)
+    with torch.no_grad(), reading, calls:
+        function(*arguments)
+    return [*reading.values, *(tensor.tolist() for tensor in calls.read)], reading.path
+
+
+def _repeat(some: list[Any], others: list[Any]) -> bool:
+    """Whether one of two lists is the other one, once or several times."""
+    few, many = sorted((some, others), key=len)
+    return many == len(many) // max(1, len(few)) * few
 
 
 def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recording:
@@ -235,6 +342,9 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     except Exception as error:  # any error of the function
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", message) from theirs(error)
+    if not isinstance(result, Tensor):
+        got = f"one that gives no tensor where it is recorded, but {type(result).__name__}"
+        raise InputError(field, "a function that can be traced", got)
     recording.looked |= bool(calls.seen)
     recording.look(calls.read)
     recording.result = recording.slot(result)
@@ -248,9 +358,15 @@ def replay_all(operations: Iterable[Operation], known: dict[Slot, Any]) -> None:
     """Apply PyTorch's operations in order, each with the default type that it was recorded with."""
     with torch.no_grad():
         for default, some in groupby(operations, key=lambda operation: operation.default):
-            with whole_numbers_become(default):
+            usual = torch.get_default_dtype()
+            if default is not usual:  # it was changed since
+                torch.set_default_dtype(default)
+            try:
                 for operation in some:
                     operation.replay(known)
+            finally:
+                if default is not usual:
+                    torch.set_default_dtype(usual)
 
 
 def _is_reproduced(recording: Recording, result: Tensor) -> bool:
@@ -295,10 +411,11 @@ def _leaves(tree: Any) -> Iterator[Any]:
 
 @cache
 def _out_of_place(operation: Any) -> Any:
-    """The operation of `OPERATIONS` that makes a tensor of what this one does in place; None where there is none."""
+    """The operation that makes a tensor of what this one does in place; None where there is none."""
     name, overload = name_of(operation).removesuffix("_"), operation._overloadname
     packet = getattr(torch.ops.aten, name.removeprefix("aten."), None)
-    return getattr(packet, overload, None) if name in OPERATIONS else None
+    found = getattr(packet, overload, None) if name_of(operation).endswith("_") else None
+    return None if found is None or found._schema.is_mutable else found
 
 
 @cache
@@ -317,9 +434,11 @@ def _shaping(operation: Any, args: Sequence[Any]) -> Sequence[Any]:
 
 @cache
 def _decompositions() -> dict[Any, Callable]:
-    from torch._decomp import core_aten_decompositions
+    from torch._decomp import core_aten_decompositions, decomposition_table
 
-    return dict(core_aten_decompositions())
+    # Those of the whole table that aren't made of the primitives of PyTorch's compiler.
+    own = {op: rule for op, rule in decomposition_table.items() if rule.__module__ == "torch._decomp.decompositions"}
+    return own | dict(core_aten_decompositions())
 
 
 @cache

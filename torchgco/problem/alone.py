@@ -1,0 +1,254 @@
+"""Parts that look at values, evaluated row by row: each knot of each problem by itself.
+
+Python code that branches on values reads those of all rows that it is given, and can't be traced: before a solve,
+nothing proves that it keeps them apart. What it gives for a row alone is what the user's code says of this row.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import suppress
+from functools import cache, partial
+from typing import Any, Self, TypeAlias
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import MISTAKES
+from torchgco.base.tree import Rows, is_users
+from torchgco.base.values import whole_numbers_become
+from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.costs.base import Cost
+from torchgco.dynamics.base import Dynamics
+from torchgco.problem.border import ONE_KNOT, OWN_ROW, STEP_OF_STAGE, called
+from torchgco.problem.in_time import at_times
+from torchgco.problem.joined import unlike
+from torchgco.problem.problem import Problem
+from torchgco.tracing.recorder import looks_at_values
+
+_looking: MutableMapping[Any, bool] = WeakIdKeyDictionary()  # whether parts do, by identity
+# Values (b, ...) of a problem along X, U, of all knots at once or, where they can be had so, one knot after the other.
+Values: TypeAlias = Callable[[Problem, Tensor, Tensor, bool], Tensor]
+
+
+def row_by_row(problem: Problem, again: bool = False) -> Problem:
+    """The problem, whose parts that look at values are evaluated row by row; itself where none does.
+
+    Args:
+        again: each part's code is tried, also where it was before.
+    """
+    first = problem.take(slice(0, 1))
+    looks = partial(_looks, again)
+    x = torch.where(torch.isfinite(first.x0), first.x0, 0.0)
+    X, U = x.unsqueeze(1).repeat(1, problem.N + 1, 1), x.new_zeros(1, problem.N, problem.m)
+    parts: dict[str, Any] = {}
+    if looks(problem.dynamics, first.along.step, X[:, 1:], U):
+        integrated = type(first.dynamics).step is Dynamics.step
+        parts["dynamics"] = _made(problem.dynamics, _Field if integrated else _Step)
+    if looks(problem.cost, first.cost.total, X, U):
+        parts["cost"] = _made(problem.cost, _Cost if type(problem.cost).total is Cost.total else _Total)
+    rows = list(problem.constraints)
+    for i, part in enumerate(first.constraints):
+        if looks(rows[i], part.value, X, U):
+            rows[i] = _made(rows[i], _Function if isinstance(part, FunctionConstraint) else _Constraint)
+            parts["constraints"] = tuple(rows)
+    return problem._with(parts, problem.known) if parts else problem
+
+
+def check_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = None) -> None:
+    """Check that rows of trajectories X (B, N+1, n), U (B, N, m) together are what each is by itself.
+
+    Only parts that look at values are evaluated, along the trajectories that are finite.
+
+    Args:
+        times: (B, N+1), s, of the knots where the time is free.
+
+    Raises:
+        InputError: names the part at fault, as `Problem` does where that is seen when the problem is made.
+    """
+    apart = row_by_row(problem, again=True)
+    rows = (torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)).nonzero().flatten()
+    if apart is problem or rows.numel() == 0:
+        return
+    some = X[rows], U[rows], None if times is None else times[rows]
+    with torch.no_grad(), whole_numbers_become(X.dtype):
+        whole, x, u = at_times(problem.take(rows), *some)
+        alone, _, _ = at_times(apart.take(rows), *some)
+        for field, wanted, values in _values(problem, apart):
+            own = called(field, wanted, values, alone, x, u, True)
+            for at_once in (True, False):
+                found = called(field, wanted, values, whole, x, u, at_once)
+                if found.shape != own.shape or bool((wrong := unlike(found, own)).any()):
+                    raise InputError(field, wanted, _told(found, own, wrong, rows))
+
+
+def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values]]:
+    """Field, expectation and values of each part that isn't the same in both problems."""
+    if apart.dynamics is not problem.dynamics:
+        yield "dynamics.step", STEP_OF_STAGE, _steps
+    if apart.cost is not problem.cost:
+        if isinstance(apart.cost, _Total):
+            yield "cost.total", OWN_ROW, lambda p, X, U, _: p.cost.total(X, U)
+        else:
+            yield "cost.stage", OWN_ROW, _stages
+            yield "cost.terminal", OWN_ROW, lambda p, X, U, _: p.cost.terminal(X[:, -1])
+    for i, (one, other) in enumerate(zip(problem.constraints, apart.constraints, strict=True)):
+        if one is not other:
+            is_function = isinstance(one, FunctionConstraint)
+            field = f"{one.name}.function" if isinstance(one, FunctionConstraint) else f"constraints[{i}].value"
+            yield field, ONE_KNOT if is_function else OWN_ROW, lambda p, X, U, _, i=i: p.constraints[i].value(X, U)
+
+
+def _steps(problem: Problem, X: Tensor, U: Tensor, at_once: bool) -> Tensor:
+    if at_once:
+        return problem.along.step(X[:, :-1], U)
+    return torch.stack([problem.dynamics.at(k).step(X[:, k], U[:, k]) for k in range(problem.N)], dim=1)
+
+
+def _stages(problem: Problem, X: Tensor, U: Tensor, at_once: bool) -> Tensor:
+    if at_once:
+        return problem.cost.stage(X[:, :-1], U, torch.arange(problem.N, device=U.device))
+    return torch.stack([problem.cost.stage(X[:, k], U[:, k], k) for k in range(problem.N)], dim=1)
+
+
+def _told(found: Tensor, own: Tensor, wrong: Tensor, rows: Tensor) -> str:
+    """What an error says of values (b, ...) of problems `rows` (b,) that are `own` where each row is by itself."""
+    if found.shape != own.shape:
+        return f"values of shape {tuple(found.shape)} along the trajectories found, {tuple(own.shape)} row by row"
+    b, *at = wrong.nonzero()[0].tolist()
+    knot = f", row {at[0]} along the trajectory" if at else ""
+    numbers = f"{float(found[(b, *at)]):.6g} along the trajectories found, {float(own[(b, *at)]):.6g} by itself"
+    return f"other values among other knots and problems: {numbers} (problem {int(rows[b])}{knot})"
+
+
+def _looks(again: bool, part: Any, values: Callable[..., Tensor], *arguments: Tensor) -> bool:
+    if not is_users(part):
+        return False
+    found = None if again else _looking.get(part)
+    if found is None:
+        found = looks_at_values(values, *arguments)
+        with suppress(TypeError):  # no weak reference to it
+            _looking[part] = found
+    return found
+
+
+def _made(part: Any, mixin: type) -> Any:
+    """The same part with methods of `mixin` before its own."""
+    made = copy.copy(part)
+    object.__setattr__(made, "__class__", _kind(mixin, type(part)))
+    return made
+
+
+@cache
+def _kind(mixin: type, kind: type) -> type:
+    return type(kind.__name__, (mixin, kind), {"__module__": kind.__module__})
+
+
+def _each(row: Callable[[int, Any], Tensor], *arguments: Tensor) -> Tensor:
+    """row(b, i) (1, ...) of all rows of arguments (B, ...) or (B, K, ...), where it takes those of (b, i) (1, ...).
+
+    NaN for rows that the user's code refuses and that aren't finite.
+    """
+    x, found = arguments[0], dict[tuple[int, Any], Tensor | None]()
+    places = [(b, i) for i in (range(x.shape[1]) if x.dim() == 3 else [None]) for b in range(len(x))]
+    for place in places:
+        try:
+            found[place] = row(*place)
+        except MISTAKES:
+            if all(bool(torch.isfinite(_at(z, *place)).all()) for z in arguments):
+                raise
+            found[place] = None
+    known = next((value for value in found.values() if value is not None), None)
+    if known is None:
+        return row(*places[0])  # which raises what it has to say
+    rows = torch.cat([torch.full_like(known, torch.nan) if value is None else value for value in found.values()])
+    return rows if x.dim() == 2 else rows.unflatten(0, (-1, len(x))).transpose(0, 1)
+
+
+def _at(z: Tensor, b: int, i: int | None) -> Tensor:
+    """Row (1, ...) of (B, ...) or (B, K, ...)."""
+    return z[b : b + 1] if i is None else z[b : b + 1, i]
+
+
+def _one(b: int) -> slice:
+    return slice(b, b + 1)
+
+
+class _Field(Dynamics):
+    of_stages: tuple[Dynamics, Tensor] | None = None  # the model of any stage, and the stages (K,), set by `at`
+
+    def at(self, k: int | Tensor) -> Self:
+        found = super().at(k)
+        if not isinstance(found, _Field):  # the user's code makes another object
+            found = _made(found, _Step if isinstance(self, _Step) else _Field)
+        return found if found is self or isinstance(k, int) else _for_stages(found, (self, k))
+
+    def take(self, index: Rows) -> Self:
+        found = super().take(index)
+        if self.of_stages is None:
+            return found
+        return _for_stages(found, (self.of_stages[0].take(index), self.of_stages[1]))
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        if x.shape[:-1] == (1,):
+            return super().field(x, u)
+        return _each(lambda b, i: self._row(b, i).field(_at(x, b, i), _at(u, b, i)), x, u)
+
+    def _row(self, b: int, i: int | None) -> Dynamics:
+        model, k = self.of_stages or (self, None)
+        return model.take(_one(b)) if k is None or i is None else model.take(_one(b)).at(int(k[i]))
+
+
+def _for_stages(model: Any, of_stages: tuple[Dynamics, Tensor]) -> Any:
+    model = copy.copy(model)
+    object.__setattr__(model, "of_stages", of_stages)
+    return model
+
+
+class _Step(_Field):
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        if x.shape[:-1] == (1,):
+            return super().step(x, u)
+        return _each(lambda b, i: self._row(b, i).step(_at(x, b, i), _at(u, b, i)), x, u)
+
+
+class _Cost(Cost):
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        if x.shape[:-1] == (1,):
+            return super().stage(x, u, k)
+        number = lambda i: int(k[i]) if isinstance(k, Tensor) and k.dim() == 1 else k
+        return _each(lambda b, i: self.take(_one(b)).stage(_at(x, b, i), _at(u, b, i), number(i)), x, u)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        if x.shape[:-1] == (1,):
+            return super().terminal(x)
+        return _each(lambda b, i: self.take(_one(b)).terminal(_at(x, b, i)), x)
+
+
+class _Total(_Cost):
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        if len(X) == 1:
+            return super().total(X, U)
+        return torch.cat([self.take(_one(b)).total(X[_one(b)], U[_one(b)]) for b in range(len(X))])
+
+
+class _Function(FunctionConstraint):
+    def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
+        if arguments[0].dim() == 2:
+            return super().rows_at(k, *arguments)
+        number = lambda i: k if isinstance(k, int) else int(k[i])
+        return _each(lambda b, i: self.take(_one(b)).rows_at(number(i), *(_at(z, b, i) for z in arguments)), *arguments)
+
+
+class _Constraint(Constraint):
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().value(X, U) if len(X) == 1 else self._of_each("value", X, U)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().violation(X, U) if len(X) == 1 else self._of_each("violation", X, U)
+
+    def _of_each(self, name: str, X: Tensor, U: Tensor) -> Tensor:
+        return torch.cat([getattr(self.take(_one(b)), name)(X[_one(b)], U[_one(b)]) for b in range(len(X))])
