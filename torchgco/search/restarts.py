@@ -13,6 +13,7 @@ from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.kernels import expect_interior
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_maps, has_paths
@@ -21,7 +22,9 @@ from torchgco.search.converge import Converge
 from torchgco.search.freed import Freed
 from torchgco.search.nearby import among_nearby
 from torchgco.search.proposals import PathProposals
+from torchgco.search.rows import Tighten
 from torchgco.search.search import Late, Search
+from torchgco.search.starts import Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.suitability import suited_paths
 from torchgco.search.table import Passes, Row, passes_of
@@ -117,7 +120,13 @@ class Restarts(Solver):
         paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
         through = partial(solved_through_gates, self.interior, limit)
         rounds = max((one.rounds for one in self.passes.steps if isinstance(one, ClearChords)), default=0)
-        return Chooser(self, Freed(self.interior, limit, rounds), limit, paces=paces, through=through)
+        return Chooser(self._at_held_times(), Freed(self.interior, limit, rounds), limit, paces=paces, through=through)
+
+    def _at_held_times(self) -> Restarts:
+        """The same without further starts: a time that is too short has no trajectory, and the next one is tried."""
+        rows = {name: row for name, row in self.passes.items() if not isinstance(row, Starts)}
+        short = {name: replace(row, starts=0) for name, row in rows.items() if isinstance(row, Tighten)}
+        return replace(self, passes=Passes(rows | short))
 
     def recording(self) -> Restarts:
         """The same solver, which keeps the record of its search and of every iteration."""
@@ -135,7 +144,8 @@ class Restarts(Solver):
         solver = self.local
         session = Session(call, solver.inner.as_printed, record=solver.record)
         passes, guidance = self._suited(session.call.problem)
-        search = Search(session.call, solver, passes, guidance, self.interior, session.recorder)
+        again = partial(self._ended, passes, guidance)
+        search = Search(session.call, solver, passes, guidance, self.interior, session.recorder, again)
         self._run(search, passes)
         end = search.best.end
         if self._finishes:
@@ -144,6 +154,12 @@ class Restarts(Solver):
         if search.record is None:
             return solution
         return replace(solution, search=search.finish_record(*session.scales))
+
+    def _ended(self, passes: Sequence[Row | None], guidance: Guidance | None, call: Call) -> SolveEnd:
+        """How another search of the same kind ends, which isn't recorded."""
+        search = Search(call, self.local, passes, guidance, self.interior)
+        self._run(search, passes)
+        return search.best.end
 
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
         """All passes, until the time is over."""
