@@ -115,7 +115,9 @@ class Restarts(Solver):
         """The interior point; among obstacles the passes where the time is held, and the interior point from there."""
         bodies = (part.absent.shape[1] > 0 if isinstance(part, Obstacles) else True for part in problem.geometric)
         if not any(bodies):
-            return self.interior.choosing_time(problem)
+            starts = [one for one in self.passes.steps if isinstance(one, Starts)]
+            count, every = max((one.count for one in starts), default=0), any(one.when == "all" for one in starts)
+            return replace(self.interior.choosing_time(problem), starts=count, starts_all=every)
         limit = self.local.violation_tolerance
         paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
         through = partial(solved_through_gates, self.interior, limit)
