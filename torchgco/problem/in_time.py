@@ -32,7 +32,7 @@ from torchgco.problem.rates import FirstRows, on_first, rates_of
 FREE_TIME_FORM = "in free time"  # what is kept with the form of the problem for this one
 HELD_FORM = "at held times"  # the same, where obstacles move
 PIN = 1e-3  # cost of a next tau that nobody reads, per unit squared, as a share of that of the nominal stages' time
-FITS = 0.1  # share of the states' squared changes by which the model's may miss them in states that it goes through
+MISFIT = 0.1  # share of the states' squared changes by which the model's may miss them in states that it goes through
 EQUAL = 1e-6  # difference of two stages of a segment, as a share of the duration: that of times in single precision
 
 
@@ -148,7 +148,7 @@ def fitting_factors(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     both, square, whole = (z.sum(-1) @ of_stages for z in (change * rates, rates.square(), change.square()))
     factors = both / square
     misses = whole - factors * both  # what is left of the squares
-    return torch.where((misses <= FITS * whole) & (factors > 0), factors, torch.nan)
+    return torch.where((misses <= MISFIT * whole) & (factors > 0), factors, torch.nan)
 
 
 def guessing_times(problem: Problem, times: Any) -> Problem:

@@ -23,7 +23,8 @@ from torchgco.search.search import Search
 from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.drawn import KNOTS, STREAM, controls_of, half_ranges
-ROUNDS = 2  # one guess turns a car round between walls in 2 of 5 cases: all of 8 miss in 1.7 %, of 16 in 0.03 %
+
+START_ROUNDS = 2  # one guess turns a car round between walls in 2 of 5 cases: all of 8 miss in 1.7 %, of 16 in 0.03 %
 
 
 @dataclass(frozen=True)
@@ -32,10 +33,10 @@ class Starts(Row):
 
     A guess has states on the straight line from the start to the end of the best trajectory, bent by smooth noise, and
     the controls given, with smooth noise: swing-ups and manoeuvres have many local minima, and random controls alone
-    lead chaotic systems far away. Every other guess is the trajectory of random controls over their whole range, shifted
-    so that it ends where the line does: it breaks symmetries in which the best trajectory rests, and turns a vehicle
-    that can't go straight to its goal. A stated goal that isn't reached is the end of both. Guesses are keyed by (seed,
-    id, start).
+    lead chaotic systems far away. Every other guess is the trajectory of random controls over their whole range,
+    shifted so that it ends where the line does: it breaks symmetries in which the best trajectory rests, and turns a
+    vehicle that can't go straight to its goal. A stated goal that isn't reached is the end of both. Guesses are keyed
+    by (seed, id, start).
 
     Args:
         count: of guesses, and of as many others where none of these leads to a feasible trajectory that arrives.
@@ -72,7 +73,7 @@ class Starts(Row):
         """Solve; see the class."""
         problem, rows = search.call.problem, self._rows(search)
         slots = search.solver.slots or problem.B * self.count
-        for number in range(ROUNDS if Converge.worth(problem) else 0):
+        for number in range(START_ROUNDS if Converge.worth(problem) else 0):
             rows = rows[self._missed(search)[rows]] if number > 0 else rows
             # Of none, `split` would make one empty batch.
             for some in rows.split(max(1, slots // self.count)) if rows.numel() > 0 else ():

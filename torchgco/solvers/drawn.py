@@ -21,8 +21,7 @@ def half_ranges(problem: Problem, U: Tensor) -> Tensor:
 
 
 def controls_of(problem: Problem, U: Tensor, noise: Tensor) -> Tensor:
-    """Controls (B, N, m) by noise in units of half their range, from the middle of their bounds, else from U, within
-    them."""
+    """Controls (B, N, m) within their bounds, by noise in units of half their range from the middle, else from U."""
     bounds, half = problem.control_bounds, half_ranges(problem, U)
     if bounds is None:
         return U + half * noise

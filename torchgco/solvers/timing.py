@@ -371,7 +371,8 @@ def needed_durations(chooser: Chooser, problem: Problem, call: Any, found: Solut
     time = time.take(rows)
     freed = replace(time, least=time.most, most=BEYOND * time.most, guess=None, weight=torch.ones_like(time.weight))
     longer = some._with({"time": freed, "cost": _Nothing(some.cost)})
-    again = _solved(replace(chooser, starts=0), longer, replace(call.take(rows), problem=in_time(longer), X0=None, warm=None))
+    call = replace(call.take(rows), problem=in_time(longer), X0=None, warm=None)
+    again = _solved(replace(chooser, starts=0), longer, call)
     needed = torch.full_like(found.cost, torch.nan)
     does = again.violation <= chooser.limit
     needed[rows[does]] = times_of(some, factors_in(some, again.X))[does, -1]
