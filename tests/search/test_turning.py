@@ -14,6 +14,7 @@ from tests.problems import assert_same_bits
 from torchgco import (
     Body,
     Boxes,
+    Constraint,
     ControlBounds,
     FunctionConstraint,
     FunctionDynamics,
@@ -51,6 +52,7 @@ def jackknife(x: Tensor) -> Tensor:
 def turning(kind: str, headings: Tensor, walls: bool = False, required: bool = False, way: float = 1.0) -> Problem:
     """Vehicles at the origin that drive only forwards, or with `way` -1 backwards; the goal is 3 m the other way."""
     low, high = sorted((0.0, way))
+    parts: list[Constraint]
     h, zero = headings, torch.zeros_like(headings)
     if kind == "unicycle":
         model, x0, half = FunctionDynamics(unicycle, 3, 2, 0.1, "rk4", slice(0, 2)), (zero, zero, h), 0.6
@@ -116,7 +118,7 @@ def test_the_rest_of_a_batch_changes_nothing() -> None:
     whole = torchgco.solve(spoiled, verbose=False)
     assert int(whole.status[2]) == Status.NON_FINITE
     for b in (0, 1, 3):
-        alone = torchgco.solve(problem.take([b]), ids=torch.tensor([b]), verbose=False)
+        alone = torchgco.solve(problem.take(torch.tensor([b])), ids=torch.tensor([b]), verbose=False)
         assert_same_bits(alone, whole.take([b]))
 
 
@@ -153,6 +155,6 @@ def test_a_car_with_a_trailer_backs_into_a_slot() -> None:
     ]  # fmt: skip
     rest = [0, -0.5, math.pi / 2, math.pi / 2, 0]
     cost = QuadraticCost(Q=[0.001, 0.001, 0, 0, 0.01], R=[0.05, 0.05], Qf=[10] * 5, x_ref=rest)
-    problem = Problem(model, cost, parts, [8.0, 4, 0, 0, 0], 120, goal=Goal([0, -0.5], 0.2))
+    problem = Problem(model, cost, parts, torch.tensor([[8.0, 4, 0, 0, 0]], dtype=D), 120, goal=Goal([0, -0.5], 0.2))
     found = torchgco.solve(problem, verbose=False)
     assert bool(judge(problem, found.U).reached) and float(found.cost) < 14.0

@@ -434,5 +434,5 @@ def test_drawn_guesses_find_shorter_times() -> None:
     once = torchgco.solve(problem, verbose=False)
     most = torchgco.solve(problem, solver="gco_max", verbose=False)
     assert bool((most.cost <= once.cost).all()) and bool((most.cost < 0.99 * once.cost).any())
-    alone = torchgco.solve(problem.take([2]), solver="gco_max", ids=torch.tensor([2]), verbose=False)
+    alone = torchgco.solve(problem.take(torch.tensor([2])), solver="gco_max", ids=torch.tensor([2]), verbose=False)
     assert_same_bits(alone, most.take([2]))
