@@ -23,6 +23,7 @@ from torchgco import (
     presets,
 )
 from torchgco.search import Converge, Solve, Starts
+from torchgco.search.starts import RequireGoal
 
 D = torch.float64
 ALL = Starts(when="all")
@@ -100,7 +101,7 @@ def test_guesses_differ_by_seed_and_id() -> None:
 def test_nothing_is_done_where_the_first_solve_succeeds() -> None:
     """`gco` has starts for the others alone."""
     problem = bryson_denham()
-    assert presets.gco(problem).passes.steps[-1] == Starts()
+    assert presets.gco(problem).passes.steps[-2:] == (Starts(), RequireGoal())
     assert same(torchgco.solve(problem), solved(problem))
     assert not same(torchgco.solve(problem, solver="gco_max"), solved(problem))
 

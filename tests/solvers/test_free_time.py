@@ -34,6 +34,8 @@ from torchgco import (
     certify,
     judge,
 )
+from torchgco.dynamics.rollout import open_loop
+from torchgco.problem.in_time import fitting_factors, in_time, states_in_time
 
 D = torch.float64
 INF = float("inf")
@@ -389,3 +391,48 @@ def test_a_moving_target_is_met_at_the_time_that_is_found() -> None:
     assert float(found.cost) == pytest.approx(least, rel=1e-8)
     for other in (0.98 * tau, 1.02 * tau):
         assert float(torchgco.solve(chase(other)).cost) + weight * other * N * dt > least
+
+
+def braking(B: int, seed: int, **time: Any) -> Problem:
+    """Craft with a thrust of constant size that come to rest at the origin by turning it: many local minima."""
+    draws = torch.Generator().manual_seed(seed)
+    x0 = torch.cat((2.0 * torch.rand(B, 2, generator=draws, dtype=D) + 1.0, torch.zeros(B, 2, dtype=D)), -1)
+    rates = lambda x, u: torch.cat((x[..., 2:], torch.cos(u), torch.sin(u)), -1)
+    model = FunctionDynamics(rates, 4, 1, 0.1, "rk4", position=slice(0, 2))
+    free = FreeTime(**{"least": 0.2, "most": 4.0, **time})
+    rows, goal = [ControlBounds(-7.0, 7.0)], Goal(state=[0.0] * 4, required=True)
+    return Problem(model, FunctionCost(lambda x, u: 0.0 * u[..., 0]), rows, x0, 40, goal=goal, time=free)
+
+
+@pytest.mark.parametrize("segments", [None, 2])
+def test_given_states_and_controls_set_the_time(segments: int | None) -> None:
+    """What drawn controls do in drawn times: from there the time is free, without a guess of it."""
+    draws = torch.Generator().manual_seed(3)
+    given = braking(5, 1, segments=segments)
+    assert given.time is not None
+    taken = given.time.least + 3.0 * torch.rand(5, given.time.count, generator=draws, dtype=D)
+    U = torch.rand(5, 1, 1, generator=draws, dtype=D) + torch.linspace(0, 2, 40, dtype=D).view(1, -1, 1)
+    whole = in_time(given, taken)
+    _, lifted = states_in_time(given, torch.zeros(5, 41, 4, dtype=D), U, taken)
+    X = open_loop(whole.dynamics, whole.x0, lifted)[..., :4]
+    torch.testing.assert_close(fitting_factors(given, X, U), taken, rtol=2e-3, atol=0)
+    bent = X + 0.3 * torch.rand(X.shape, generator=draws, dtype=D)  # which no controls lead to
+    assert bool(fitting_factors(given, bent, U).isnan().all())
+
+
+def test_the_states_and_controls_of_a_solution_are_kept_without_its_time() -> None:
+    problem = braking(3, 2)
+    first = torchgco.solve(problem, solver="gco_max", verbose=False)
+    assert bool((first.violation <= 1e-6).all())
+    again = torchgco.solve(problem, U0=first.U, X0=first.X, solver="interior_point", verbose=False)
+    assert bool((again.duration <= first.duration * (1.0 + 1e-4)).all())
+
+
+def test_drawn_guesses_find_shorter_times() -> None:
+    """Of the default none where the first solve converges; eight of `gco_max`, in any batch the same."""
+    problem = braking(4, 5)
+    once = torchgco.solve(problem, verbose=False)
+    most = torchgco.solve(problem, solver="gco_max", verbose=False)
+    assert bool((most.cost <= once.cost).all()) and bool((most.cost < 0.99 * once.cost).any())
+    alone = torchgco.solve(problem.take(torch.tensor([2])), solver="gco_max", ids=torch.tensor([2]), verbose=False)
+    assert_same_bits(alone, most.take([2]))

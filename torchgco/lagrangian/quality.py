@@ -85,6 +85,13 @@ def ranks_arrival(problem: Problem) -> bool:
     return problem.goal is not None and not problem.goal.assumed
 
 
+def outside_goal(problem: Problem, X: Tensor) -> Tensor:
+    """Whether states (B, N+1, n) end outside the ball of a stated goal, (B,) bool; NaN doesn't."""
+    if problem.goal is None or problem.goal.assumed:
+        return torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    return problem.goal.distance(X[:, -1, problem.position]) > problem.goal.radius + ADMITTED
+
+
 def leaves_goal(problem: Problem, new: Tensor, old: Tensor) -> Tensor:
     """Whether states (B, N+1, n) end away from a stated goal at which old ones have arrived, (B,) bool."""
     if not ranks_arrival(problem):

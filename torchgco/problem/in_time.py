@@ -32,6 +32,7 @@ from torchgco.problem.rates import FirstRows, on_first, rates_of
 FREE_TIME_FORM = "in free time"  # what is kept with the form of the problem for this one
 HELD_FORM = "at held times"  # the same, where obstacles move
 PIN = 1e-3  # cost of a next tau that nobody reads, per unit squared, as a share of that of the nominal stages' time
+MISFIT = 0.1  # share of the states' squared changes by which the model's may miss them in states that it goes through
 EQUAL = 1e-6  # difference of two stages of a segment, as a share of the duration: that of times in single precision
 
 
@@ -131,6 +132,23 @@ def factors_of(problem: Problem, times: Any) -> Tensor:
     if bool(wrong.any()) or bool((times[:, 0] != 0).any()):
         raise InputError("times", "knots from 0 s on, at equal distances within each segment", "others")
     return factors
+
+
+def fitting_factors(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The factors (B, S) with which the model goes through states X (B, N+1, n) by controls U (B, N, m), nearly.
+
+    Those of the least squares of x_k+1 - x_k - tau dt x', with x' the mean of a stage's ends; NaN where these are off.
+    """
+    time, model = problem.time, problem.dynamics
+    assert time is not None
+    rates = 0.5 * model.dt * (model.field(X[:, :-1], U) + model.field(X[:, 1:], U))
+    size = X.amax(1, keepdim=True) - X.amin(1, keepdim=True)
+    change, rates = ((z / torch.where(size > 0, size, 1.0)).flatten(2) for z in (X.diff(dim=1), rates))
+    of_stages = torch.nn.functional.one_hot(time.of_stages(problem.N), time.count).to(X)
+    both, square, whole = (z.sum(-1) @ of_stages for z in (change * rates, rates.square(), change.square()))
+    factors = both / square
+    misses = whole - factors * both  # what is left of the squares
+    return torch.where((misses <= MISFIT * whole) & (factors > 0), factors, torch.nan)
 
 
 def guessing_times(problem: Problem, times: Any) -> Problem:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
@@ -284,6 +284,13 @@ class Problem:
     def held_at(self, x: Tensor) -> Self:
         """The same problems with starts that are given, `start_in` x (B, n); themselves where no start is free."""
         return self if self.free_start is None else self._with({"x0": self.start_in(x), "free_start": None}, self.known)
+
+    def requiring_goal(self, radius: Tensor) -> Self:
+        """The same problems with arriving within a radius (B,) of their goal, m, as a constraint, the last of them."""
+        assert self.goal is not None
+        goal = replace(self.goal, radius=radius, required=True, assumed=False)
+        rows = with_goal(goal, self.constraints, self._dimensions(self.x0))
+        return self._with({"goal": goal, "constraints": rows}, self.known.of_lifted("with its goal required"))
 
     def grown(self, by: Tensor) -> Self:
         """The same problems with their obstacles grown by `by` (B,), m."""

@@ -99,33 +99,34 @@ class Converge(Row):
     def _tighten(self, search: Search) -> None:
         best, rows, whole = search.best, _unsolved(search), replace(search.call, callback=None)  # not worth a report
         if rows.numel() > 0:
-            self._keep(search, rows, continued(search.interior, whole.take(rows), best.of(rows).best))
+            keep_clear(search, rows, continued(search.interior, whole.take(rows), best.of(rows).best))
         lost = best.end.best.violation[rows] > search.solver.violation_tolerance
         lost = rows[lost & ~is_over(best.end.status[rows])]
         if lost.numel() > 0:
-            self._keep(search, lost, search.interior.solved(whole.take(lost)))
+            keep_clear(search, lost, search.interior.solved(whole.take(lost)))
 
-    def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
-        """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.
 
-        Better are those that arrive, that are clear between knots or touch less there, or that cost less.
-        """
-        problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
-        old, new = search.best.of(rows).best, end.best
-        arrives = ~leaves_goal(problem, new.X, old.X)
-        near = new.cost <= old.cost + WORTH * old.cost.abs()
-        serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
-        now, before = (path_clearance(problem, one.X, one.U) for one in (new, old))
-        clear = ~(now < before.clamp(max=0.0))
-        clear |= old.violation > limit
-        search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
+def keep_clear(search: Search, rows: Tensor, end: SolveEnd) -> None:
+    """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.
+
+    Better are those that arrive, that are clear between knots or touch less there, or that cost less.
+    """
+    problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
+    old, new = search.best.of(rows).best, end.best
+    arrives = ~leaves_goal(problem, new.X, old.X)
+    near = new.cost <= old.cost + WORTH * old.cost.abs()
+    serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
+    now, before = (path_clearance(problem, one.X, one.U) for one in (new, old))
+    clear = ~(now < before.clamp(max=0.0))
+    clear |= old.violation > limit
+    search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
 
 
 def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
     """Keep results of the interior point that are better than the best by more than rounding, and as feasible.
 
-    A result is better that is feasible where the best isn't, or cheaper by more than a stationary trajectory may leave
-    to save.
+    A result is better that is feasible where the best isn't, arrives at a stated goal where the best doesn't, or is
+    cheaper by more than a stationary trajectory may leave to save.
     """
     old, new = search.best.of(rows).best, end.best
     admitted = search.interior.admitted(search.call.problem)
@@ -135,7 +136,9 @@ def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
     lost = ~(old.violation <= limit)
     cheaper = new.cost < old.cost - STATIONARY * old.cost.abs()
     tight = (end.status == SOLVED) & (new.violation <= old.violation.clamp(min=admitted))
-    better = is_preferred(search.call.problem.take(rows), new, old, limit) & (lost | (cheaper & tight))
+    problem = search.call.problem.take(rows)
+    arrives = leaves_goal(problem, old.X, new.X)
+    better = is_preferred(problem, new, old, limit) & (lost | arrives | (cheaper & tight))
     search.best.replace(rows, better, new, end)
 
 

@@ -39,6 +39,32 @@ def short_horizons(problem: Problem) -> str | None:
     longer, or else with a largest acceleration: of a double integrator with bounded controls. Through a map the way is
     the roadmap's, otherwise the straight line. Where the time is free, `solvers.timing` tells which would do.
     """
+    found = _limit_and_way(problem)
+    if found is None or problem.goal is None:
+        return None
+    limit, far = found
+    goal, short = problem.goal, (far > limit.reach(problem) + problem.goal.radius).nonzero().flatten().tolist()
+    if not short:
+        return None
+    first, named = short[0], ", ".join(map(str, short[:NAMED])) + (", ..." if len(short) > NAMED else "")
+    needed = max(math.ceil(float(limit.stages(problem, far - goal.radius)[b])) for b in short)
+    return (
+        f"{len(short)} of {problem.B} horizons are too short for the way to the goal (problem {named}): the first is "
+        f"{float(far[first]):.3g} m long, of which {int(problem.stages[first])} stages cover at most "
+        f"{float(limit.reach(problem)[first]):.3g} m; {limit.advice(needed)}"
+    )
+
+
+def beyond_reach(problem: Problem) -> Tensor:
+    """Whether the horizon is known to be too short for the way to a stated goal, (B,) bool."""
+    found = _limit_and_way(problem)
+    if found is None or problem.goal is None:
+        return torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
+    return found[1] > found[0].reach(problem) + problem.goal.radius
+
+
+def _limit_and_way(problem: Problem) -> tuple[Step | Push, Tensor] | None:
+    """What limits the way within the horizon, and the way (B,) to a stated goal, m; None where nothing does."""
     goal = problem.goal
     if goal is None or goal.assumed or problem.B == 0 or problem.time is not None:
         return None
@@ -52,16 +78,7 @@ def short_horizons(problem: Problem) -> str | None:
         if bool((far > reach).any()):  # the largest may lie between the samples
             limit = limit_of(problem, CLIMBS)
             assert limit is not None
-    short = (far > limit.reach(problem) + goal.radius).nonzero().flatten().tolist()
-    if not short:
-        return None
-    first, named = short[0], ", ".join(map(str, short[:NAMED])) + (", ..." if len(short) > NAMED else "")
-    needed = max(math.ceil(float(limit.stages(problem, far - goal.radius)[b])) for b in short)
-    return (
-        f"{len(short)} of {problem.B} horizons are too short for the way to the goal (problem {named}): the first is "
-        f"{float(far[first]):.3g} m long, of which {int(problem.stages[first])} stages cover at most "
-        f"{float(limit.reach(problem)[first]):.3g} m; {limit.advice(needed)}"
-    )
+    return limit, far
 
 
 class Horizon(NamedTuple):

@@ -13,6 +13,7 @@ from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.kernels import expect_interior
+from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_maps, has_paths
@@ -22,7 +23,9 @@ from torchgco.search.freed import Freed
 from torchgco.search.nearby import among_nearby
 from torchgco.search.proposals import PathProposals
 from torchgco.search.reach import Horizon, horizon_of
+from torchgco.search.rows import Tighten
 from torchgco.search.search import Late, Search
+from torchgco.search.starts import Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.suitability import suited_paths
 from torchgco.search.table import Passes, Row, passes_of
@@ -115,12 +118,20 @@ class Restarts(Solver):
         """The interior point; among obstacles the passes where the time is held, and the interior point from there."""
         bodies = (part.absent.shape[1] > 0 if isinstance(part, Obstacles) else True for part in problem.geometric)
         if not any(bodies):
-            return self.interior.choosing_time(problem)
+            starts = [one for one in self.passes.steps if isinstance(one, Starts)]
+            count, every = max((one.count for one in starts), default=0), any(one.when == "all" for one in starts)
+            return replace(self.interior.choosing_time(problem), starts=count, starts_all=every)
         limit = self.local.violation_tolerance
         paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
         through = partial(solved_through_gates, self.interior, limit)
         rounds = max((one.rounds for one in self.passes.steps if isinstance(one, ClearChords)), default=0)
-        return Chooser(self, Freed(self.interior, limit, rounds), limit, paces=paces, through=through)
+        return Chooser(self._at_held_times(), Freed(self.interior, limit, rounds), limit, paces=paces, through=through)
+
+    def _at_held_times(self) -> Restarts:
+        """The same without further starts: a time that is too short has no trajectory, and the next one is tried."""
+        rows = {name: row for name, row in self.passes.items() if not isinstance(row, Starts)}
+        short = {name: replace(row, starts=0) for name, row in rows.items() if isinstance(row, Tighten)}
+        return replace(self, passes=Passes(rows | short))
 
     def horizon(self, problem: Problem) -> Horizon | None:
         """What `Solution.explain` asks of the horizon of a batch of one; see `reach.horizon_of`."""
@@ -142,7 +153,8 @@ class Restarts(Solver):
         solver = self.local
         session = Session(call, solver.inner.as_printed, record=solver.record)
         passes, guidance = self._suited(session.call.problem)
-        search = Search(session.call, solver, passes, guidance, self.interior, session.recorder)
+        again = partial(self._ended, passes, guidance)
+        search = Search(session.call, solver, passes, guidance, self.interior, session.recorder, again)
         self._run(search, passes)
         end = search.best.end
         if self._finishes:
@@ -151,6 +163,12 @@ class Restarts(Solver):
         if search.record is None:
             return solution
         return replace(solution, search=search.finish_record(*session.scales))
+
+    def _ended(self, passes: Sequence[Row | None], guidance: Guidance | None, call: Call) -> SolveEnd:
+        """How another search of the same kind ends, which isn't recorded."""
+        search = Search(call, self.local, passes, guidance, self.interior)
+        self._run(search, passes)
+        return search.best.end
 
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
         """All passes, until the time is over."""

@@ -13,7 +13,7 @@ from torchgco.search.converge import Converge
 from torchgco.search.direct import Direct, Join
 from torchgco.search.following import Follow
 from torchgco.search.proposals import PathProposals
-from torchgco.search.starts import Starts
+from torchgco.search.starts import RequireGoal, Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.table import Row
 
@@ -172,10 +172,10 @@ class Samples(Row):
 class Tighten(Row):
     """The last solve, by the interior point: from the best trajectory.
 
-    Problems without obstacles that were unsolved at first are solved from other guesses, too.
+    Problems that are unsolved, or miss a stated goal, are solved from other guesses, too, and with the goal required.
 
     Args:
-        starts: so many; 0: none.
+        starts: so many guesses; 0: none, and no goal is required that isn't.
 
     Raises:
         InputError: a field out of its range.
@@ -189,11 +189,12 @@ class Tighten(Row):
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
-        return Converge(), *((Starts(self.starts),) if self.starts > 0 else ())
+        return Converge(), *((Starts(self.starts), RequireGoal()) if self.starts > 0 else ())
 
     @property
     def does(self) -> str:
-        more = f"; without obstacles, unsolved: from {self.starts} guesses" if self.starts > 0 else ""
+        more = f"; unsolved or not arrived: from {self.starts} guesses, then with the goal required"
+        more = more if self.starts > 0 else ""
         return f"{self.steps[0].does}{more}"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
@@ -37,6 +37,7 @@ class Search:
         interior: the interior point of the table.
         guidance: of attempts from samples; None: none can serve.
         recorder: of every iteration; None: nothing is recorded.
+        again: makes a search of its own, by the same passes, for another call; None: there is none.
 
     Attributes:
         best: the best trajectories so far, once a first solve has been made.
@@ -54,9 +55,10 @@ class Search:
         guidance: Guidance | None,
         interior: InteriorPoint,
         recorder: Recorder | None = None,
+        again: Callable[[Call], SolveEnd] | None = None,
     ) -> None:
         self.call, self.solver, self.guidance, self.recorder = call, solver, guidance, recorder
-        self.interior = interior
+        self.interior, self.again = interior, again
         # Whether there is anything to do where a trajectory is caught, and whether that includes paths.
         self.guided = guidance is not None or any(row.seeks_paths for row in passes if row is not None)
         self.has_paths = self.guided and has_paths(call.problem)

@@ -23,6 +23,7 @@ from torchgco.lagrangian.unmoved import unmoved
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
+from torchgco.solvers.drawn import half_ranges
 from torchgco.solvers.ending import STATIONARY, start_status
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.session import Session
@@ -248,15 +249,6 @@ def _beside(problem: Problem, U: Tensor, share: float) -> Tensor:
     """Controls (B, N, m) beside U, by an uneven share of their size or range, the same whatever the batch."""
     count = torch.arange(1, U[0].numel() + 1, dtype=U.dtype, device=U.device).view(U.shape[1:])
     return U + share * half_ranges(problem, U) * (2.0 * torch.frac(GOLDEN * count) - 1.0)
-
-
-def half_ranges(problem: Problem, U: Tensor) -> Tensor:
-    """Half the range of each control between its bounds, (B, 1, m); 1 or the largest control where it is unbounded."""
-    size = U.abs().amax(1, keepdim=True).clamp(min=1.0)
-    if problem.control_bounds is None:
-        return size
-    half = 0.5 * problem.control_bounds.range.unsqueeze(1)
-    return torch.where(torch.isfinite(half), half, size)
 
 
 def rolled_out(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:

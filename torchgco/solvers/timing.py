@@ -18,17 +18,19 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import DrawKey, smooth_normal, standard_normal
 from torchgco.base.errors import NAMED, HorizonWarning
 from torchgco.base.status import Status
 from torchgco.base.tree import put, spread, take
 from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import WrappedCost
-from torchgco.kernels import path_clearance
+from torchgco.kernels import open_loop, path_clearance
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
-from torchgco.problem.in_time import at_held_times, factors_in, in_time, states_in_time, times_of
+from torchgco.problem.in_time import at_held_times, factors_in, fitting_factors, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
+from torchgco.solvers.drawn import KNOTS, STREAM, controls_of
 from torchgco.solvers.history import appended, in_units
 from torchgco.solvers.linear_time import LinearTime
 from torchgco.solvers.straight import Legs, straight_line
@@ -37,6 +39,7 @@ HELD_FIRST = 1.5  # the first time that is held, as a multiple of an estimate
 HELD_NEXT = 2.0  # the next one, of the one before
 AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
 BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
+DRAWN_TIMES, DRAWN_CONTROLS = 0.5, 0.5  # deviations of drawn guesses: in octaves, and of half a control's range
 SAME_TIME = 0.1  # difference of two times, as a share, that makes no other search
 
 
@@ -58,6 +61,8 @@ class Chooser:
         first: takes the time as a variable at once, in few iterations; None: it is held first.
         paces: shares of the times found at which it is searched again, as another way may be the better one there.
         through: takes the time of problems with gates as a variable at once; None: as of others.
+        starts: drawn guesses of the time and the controls, from which it is taken as a variable, too, in the end.
+        starts_all: for all problems; else for those that haven't converged.
     """
 
     held: Runs
@@ -66,6 +71,8 @@ class Chooser:
     first: Runs | None = None
     paces: tuple[float, ...] = ()
     through: Callable[[Any], Solution] | None = None
+    starts: int = 0
+    starts_all: bool = False
 
 
 class Timed:
@@ -150,15 +157,19 @@ class Timed:
                 break
         self._freed_where_none_is()
         self._again()
+        self._from_drawn()
         return self.best
 
     def _first(self) -> Tensor:
-        """The factors (B, S) to begin with: the guess, or `own`.
+        """The factors (B, S) to begin with: the guess, else those that states to begin with take, else `own`.
 
         A guess shorter than the estimate is no time in which the model, as far as it is linear, gets to the end; beside
         states to begin with it counts all the same.
         """
-        guess = self.time.guess
+        guess, time, X = self.time.guess, self.time, self.call.X0
+        if guess is None and X is not None:
+            fitting = fitting_factors(self.problem, X, self.call.U0[..., : self.problem.m]).clamp(time.least, time.most)
+            return fitting if not bool(fitting.isnan().any()) else torch.where(fitting.isnan(), self.own, fitting)
         if guess is None:
             return self.own
         return guess if self.call.X0 is not None else torch.where(guess < self._estimate, self.own, guess)
@@ -241,6 +252,33 @@ class Timed:
             factors = self.own if pace is None else pace * factors_in(self.problem, self.best.X)
             if rows.numel() > 0 and not self.call.late:
                 self._tried(rows, factors.clamp(self.time.least, self.time.most)[rows], False)
+
+    def _from_drawn(self) -> None:
+        """Take the time as a variable from trajectories of drawn controls in drawn times about the one found.
+
+        Least times are local: of controls that turn a thrust there are many.
+        """
+        status, count = self.best.status, self.chooser.starts
+        open_ = status != Status.INVALID_START
+        rows = (open_ if self.chooser.starts_all else open_ & (status != Status.CONVERGED)).nonzero().flatten()
+        if rows.numel() == 0 or count == 0 or self.call.late:
+            return
+        each = rows.repeat_interleave(count)
+        start = torch.arange(count, device=rows.device).repeat(rows.numel())
+        call, user = replace(self.call.take(each), callback=None, warm=None), self.problem.take(each)
+        of_time, of_controls = (DrawKey(call.seed, call.ids, STREAM + 2 * start + part) for part in (0, 1))
+        U = call.U0[..., : user.m]
+        U = controls_of(user, U, DRAWN_CONTROLS * smooth_normal(of_controls, KNOTS, U))
+        found = factors_in(user, self.best.X[each])
+        pace = standard_normal(of_time, 1, range(1), found.dtype)[0]
+        guess = (found * torch.exp2(DRAWN_TIMES * pace)).clamp(self.time.least[each], self.time.most[each])
+        x0 = call.problem.x0.clone()
+        x0[:, user.n] = guess[:, 0]
+        lifted = call.problem._with({"x0": x0}, call.problem.known)
+        _, U = states_in_time(user, self._line[each], U, guess)
+        ends = self.chooser.free.run(replace(call, problem=lifted, X0=open_loop(lifted, U), U0=U))
+        for number in range(count):
+            self._keep(rows, ends.take(slice(number, None, count)))
 
     def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Any:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
@@ -333,7 +371,8 @@ def needed_durations(chooser: Chooser, problem: Problem, call: Any, found: Solut
     time = time.take(rows)
     freed = replace(time, least=time.most, most=BEYOND * time.most, guess=None, weight=torch.ones_like(time.weight))
     longer = some._with({"time": freed, "cost": _Nothing(some.cost)})
-    again = _solved(chooser, longer, replace(call.take(rows), problem=in_time(longer), X0=None, warm=None))
+    call = replace(call.take(rows), problem=in_time(longer), X0=None, warm=None)
+    again = _solved(replace(chooser, starts=0), longer, call)
     needed = torch.full_like(found.cost, torch.nan)
     does = again.violation <= chooser.limit
     needed[rows[does]] = times_of(some, factors_in(some, again.X))[does, -1]
