@@ -31,7 +31,11 @@ N, DT, PERIOD, SPEED = 40, 0.1, 0.05, 0.8
 ACCELERATION, TURNING, SLOWEST, FASTEST = 1.0, 1.5, -0.3, 1.0
 PEOPLE, BODY, AWAY = 6, 0.3, 1e3  # in the problem; a person's radius, m; where nobody is
 APART = 0.05  # m that people keep from a vehicle that is in their way, then they turn round
-CROSSES, FROM, AHEAD = 1.5, 1.2, (0.4, 1.2)  # s between people who cross; m from which, and how far ahead of the vehicle
+CROSSES, FROM, AHEAD = (
+    1.5,
+    1.2,
+    (0.4, 1.2),
+)  # s between people who cross; m from which, and how far ahead of the vehicle
 SECONDS = 6.0  # of a loop
 SOUND = 1e-3  # m
 LONG = 0.0  # s of a solve that seeks what a period has missed
@@ -232,7 +236,9 @@ def looped(one: Owned, folder: Path, seed: int, solver: str | None, seconds: flo
 _opened: dict[Any, Any] = {}
 
 
-def opened(one: Owned, folder: Path, solver: str | None, seconds: float | None) -> tuple[DistanceField, torchgco.MPC, Ways]:
+def opened(
+    one: Owned, folder: Path, solver: str | None, seconds: float | None
+) -> tuple[DistanceField, torchgco.MPC, Ways]:
     """A map's field, a loop on it, and its ways."""
     if one.file not in _opened:
         grid = read(folder / one.file) if one.resolution is None else read(folder / one.file, resolution=one.resolution)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgco.compiled.plan import Plan
 from torchgco.compiled.stages import moved, stages_between
 from torchgco.compiled.stopping import clamped, limits, stopping
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.norms import within_norms
 from torchgco.kernels import current, followed, measured, open_loop
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival, violation
@@ -57,8 +58,12 @@ def held(problem: Problem, plan: Plan | None, now: float) -> Held:
 
 
 def better(problem: Problem, kept: Held, U: Tensor) -> Held:
-    """What is held, or the controls (b, N, m) of a solve, brought within their bounds, where these are better."""
+    """What is held, or the controls (b, N, m) of a solve that failed, within their bounds, where these are better.
+
+    A plan before that is feasible stays.
+    """
     whole = current(for_solvers(problem))
+    U = torch.where((kept.is_before & kept.feasible).view(-1, 1, 1), kept.U, U)
     found = _best(problem, whole, torch.stack((kept.U, U), dim=1), 1)
     return found._replace(is_before=found.is_before & kept.is_before)
 
@@ -78,7 +83,8 @@ def within(problem: Problem, U: Tensor) -> Tensor:
 def _best(problem: Problem, whole: Problem, U: Tensor, count: int) -> Held:
     """The best of candidates U (B, C, N, m), the first `count` of which are the plan before with its feedback.
 
-    Feasible arrival at a stated goal counts first, then the cost of what is feasible, then the violation.
+    Feasible arrival at a stated goal counts first, then the cost of what is feasible. Of what isn't, the least violated
+    counts, and of those that differ by less than what is admitted the one that is out of it soonest.
     """
     B, C = U.shape[:2]
     each = torch.arange(B).repeat_interleave(C)
@@ -86,22 +92,32 @@ def _best(problem: Problem, whole: Problem, U: Tensor, count: int) -> Held:
     U = within(own, U.flatten(0, 1))
     X = open_loop(many, U)
     worst, cost = _violation(many, X, U), many.cost.total(X, U).nan_to_num(torch.inf)
-    X = X[..., : problem.n]
     fits = (worst <= ADMITTED) & torch.isfinite(X).flatten(1).all(-1)
-    arrives = fits & has_arrived(own, X) if ranks_arrival(own) else fits
-    rank = torch.where(arrives, 0, torch.where(fits, 1, 2)).view(B, C)
-    value = torch.where(fits, cost, worst).view(B, C)
-    chosen = value.masked_fill(rank > rank.amin(1, keepdim=True), torch.inf).argmin(1)
+    arrives = fits & has_arrived(own, X[..., : problem.n]) if ranks_arrival(own) else fits
+    near = (worst.view(B, C) <= worst.view(B, C).amin(1, keepdim=True) + ADMITTED).flatten()
+    rank = torch.where(arrives, 0, torch.where(fits, 1, torch.where(near, 2, 3))).view(B, C)
+    value = cost if bool(fits.view(B, C).any(1).all()) else torch.where(fits, cost, _sum_of_violations(many, X, U))
+    chosen = value.view(B, C).masked_fill(rank > rank.amin(1, keepdim=True), torch.inf).argmin(1)
     rows = torch.arange(B) * C + chosen
-    return Held(X[rows].clone(), U[rows].clone(), fits[rows], chosen < count)
+    return Held(X[rows, :, : problem.n].clone(), U[rows], fits[rows], chosen < count)
 
 
 def _violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """The largest violation (B,) of all constraints but a required goal: what comes to rest doesn't reach it."""
-    parts = [part for part in problem.constraints if not isinstance(part.bare, GoalBall | GoalState)]
+    parts = _but_goal(problem)
     if len(parts) == len(problem.constraints):
         return measured(problem, X, U).nan_to_num(torch.inf)
     return violation(parts, X, U).nan_to_num(torch.inf)
+
+
+def _sum_of_violations(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The sum (B,) over the same constraints and their knots."""
+    rows = [part.violation(X, U) for part in _but_goal(problem)]
+    return sum((one.amax(-1).sum(-1) for one in rows if one.shape[-1] > 0), X.new_zeros(len(X))).nan_to_num(torch.inf)
+
+
+def _but_goal(problem: Problem) -> list[Constraint]:
+    return [part for part in problem.constraints if not isinstance(part.bare, GoalBall | GoalState)]
 
 
 def _moved_on(plan: Plan, now: float) -> tuple[Tensor, Tensor, Tensor]:

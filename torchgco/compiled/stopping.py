@@ -7,6 +7,7 @@ speed stays as a candidate has it: at rest, as in the plan before, or at a share
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from torchgco.problem.problem import Problem
 from torchgco.problem.rates import rates_of
 
 SHARES = -1.0, -0.5, 0.5, 1.0  # of the way from a control at rest to its lower and its upper bound
+MOST_TOGETHER = 4  # controls, of which all ends of the bounds are combined: 16 candidates
 DELAYS = 0.0, 0.125, 0.25  # of the horizon, after which candidates begin to brake
 AHEAD = 0.25  # of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these
 PROBE = 1e-4  # of a control's range: by how much a difference moves it
@@ -75,15 +77,15 @@ def _candidates(problem: Problem, rest: Tensor, before: Tensor | None) -> tuple[
 
     Shares of infinite bounds are those of rest.
     """
-    bases, bounds = [rest] if before is None else [rest, before], problem.control_bounds
+    bases, bounds, m = [rest] if before is None else [rest, before], problem.control_bounds, problem.m
     if bounds is not None:
-        low, high = (bound.expand_as(rest) for bound in bounds.over(problem.N))
-        for i in range(problem.m):
-            for share in SHARES:
-                toward = ((high if share > 0 else low) - rest)[..., i]
-                base = rest.clone()
-                base[..., i] += torch.where(torch.isfinite(toward), abs(share) * toward, 0.0)
-                bases.append(base)
+        up, down = (
+            torch.where(torch.isfinite(bound - rest), bound - rest, 0.0) for bound in bounds.over(problem.N)[::-1]
+        )
+        shares = [share * one for one in torch.eye(m, dtype=rest.dtype) for share in SHARES]
+        if m <= MOST_TOGETHER:
+            shares += [rest.new_tensor(signs) for signs in product((-1.0, 1.0), repeat=m)]
+        bases += [rest + share.clamp(min=0.0) * up - share.clamp(max=0.0) * down for share in shares]
     later = DELAYS if problem.along is problem.dynamics else DELAYS[:1]  # a stage is of one model for all candidates
     delays = torch.tensor([int(share * problem.N) for share in later]).repeat_interleave(len(bases))
     return torch.stack(bases, dim=1).repeat(1, len(later), 1, 1), delays
@@ -109,10 +111,10 @@ def _braked(problem: Problem, rest: Tensor, bases: Tensor, delays: Tensor, ahead
         span = torch.where(torch.isfinite(high - low), high - low, 1.0).clamp(min=torch.finfo(x.dtype).tiny)
         stages = (varied, varied) if steady else (varied.at(k), varied.at(min(k + 1, N - 1)))
         change, speed = _toward_rest(problem, stages, x, own, span, then, ahead)
-        u = clamped(torch.where(rests.unsqueeze(-1), own, own + span * change), low, high)
-        if ahead == 0.0:  # m until the end of the horizon
-            left = speed(u - own).square().sum(-1).sqrt() * float(problem.dynamics.dt) * (N - at)
+        if ahead == 0.0:  # m until the end of the horizon with controls at rest
+            left = speed(calm[rows, at] - own).square().sum(-1).sqrt() * float(problem.dynamics.dt) * (N - at)
             rests |= left <= ADMITTED
+        u = clamped(torch.where(rests.unsqueeze(-1), calm[rows, at], own + span * change), low, high)
         runs = first + k < N
         U[rows[runs], at[runs]] = u[runs]
         if bool(rests.all()):
