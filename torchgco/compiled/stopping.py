@@ -100,21 +100,20 @@ def _braked(problem: Problem, rest: Tensor, bases: Tensor, delays: Tensor, ahead
     B, C, N, m = bases.shape
     each, first, rows = torch.arange(B).repeat_interleave(C), delays.repeat(B), torch.arange(B * C)
     many, steady = problem.take(each), problem.along is problem.dynamics
-    varied = problem.take(each.repeat(m + 1)).dynamics
+    varied = problem.take(each.repeat(m + 2)).dynamics
     U, calm, bounds = bases.flatten(0, 1).clone(), rest.repeat_interleave(C, dim=0), limits(many)
     x, u = open_loop(current(for_solvers(many)), U)[rows, first, : problem.n], U[rows, (first - 1).clamp(min=0)]
     rests = torch.zeros(B * C, dtype=torch.bool)
     for k in range(N - int(delays.min())):
         at = (first + k).clamp(max=N - 1)
         low, high = bounds(at, u)
-        own, then = torch.where(rests.unsqueeze(-1), calm[rows, at], U[rows, at]), calm[rows, (at + 1).clamp(max=N - 1)]
+        quiet, own, then = calm[rows, at], U[rows, at], calm[rows, (at + 1).clamp(max=N - 1)]
         span = torch.where(torch.isfinite(high - low), high - low, 1.0).clamp(min=torch.finfo(x.dtype).tiny)
         stages = (varied, varied) if steady else (varied.at(k), varied.at(min(k + 1, N - 1)))
-        change, speed = _toward_rest(problem, stages, x, own, span, then, ahead)
+        change, left = _toward_rest(problem, stages, x, own, span, quiet, then, ahead)
         if ahead == 0.0:  # m until the end of the horizon with controls at rest
-            left = speed(calm[rows, at] - own).square().sum(-1).sqrt() * float(problem.dynamics.dt) * (N - at)
-            rests |= left <= ADMITTED
-        u = clamped(torch.where(rests.unsqueeze(-1), calm[rows, at], own + span * change), low, high)
+            rests |= left * float(problem.dynamics.dt) * (N - at) <= ADMITTED
+        u = clamped(torch.where(rests.unsqueeze(-1), quiet, own + span * change), low, high)
         runs = first + k < N
         U[rows[runs], at[runs]] = u[runs]
         if bool(rests.all()):
@@ -126,26 +125,35 @@ def _braked(problem: Problem, rest: Tensor, bases: Tensor, delays: Tensor, ahead
 
 
 def _toward_rest(
-    problem: Problem, stages: tuple[Dynamics, Dynamics], x: Tensor, u: Tensor, span: Tensor, then: Tensor, ahead: float
-) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    """By how many ranges (R, m) controls u are to change at a stage, and the speed (R, d) after other changes of u."""
+    problem: Problem,
+    stages: tuple[Dynamics, Dynamics],
+    x: Tensor,
+    u: Tensor,
+    span: Tensor,
+    quiet: Tensor,
+    then: Tensor,
+    ahead: float,
+) -> tuple[Tensor, Tensor]:
+    """By how many ranges (R, m) controls u are to change at a stage, and the speed (R,) after it with controls `quiet`.
+
+    The speed is that at the next knot, or `ahead` s later with controls `then`.
+    """
     R, m = u.shape
     at = slice(0, problem.n) if problem.dynamics.position is None else problem.position
-    moved = u + PROBE * torch.cat((torch.zeros_like(span).unsqueeze(0), torch.diag_embed(span).transpose(0, 1)))
+    tried = torch.cat((u.unsqueeze(0), u + PROBE * torch.diag_embed(span).transpose(0, 1), quiet.unsqueeze(0)))
     now, later = stages
-    x, then = now.step(x.repeat(m + 1, 1), moved.flatten(0, 1)), then.repeat(m + 1, 1)
+    x, then = now.step(x.repeat(m + 2, 1), tried.flatten(0, 1)), then.repeat(m + 2, 1)
     if not later.is_integrated:
         speeds = (later.step(x, then) - x)[..., at] / problem.dynamics.dt
     else:
         if ahead > 0.0:
             x = INTEGRATORS[later.integrator](lambda z: later.field(z, then), x, ahead)
         speeds = later.field(x, then)[..., at]
-    v, *others = speeds.view(m + 1, R, -1).unbind(0)
+    v, *others, still = speeds.view(m + 2, R, -1).unbind(0)
     J = (torch.stack(others, dim=-1) - v.unsqueeze(-1)) / PROBE  # (R, d, m), by shares of the ranges
-    squares = J.mT @ J
+    squares, one = J.mT @ J, torch.eye(m, dtype=x.dtype)
     size = squares.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(x.dtype).tiny)
-    squares = squares + DAMPING * size[:, None, None] * torch.eye(m, dtype=x.dtype)
-    finite = torch.isfinite(squares).flatten(1).all(-1)
-    squares = torch.where(finite[:, None, None], squares, torch.eye(m, dtype=x.dtype))
+    squares = squares + DAMPING * size[:, None, None] * one
+    squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, one)
     change = -torch.linalg.solve(squares, (J.mT @ v.unsqueeze(-1)).nan_to_num()).squeeze(-1)
-    return change, lambda du: v + (J @ (du / span).unsqueeze(-1)).squeeze(-1)
+    return change, still.square().sum(-1).sqrt()
