@@ -3,11 +3,12 @@
 A differential drive (+-1 m/s^2, +-1.5 rad/s, -0.3 to 1 m/s) follows the grid's way at 20 Hz between the starts and
 goals of `floors.MAPS`, among people who walk straight on until something is in their way, and don't give way. It knows
 where they are and how they walk now. In each period what it would fly from then on is judged; where that breaks a
-constraint, a sound plan is sought by all means: braking at any rate of turn, the plan before, and long solves.
+constraint, a sound one is sought: the plan before, and braking at many rates of turn, at once or a little later.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 import warnings
@@ -22,7 +23,6 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.families.floors import MAPS, Owned
-from benchmarks.lib.command import parser_of
 from torchgco import ControlBounds, Problem, QuadraticCost, Spheres, StateBounds, Unicycle
 from torchgco.maps import DistanceField, Field, read
 from torchgco.maps.ways import Ways
@@ -38,7 +38,6 @@ CROSSES, FROM, AHEAD = (
 )  # s between people who cross; m from which, and how far ahead of the vehicle
 SECONDS = 6.0  # of a loop
 SOUND = 1e-3  # m
-LONG = 0.0  # s of a solve that seeks what a period has missed
 
 
 @dataclass
@@ -183,13 +182,11 @@ def known(problem: Problem, plan_before: Tensor | None) -> str | None:
     worst = violations(problem, U)
     if bool((worst <= SOUND).any()):
         return "before" if plan_before is not None and worst[0] <= SOUND else "braking"
-    if LONG == 0.0:
-        return None
-    found = torchgco.solve(problem, verbose=False, max_seconds=LONG)
-    return "gco" if float(violations(problem, found.U)) <= SOUND else None
+    return None
 
 
-def looped(one: Owned, folder: Path, seed: int, solver: str | None, seconds: float | None, oracle: bool) -> Loop:
+def looped(one: Owned, folder: Path, seed: int, solver: str | None, seconds: float | None) -> Loop:
+    """A loop on a map, among people drawn under a seed."""
     free, mpc, ways = opened(one, folder, solver, seconds)
     way = ways.way(one.start, one.goal)
     assert way is not None
@@ -218,7 +215,7 @@ def looped(one: Owned, folder: Path, seed: int, solver: str | None, seconds: flo
         found.wrong += said is not None and bool(said) != sound
         if not sound:
             found.unsound += 1
-            if oracle and (what := known(problem, before)) is not None:
+            if (what := known(problem, before)) is not None:
                 found.missed.append(f"{k}:{what}")
         before = torch.lerp(U, torch.cat((U[:, 1:], U[:, -1:]), 1), PERIOD / DT)
         x = torchgco.Unicycle(dt=PERIOD).step(torch.from_numpy(x)[None], u[None])[0].numpy()
@@ -251,34 +248,32 @@ def opened(
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = parser_of(__doc__, "results/maps.md")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seeds", nargs=2, type=int, default=[0, 32])
-    parser.add_argument("--solver", default=None)
-    parser.add_argument("--seconds", type=float, default=None)
-    parser.add_argument("--no-oracle", action="store_true")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, metavar="DIR", help="with the maps")
+    parser.add_argument("--seeds", nargs=2, type=int, default=[0, 32], help="the first, and the one after the last")
+    parser.add_argument("--solver", help="gco or interior_point")
+    parser.add_argument("--seconds", type=float, help="limit of a step; default: a period")
     asked = parser.parse_args(words)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     found = []
     for seed in range(*asked.seeds):
-        one = looped(MAPS[seed % len(MAPS)], asked.folder, seed, asked.solver, asked.seconds, not asked.no_oracle)
-        found.append(one)
-        ms = 1e3 * np.array(one.seconds)
-        print(
-            f"{one.name:22} periods {len(ms) + 1:4} solved {one.solved:4} held {one.held:3} unsound {one.unsound:3} "
-            f"missed {len(one.missed):3} outside {one.outside} wrong {one.wrong} least {one.least:+.3f} arrived {one.arrived} "
-            f"CPU ms median {np.median(ms):.2f} p99 {np.quantile(ms, 0.99):.1f} max {ms.max():.0f} wall max {1e3 * max(one.wall):.0f} {one.missed[:12]}",
-            flush=True,
-        )
-    ms = 1e3 * np.concatenate([one.seconds for one in found])
-    total = lambda name: sum(getattr(one, name) for one in found)
-    print(
-        f"{len(found)} loops: periods {len(ms) + len(found)} solved {total('solved')} held {total('held')} unsound "
-        f"{total('unsound')} missed {sum(len(one.missed) for one in found)} outside {total('outside')} wrong {total('wrong')} "
-        f"arrived {total('arrived')} CPU ms median {np.median(ms):.2f} p99 {np.quantile(ms, 0.99):.1f} max {ms.max():.0f}"
-    )
+        found.append(looped(MAPS[seed % len(MAPS)], asked.folder, seed, asked.solver, asked.seconds))
+        print(line(found[-1].name, found[-1:]), *found[-1].missed, flush=True)
+    print(line(f"{len(found)} loops", found))
     return 0
+
+
+def line(name: str, loops: Sequence[Loop]) -> str:
+    """The sums over some loops, and the times of their steps."""
+    ms, least = 1e3 * np.concatenate([one.seconds for one in loops]), min(one.least for one in loops)
+    names = "solved", "held", "unsound", "outside", "wrong", "arrived"
+    counts = [f"{name} {sum(int(getattr(one, name)) for one in loops)}" for name in names]
+    missed, times = sum(len(one.missed) for one in loops), [f"{q} {np.quantile(ms, q):.1f}" for q in (0.5, 0.99, 1.0)]
+    return (
+        f"{name:22} periods {len(ms) + len(loops)} {' '.join(counts)} missed {missed} least {least:+.3f} m, "
+        f"processor's ms by quantile {' '.join(times)}, wall at most {1e3 * max(max(one.wall) for one in loops):.0f}"
+    )
 
 
 if __name__ == "__main__":

@@ -22,10 +22,12 @@ from torchgco.problem.rates import rates_of
 
 SHARES = -1.0, -0.5, 0.5, 1.0  # of the way from a control at rest to its lower and its upper bound
 MOST_TOGETHER = 4  # controls, of which all ends of the bounds are combined: 16 candidates
-DELAYS = 0.0, 0.125, 0.25  # of the horizon, after which candidates begin to brake
-AHEAD = 0.25  # of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these
+BRAKES_AFTER = 0.0, 0.125, 0.25  # of the horizon, after which candidates begin to brake
+TILTS_WITHIN = (
+    0.25  # of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these
+)
 PROBE = 1e-4  # of a control's range: by how much a difference moves it
-DAMPING = 1e-9  # of the squares' sum: no direction counts in which the speed changes by less than their square root
+LEAST_SHARE = 1e-9  # of the squares' sum: no direction counts in which the speed changes by less than their square root
 Limits = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # of stages, after the controls of those before
 
 
@@ -42,7 +44,7 @@ def stopping(problem: Problem, before: Tensor | None) -> Tensor:
     left = (~rests.any(1)).nonzero().flatten()
     if left.numel() == 0 or not problem.dynamics.is_integrated:
         return U
-    ahead = AHEAD * problem.N * float(problem.dynamics.dt)
+    ahead = TILTS_WITHIN * problem.N * float(problem.dynamics.dt)
     later = U.clone()  # of those that have come to rest the same ones: a problem's are the same in every batch
     later[left] = _braked(problem.take(left), rest[left], bases[left], delays, ahead)[0]
     return torch.cat((U, later), dim=1)
@@ -86,7 +88,9 @@ def _candidates(problem: Problem, rest: Tensor, before: Tensor | None) -> tuple[
         if m <= MOST_TOGETHER:
             shares += [rest.new_tensor(signs) for signs in product((-1.0, 1.0), repeat=m)]
         bases += [rest + share.clamp(min=0.0) * up - share.clamp(max=0.0) * down for share in shares]
-    later = DELAYS if problem.along is problem.dynamics else DELAYS[:1]  # a stage is of one model for all candidates
+    later = (
+        BRAKES_AFTER if problem.along is problem.dynamics else BRAKES_AFTER[:1]
+    )  # a stage is of one model for all candidates
     delays = torch.tensor([int(share * problem.N) for share in later]).repeat_interleave(len(bases))
     return torch.stack(bases, dim=1).repeat(1, len(later), 1, 1), delays
 
@@ -153,7 +157,7 @@ def _toward_rest(
     J = (torch.stack(others, dim=-1) - v.unsqueeze(-1)) / PROBE  # (R, d, m), by shares of the ranges
     squares, one = J.mT @ J, torch.eye(m, dtype=x.dtype)
     size = squares.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(x.dtype).tiny)
-    squares = squares + DAMPING * size[:, None, None] * one
+    squares = squares + LEAST_SHARE * size[:, None, None] * one
     squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, one)
     change = -torch.linalg.solve(squares, (J.mT @ v.unsqueeze(-1)).nan_to_num()).squeeze(-1)
     return change, still.square().sum(-1).sqrt()
