@@ -27,6 +27,7 @@ class Held(NamedTuple):
 
     X: Tensor  # (b, N+1, n)
     U: Tensor  # (b, N, m)
+    K: Tensor  # (b, N, m, n): feedback of the plan before; 0 of others
     feasible: Tensor  # (b,) bool: whether they keep all constraints but that of a required goal
     is_before: Tensor  # (b,) bool: the plan before with its feedback
 
@@ -43,14 +44,14 @@ def held(problem: Problem, plan: Plan | None, now: float) -> Held:
         X, before, K = _moved_on(plan, now)
         lifted = rates_of(problem) is not None  # feedback could break the bounds of rates
         ways = [before] if lifted else [followed(whole, X, before, K)[1], before]
-        found = _best(problem, whole, torch.stack(ways, dim=1), len(ways) - 1)
+        found = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
     if found is None:
-        return _best(problem, whole, stopping(problem, None), 0)
+        return _best(problem, whole, stopping(problem, None))
     left = (~found.feasible).nonzero().flatten()
     if left.numel() > 0:
         stops = stopping(problem.take(left), None if before is None else before[left])
         ways = torch.cat((found.U[left].unsqueeze(1), stops), dim=1)
-        other = _best(problem.take(left), whole.take(left), ways, 1)
+        other = _best(problem.take(left), whole.take(left), ways, found.K[left], 1)
         other.is_before.logical_and_(found.is_before[left])
         for part, new in zip(found, other, strict=True):
             part[left] = new
@@ -64,7 +65,7 @@ def better(problem: Problem, kept: Held, U: Tensor) -> Held:
     """
     whole = current(for_solvers(problem))
     U = torch.where((kept.is_before & kept.feasible).view(-1, 1, 1), kept.U, U)
-    found = _best(problem, whole, torch.stack((kept.U, U), dim=1), 1)
+    found = _best(problem, whole, torch.stack((kept.U, U), dim=1), kept.K, 1)
     return found._replace(is_before=found.is_before & kept.is_before)
 
 
@@ -80,8 +81,8 @@ def within(problem: Problem, U: Tensor) -> Tensor:
     return within_norms(U, problem.constraints)
 
 
-def _best(problem: Problem, whole: Problem, U: Tensor, count: int) -> Held:
-    """The best of candidates U (B, C, N, m), the first `count` of which are the plan before with its feedback.
+def _best(problem: Problem, whole: Problem, U: Tensor, K: Tensor | None = None, count: int = 0) -> Held:
+    """The best of candidates U (B, C, N, m), the first `count` of which are the plan before with its feedback K.
 
     Feasible arrival at a stated goal counts first, then the cost of what is feasible. Of what isn't, the least violated
     counts, and of those that differ by less than what is admitted the one that is out of it soonest.
@@ -99,7 +100,11 @@ def _best(problem: Problem, whole: Problem, U: Tensor, count: int) -> Held:
     value = cost if bool(fits.view(B, C).any(1).all()) else torch.where(fits, cost, _sum_of_violations(many, X, U))
     chosen = value.view(B, C).masked_fill(rank > rank.amin(1, keepdim=True), torch.inf).argmin(1)
     rows = torch.arange(B) * C + chosen
-    return Held(X[rows, :, : problem.n].clone(), U[rows], fits[rows], chosen < count)
+    fed = chosen < count
+    gains = U.new_zeros(B, problem.N, problem.m, problem.n)
+    if K is not None:
+        gains[fed] = K[fed]
+    return Held(X[rows, :, : problem.n].clone(), U[rows], gains, fits[rows], fed)
 
 
 def _violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

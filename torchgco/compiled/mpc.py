@@ -221,8 +221,11 @@ class MPC:
                 self._known(self.compiled.now.take(missing), missing, now, known)
             found = Held(*map(torch.cat, zip(*(known[b] for b in rows.tolist()), strict=True)))
             found = better(self.compiled.now.take(rows), found, answer.U[rows])
-            made = made.with_rows(rows, found.X, found.U)
-            kept[rows.numpy()], self._feasible[rows.numpy()] = found.is_before, found.feasible
+            made = made.with_rows(rows, found.X, found.U, found.K)
+            # At other times than its knots a plan before isn't, to the last millimetre, what was looked at.
+            at_knots = [isinstance(stages_between((now - self._begun[b]) / self.dt), int) for b in rows.tolist()]
+            kept[rows.numpy()] = found.is_before.numpy() & at_knots
+            self._feasible[rows.numpy()] = found.feasible
         self._begun = np.where(kept, self._begun, now)
         self._plan = made if before is None else _mixed(~kept, made, before)
         return self._plan.mean(now, self.period, state) if self._free else self._plan.at(now, state).u

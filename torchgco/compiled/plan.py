@@ -65,11 +65,11 @@ class Plan:
         knots = None if self.knots is None else self.knots[rows]
         return replace(self, X=X, U=U, K=K, start=self.start[rows.numpy()], bounds=None, knots=knots)
 
-    def with_rows(self, rows: Tensor, X: Tensor, U: Tensor) -> Plan:
-        """The same, but for some vehicles (b,) with these states and controls, without feedback."""
+    def with_rows(self, rows: Tensor, *new: Tensor) -> Plan:
+        """The same, but for some vehicles (b,) with these states, controls and gains."""
         parts = self.X.clone(), self.U.clone(), self.K.clone()
-        for part, new in zip(parts, (X, U, 0.0), strict=True):
-            part[rows] = new
+        for part, own in zip(parts, new, strict=True):
+            part[rows] = own
         return replace(self, X=parts[0], U=parts[1], K=parts[2])
 
     def at(self, t: float, x: Any = None) -> Instant:

@@ -27,7 +27,9 @@ TILTS_WITHIN = (
     0.25  # of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these
 )
 PROBE = 1e-4  # of a control's range: by how much a difference moves it
-LEAST_SHARE = 1e-9  # of the squares' sum: no direction counts in which the speed changes by less than their square root
+SMALLEST_SQUARE = (
+    1e-9  # of the squares' sum: no direction counts in which the speed changes by less than their square root
+)
 Limits = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # of stages, after the controls of those before
 
 
@@ -157,7 +159,7 @@ def _toward_rest(
     J = (torch.stack(others, dim=-1) - v.unsqueeze(-1)) / PROBE  # (R, d, m), by shares of the ranges
     squares, one = J.mT @ J, torch.eye(m, dtype=x.dtype)
     size = squares.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(x.dtype).tiny)
-    squares = squares + LEAST_SHARE * size[:, None, None] * one
+    squares = squares + SMALLEST_SQUARE * size[:, None, None] * one
     squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, one)
     change = -torch.linalg.solve(squares, (J.mT @ v.unsqueeze(-1)).nan_to_num()).squeeze(-1)
     return change, still.square().sum(-1).sqrt()
