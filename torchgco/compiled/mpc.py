@@ -196,7 +196,8 @@ class MPC:
         else:
             with computing_on(CPU), torch.inference_mode(False):
                 u = self._hold(answer, solved, now, state, known)
-        u = self._within(u)
+        if not solved.all() or bool(answer.violation.any()):
+            u = self._within(u)
         self.t, self.answer, self._u = now, answer, u
         return u[0].clone() if state.ndim == 1 and len(u) == 1 else u.clone()
 
