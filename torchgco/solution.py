@@ -261,7 +261,8 @@ class Solution:
         `Dynamics.state_names` and `control_names`.
 
         Args:
-            rate: samples per second, from the first to the last knot, by the model's own integrator; None: the knots.
+            rate: samples per second from the first knot on, and the last knot, by the model's own integrator; None: the
+                knots.
             problem: that was solved, for a solution that no longer knows it: else its states have no names, and
                 straight lines between the knots.
 

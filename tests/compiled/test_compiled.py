@@ -17,6 +17,7 @@ from torch import Tensor
 import torchgco
 from tests.slow import mostly
 from torchgco import (
+    Body,
     Boxes,
     ControlBounds,
     Dynamics,
@@ -31,6 +32,7 @@ from torchgco import (
     Spheres,
     StateBounds,
     Status,
+    Unicycle,
 )
 from torchgco.kernels import use_native
 from torchgco.native import kept
@@ -422,6 +424,69 @@ def test_numbers_are_listed_and_only_the_chosen_ones_change() -> None:
         mpc(radii=[1.0, 1.0])
     with pytest.raises(InputError, match="solver: expected"):
         torchgco.compile(problem, "al_ilqr")
+
+
+def test_a_number_is_given_once() -> None:
+    """Whatever the two names and the two ways are; nothing is changed then."""
+    numbers = of_driven(1, 3)
+    mpc = torchgco.compile(driven(numbers), "interior_point")
+    before = mpc.numbers["x_ref"]
+    for call in (
+        lambda: mpc(x_ref=before + 1.0, numbers={"cost.x_ref": before}),
+        lambda: mpc(x_ref=before + 1.0, numbers={"x_ref": before}),
+        lambda: mpc(numbers={"x_ref": before + 1.0, "cost.x_ref": before}),
+        lambda: mpc.numbers.write({"x_ref": before + 1.0, "cost.x_ref": before}),
+    ):
+        with pytest.raises(InputError, match=r"numbers: expected each number once, got cost\.x_ref twice, as"):
+            call()
+        assert np.array_equal(mpc.numbers["x_ref"], before)
+    assert mpc(numbers={"cost.x_ref": before}).statuses == [Status.CONVERGED]
+
+
+def test_captured_numbers_that_become_or_cease_to_be_0_or_1_are_no_change_of_code() -> None:
+    k, random = torch.tensor([1.5, 2.0]).double(), np.random.default_rng(0)
+    other = torch.tensor([0.0, 3.0]).double()
+    rates = lambda x, u: torch.cat((x[..., 2:], u - k * x[..., 2:] + 0.0 * other), -1)
+    model = FunctionDynamics(rates, 4, 2, DT, "rk4", position=slice(0, 2))
+    cost = QuadraticCost([1.0] * 4, [0.1] * 2, [1.0] * 4)
+    mpc = torchgco.compile(Problem(model, cost, [ControlBounds(-2, 2)], [[1.0, 0.5, 0.0, 0.0]], 8), "interior_point")
+    for _ in range(12):
+        k.copy_(torch.tensor(random.choice([0.0, 1.0, -1.0, 0.3, 2.7], 2)))
+        mpc()
+        assert mpc.stale() is None, k.tolist()
+    kept, rates_now = rates, lambda x, u: torch.cat((x[..., 2:], 2.0 * u), -1)
+    object.__setattr__(mpc.problem.dynamics, "function", rates_now)
+    assert "compile it again" in str(mpc.stale())
+    object.__setattr__(mpc.problem.dynamics, "function", kept)
+    assert mpc.stale() is None
+
+
+@pytest.mark.parametrize("kind", ["discs", "moving discs", "boxes"])
+def test_obstacles_among_a_body_have_numbers(kind: str) -> None:
+    random = np.random.default_rng(0)
+
+    def among(centers: Any, velocities: Any = None, radii: Any = 0.3) -> Problem:
+        robot = Body.covering([-0.5, -0.3], [0.5, 0.3], [2, 1])
+        parts: Any = Boxes(centers, [[0.3, 0.4], [0.3, 0.3]], robot)
+        if kind != "boxes":
+            parts = Spheres(centers, radii, robot, velocities)
+        cost = QuadraticCost([0.1, 0.1, 0, 0.1], [0.1, 0.1], [10, 10, 0, 1], x_ref=[4.0, 0.3, 0, 0])
+        return Problem(Unicycle(dt=DT), cost, [parts, ControlBounds([-3, -2], [3, 2])], [[0.0, 0.0, 0.0, 1.0]], 25)
+
+    first = np.array([[2.0, 1.6], [2.0, -1.6]])
+    moves = {"velocities": np.zeros((2, 2))} if kind == "moving discs" else {}
+    mpc = torchgco.compile(among(first, **moves), "interior_point")
+    mpc()
+    for _ in range(4):
+        new: dict[str, Any] = {"centers": first + random.uniform(-0.4, 0.4, (2, 2))}
+        if moves:
+            new["velocities"] = random.uniform(-0.2, 0.2, (2, 2))
+        if kind != "boxes":
+            new["radii"] = random.uniform(0.2, 0.4, 2)
+        answer, fresh = mpc(**new, warm=False), torchgco.compile(among(**new), "interior_point")()
+        assert answer.statuses == fresh.statuses == [Status.CONVERGED] and mpc.stale() is None
+        torch.testing.assert_close(answer.X, fresh.X, rtol=0, atol=1e-6)
+        torch.testing.assert_close(mpc.solution().cost, torchgco.judge(among(**new), answer.U).cost)
 
 
 def test_numbers_of_the_given_problem_that_change_in_place_are_named() -> None:

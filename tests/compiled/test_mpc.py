@@ -64,7 +64,7 @@ def test_steps_are_those_of_a_compiled_problem() -> None:
 @pytest.mark.parametrize("period", [0.02, 0.05, 0.1, 0.17])
 def test_a_period_needs_no_whole_stage(period: float) -> None:
     """Each step is that of a solve from anew; plans moved on by parts of a stage are good guesses, too."""
-    mpc, x, iterations = MPC(driven(), period=period), START, 0
+    mpc, x, iterations = MPC(driven(), period=period, max_seconds=float("inf")), START, 0
     for k in range(30):
         u = mpc.step(x, x_ref=path(period * k))
         iterations += int(mpc.answer.iterations) if k else 0
@@ -78,7 +78,7 @@ def test_a_period_needs_no_whole_stage(period: float) -> None:
 
 def test_steps_come_when_they_come() -> None:
     """Times that are told move the plan by what lies between them."""
-    told, regular, x = MPC(driven()), MPC(driven(), period=0.25), START
+    told, regular, x = MPC(driven()), MPC(driven(), period=0.25, max_seconds=float("inf")), START
     for k in range(6):
         u = regular.step(x, x_ref=path(0.25 * k))
         assert torch.equal(told.step(x, t=7.0 + 0.25 * k, x_ref=path(0.25 * k)), u)
@@ -113,13 +113,14 @@ def test_a_vehicle_that_fails_holds_its_plan_and_others_fly_on() -> None:
         held = [False, k >= 2, False]
         assert mpc.held.tolist() == held and [s == Status.CONVERGED for s in mpc.statuses] == [not h for h in held]
         assert mpc.statuses[1] == (Status.CONVERGED if k < 2 else Status.INVALID_START)
-        torch.testing.assert_close(mpc.plan.t[:, 0], torch.tensor([DT * k, DT * min(k, 1), DT * k]).double())
+        assert mpc.feasible.tolist() == [not h for h in held]
+        torch.testing.assert_close(mpc.plan.t[::2, 0], torch.tensor([DT * k, DT * k]).double())
         x = np.stack([rk4(*pair, DT) for pair in zip(x, u.numpy(), strict=True)])
 
 
 def test_a_plan_between_its_knots() -> None:
     """By NumPy's own integration; a model with a step alone has straight lines."""
-    mpc = MPC(driven(2), period=0.07)
+    mpc = MPC(driven(2), period=0.07, max_seconds=float("inf"))
     x = np.stack([START, START + 0.2])
     mpc.step(x)
     mpc.step(x := np.stack([rk4(x[b], mpc.plan.U[b, 0].numpy(), 0.07) for b in (0, 1)]))
@@ -155,6 +156,17 @@ def test_a_reset_begins_again() -> None:
     assert torch.equal(mpc.step(START), first) and mpc.t == 0.0
 
 
+def test_a_reset_forgets_the_controls_that_rates_count_from() -> None:
+    bounds, random = RateBounds(-0.1, 0.1, previous=[0.0, 0.0]), np.random.default_rng(0)
+    mpc, other = MPC(driven(1, bounds)), MPC(driven(1, bounds))
+    first = other.step(START)
+    for count in (1, 2, 5):
+        for _ in range(count):
+            mpc.step(START + 0.2 * random.standard_normal(4))
+        mpc.reset()
+        assert mpc.numbers["previous"].tolist() == [[0.0, 0.0]] and torch.equal(mpc.step(START), first)
+
+
 def test_rates_count_from_the_controls_that_were_returned() -> None:
     mpc, x, last = MPC(driven(1, RateBounds(-0.4, 0.4, previous=[0.0, 0.0]))), START, np.zeros(2)
     for k in range(5):
@@ -179,6 +191,13 @@ WRONG: dict[str, tuple[Callable[[MPC], Any], str]] = {
     "NaN": (lambda mpc: mpc.step(START * np.nan), "x: expected finite states, got NaN or infinity"),
     "time": (lambda mpc: (mpc.step(START), mpc.step(START, t=0.0)), "t: expected a time after 0 s, got 0.0"),
     "number": (lambda mpc: mpc.step(START, speed=3.0), "numbers: expected one of x0, x_ref"),
+    "start": (lambda mpc: mpc.step(START, x0=START), "numbers: expected other numbers than x0"),
+    "start by name": (lambda mpc: mpc.step(START, numbers={"x0": START}), "numbers: expected other numbers than x0"),
+    "twice": (
+        lambda mpc: mpc.step(START, x_ref=path(0.0), numbers={"cost.x_ref": path(0.0)}),
+        "numbers: expected each number once, got cost.x_ref twice, as cost.x_ref and x_ref",
+    ),
+    "no time": (lambda mpc: MPC(driven(), max_seconds=0.0), "max_seconds: expected .*above 0"),
     "period": (lambda mpc: MPC(driven(), period=0.0), "period: expected .*above 0 s"),
     "solver": (lambda mpc: MPC(driven(), "ipopt"), 'solver: expected "gco" or "interior_point", got'),
     "status": (lambda mpc: mpc.status, "mpc: expected a step before"),

@@ -81,11 +81,13 @@ def test_a_table_at_any_rate(rate: float | None, tmp_path: Path) -> None:
     table = pd.read_csv(tmp_path / "thrown.csv")
     heads = ["problem", "t [s]", "height [m]", "climb [m/s]", "vx [m/s]", "ax [m/s^2]", "energy [J]", "push [N]"]
     assert list(table.columns) == heads
-    count = N + 1 if rate is None else int(N * DT * rate + 1e-6) + 1
+    times = np.arange(N + 1) * DT if rate is None else np.arange(int(N * DT * rate + 1e-6) + 1) / rate
+    times = times if times[-1] > N * DT - 1e-9 else np.append(times, N * DT)  # the state at the end is there, too
     for b in (0, 1):
         rows = table[table["problem"] == b].to_numpy()[:, 1:]
         X, U = solution.X[b].numpy(), solution.U[b, :, 0].numpy()
-        np.testing.assert_allclose(rows[:, 0], np.arange(count) * (DT if rate is None else 1 / rate), atol=1e-12)
+        np.testing.assert_allclose(rows[:, 0], times, atol=1e-12)
+        np.testing.assert_allclose(rows[-1, 1:3], X[-1], atol=1e-12)
         for t, height, climb, vx, ax, energy, push in rows:
             k = min(int(t / DT + 1e-9), N - 1)
             state = rk4(X[k], U[k], DRAGS[b], t - k * DT)

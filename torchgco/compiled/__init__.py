@@ -1,7 +1,7 @@
 """A problem compiled once and solved again and again: `compile`, and the numbers that calls may change."""
 
+from torchgco.compiled.answer import Answer as Answer
 from torchgco.compiled.command import MPPIController as MPPIController
-from torchgco.compiled.compiled import Answer as Answer
 from torchgco.compiled.compiled import Compiled as Compiled
 from torchgco.compiled.compiled import compile as compile
 from torchgco.compiled.mpc import MPC as MPC

@@ -12,14 +12,8 @@ from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
-from torchgco.compiled.numbers import (
-    Numbers,
-    as_floats,
-    measured,
-    numbers_of,
-    with_numbers_as_they_are,
-    with_own_numbers,
-)
+from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
+from torchgco.compiled.numbers import Numbers, as_floats, measured
 from torchgco.compiled.stages import moved, stage_of, stages_between
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current, open_loop
@@ -100,7 +94,7 @@ class MPPIController:
                 and that mixes knots or vehicles along the plan.
         """
         state, B = measured(x, *self._problem.x0.shape), self._problem.B
-        self.numbers.write({**(numbers or {}), **named, "x0": state})
+        self.numbers.write(self.numbers.named(numbers, named, {"x0": state}))
         with torch.no_grad(), torch.inference_mode(False), computing_on(CPU):
             before = moved(self.U, self._stages) if shift and self._commands else self.U
             key = DrawKey(self.seed, self._ids, torch.full_like(self._ids, self._commands))

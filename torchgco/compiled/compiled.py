@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -20,8 +20,10 @@ from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import CPU, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
+from torchgco.compiled.answer import Answer
 from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
-from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
+from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
+from torchgco.compiled.numbers import Number, Numbers
 from torchgco.explaining.account import Account
 from torchgco.kernels import cost_scale, cost_unit, current, interior_of
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -35,7 +37,9 @@ from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
+from torchgco.tracing import traced_like
 
+Begin: TypeAlias = Callable[[Problem, Tensor], tuple[Tensor, Tensor]]
 SOLVERS = "gco", "interior_point"
 CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEASIBLE, Status.TIME_LIMIT))
 
@@ -48,35 +52,6 @@ def _plainly() -> Iterator[None]:
     """
     with torch.inference_mode(False), computing_on(CPU):
         yield
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What one call of a compiled problem gives; all tensors are copies."""
-
-    X: Tensor  # (B, N+1, n)
-    U: Tensor  # (B, N, m)
-    K: Tensor  # (B, N, m, n): u = U + K (x - X)
-    status: Tensor  # (B,) int64, see Status
-    iterations: Tensor  # (B,) int64, of all solves of the call
-    violation: Tensor  # (B,): largest violation, metres for lengths
-    warm: Tensor  # (B,) bool: whether the solve from the last answer was enough
-    seconds: float  # that the call took, without compiling
-    t: Tensor | None = None  # (B, N+1): times of the knots where the time is free, s; else None
-
-    @property
-    def u(self) -> Tensor:
-        """The first controls, (B, m)."""
-        return self.U[:, 0]
-
-    @property
-    def duration(self) -> Tensor | None:
-        """How long each trajectory lasts where the time is free, (B,), s; else None."""
-        return None if self.t is None else self.t[:, -1]
-
-    @property
-    def statuses(self) -> list[Status]:
-        return [Status(status) for status in self.status.tolist()]
 
 
 def compile(
@@ -212,8 +187,25 @@ class Compiled:
             named: the same.
 
         Raises:
-            InputError: an unknown name, numbers of another shape or that the problem can't have, or a call while
-                another thread's runs. Nothing is changed then.
+            InputError: an unknown name, a number given twice, numbers of another shape or that the problem can't have,
+                or a call while another thread's runs. Nothing is changed then.
+        """
+        return self.call(self.numbers.named(numbers, named), warm, shift, elapsed, max_seconds)
+
+    def call(
+        self,
+        values: Mapping[str, Any],
+        warm: bool = True,
+        shift: float | None = None,
+        elapsed: float | None = None,
+        max_seconds: float | None = None,
+        begin: Begin | None = None,
+    ) -> Answer:
+        """The same, with the new numbers by full names.
+
+        Args:
+            begin: is given problems that the last answer doesn't lead to a solution of, and their places (b,), and
+                returns states and controls from which C tries again, before the solver searches.
         """
         began = clock.seconds()
         if not self._lock.acquire(blocking=False):
@@ -223,10 +215,10 @@ class Compiled:
             until = math.inf
             if max_seconds is not None:
                 until = began + check_value(max_seconds, Positive, "max_seconds")
-            self.numbers.write({**(numbers or {}), **named})
+            self.numbers.write(values)
             able = self._warm if warm else np.zeros_like(self._warm)
             self._warm = np.zeros_like(self._warm)  # an error or an interrupt leaves nothing to begin with
-            return self._solved(able, moved, began, until)
+            return self._solved(able, moved, began, until, begin)
         finally:
             self._lock.release()
 
@@ -262,7 +254,7 @@ class Compiled:
             raise InputError("mpc", "a call before its solution is asked for", "none")
         if self._kept is None:
             return last
-        now = self._now()
+        now = self.now
         form, X, U = at_times(now, last.X, last.U, last.times)
         cost = torch.where(torch.isnan(last.cost), form.cost.total(X, U), last.cost)
         return replace(last, cost=cost, account=Account(now, self.interior))
@@ -285,8 +277,10 @@ class Compiled:
             return "numbers of the problem were changed in place since it was compiled: pass them to the call by name"
         if self._kept is None:
             return None  # PyTorch's kernels call the functions themselves
-        problem, then = for_solvers(self._now().renewed()), self._kept.engine
-        read, now = then.captured.read(), Engine(problem, compiles=False)
+        problem, then = for_solvers(self.now.renewed()), self._kept.engine
+        read = then.captured.read()
+        with traced_like(then.captured.traces):
+            now = Engine(problem, compiles=False)
         if read is None or then.with_shared(read).computes_as(now, problem):  # None: a call compiles again by itself
             return None
         return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
@@ -295,7 +289,7 @@ class Compiled:
     def __getstate__(self) -> dict[str, Any]:
         """A process that loads it compiles again, and begins without an answer."""
         names = "solver", "interior", "receding", "changes"
-        return {"problem": self._now()} | {name: getattr(self, name) for name in names}
+        return {"problem": self.now} | {name: getattr(self, name) for name in names}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         problem = state.pop("problem")
@@ -316,7 +310,7 @@ class Compiled:
         if isinstance(kept, KeptInTime):
             with _plainly():
                 kept.shift(shift)
-                parts = kept.read(parts, self._now())
+                parts = kept.read(parts, self.now)
         elif shift:
             kept.shift(shift)
         for part in parts:
@@ -331,13 +325,14 @@ class Compiled:
         if kept.is_outdated:  # C reads what functions capture as it is now
             with _plainly():
                 if not kept.refresh_captured():
-                    self._pack(self._now().renewed())
+                    self._pack(self.now.renewed())
 
-    def _now(self) -> Problem:
+    @property
+    def now(self) -> Problem:
         """The problem with its numbers as they are, and nothing that was computed from others."""
         return with_numbers_as_they_are(self._problem)
 
-    def _solved(self, able: np.ndarray, shift: float, began: float, until: float) -> Answer:
+    def _solved(self, able: np.ndarray, shift: float, began: float, until: float, begin: Begin | None) -> Answer:
         if self._kept is not None:
             self._refresh(shift)
         kept = self._kept
@@ -349,19 +344,45 @@ class Compiled:
         if able.any():
             left = math.inf if until == math.inf else max(0.0, until - clock.seconds())
             kept.solve(able, self.interior.warm_barrier, seconds=left)
-            status, worst = kept.statuses, kept.violations if kept.engine.measures else self._violation().numpy()
-            finite = kept.finite
-            late = able & finite & (status == TIME_LIMIT)
-            good = able & finite & (status == CONVERGED) & (worst <= self.interior.violation_tolerance)
+            late, good = able & kept.finite & (kept.statuses == TIME_LIMIT), self._good(able)
         else:
             kept.iterations.zero_()
         self._found = None
         if not good.all():
             with _plainly():
                 self._found, again = self._packed_solution(good), torch.from_numpy(~(good | late)).nonzero().flatten()
+                if again.numel() > 0 and begin is not None:
+                    again = self._begun(self._found, again, begin, until)
                 if again.numel() > 0:
                     self._again(self._found, again, until)
         return self._answer(good, began)
+
+    def _good(self, rows: np.ndarray) -> np.ndarray:
+        """Which of the problems that `rows` (B,) marks C has solved."""
+        kept = self._kept
+        assert kept is not None
+        worst = kept.violations if kept.engine.measures else self._violation().numpy()
+        good = kept.finite & (kept.statuses == CONVERGED) & (worst <= self.interior.violation_tolerance)
+        return np.asarray(rows & good)
+
+    def _begun(self, found: Solution, rows: Tensor, begin: Begin, until: float) -> Tensor:
+        """Solve the problems `rows` by C from other trajectories, into `found`; those that are left to the solver."""
+        kept = self._kept
+        assert kept is not None
+        kept.begin_at(rows, *begin(self.now.take(rows), rows))
+        marked = np.zeros_like(self._warm)
+        marked[rows.numpy()] = True
+        left = until - clock.seconds()
+        if left > 0:
+            kept.solve(marked, self.interior.initial_barrier, seconds=left)
+            some = self._packed_solution(good := self._good(marked))
+            done = torch.from_numpy(good).nonzero().flatten()
+            put(found, done, replace(some.take(done), iterations=(found.iterations + some.iterations)[done]))
+            rows, left = rows[~torch.from_numpy(good)[rows]], until - clock.seconds()
+        if left > 0:
+            return rows
+        found.status[rows] = TIME_LIMIT
+        return rows[:0]
 
     def _violation(self) -> Tensor:
         """The largest violations (B,) of the trajectories that C has rolled out."""
@@ -369,7 +390,7 @@ class Compiled:
         assert kept is not None
         if kept.engine.measures:
             return kept.worst
-        return violation(for_solvers(self._now()).constraints, *kept.rolled)
+        return violation(for_solvers(self.now).constraints, *kept.rolled)
 
     def _packed_solution(self, good: np.ndarray) -> Solution:
         """What C has found; CONVERGED where it is `good` (B,)."""
@@ -390,7 +411,7 @@ class Compiled:
         """Solve the problems `rows` from the start by the solver, into `found` and what the next call begins with."""
         kept, tried = self._kept, found.iterations[rows]
         assert kept is not None
-        now = self._now().take(rows)
+        now = self.now.take(rows)
         solution = self._by_solver(None, until, now)
         bare = replace(solution, trace=None, search=None, account=None, needed=None)
         put(found, rows, replace(bare, iterations=solution.iterations + tried))
@@ -398,7 +419,7 @@ class Compiled:
 
     def _by_solver(self, shift: float | None, until: float, problem: Problem | None = None) -> Solution:
         """A solve by the solver that `compile` was given, from the last answer where a shift is given."""
-        now = self._now() if problem is None else problem
+        now = self.now if problem is None else problem
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
         seconds = None if until == math.inf else max(1e-3, until - clock.seconds())
         warm = None if shift is None or self._last is None else later(now, self._last, shift)

@@ -1,4 +1,4 @@
-"""MPC: a controller that solves a compiled problem in every period, and holds its plan where that fails."""
+"""MPC: a controller that solves a compiled problem in every period, and holds its plan, or stops, where that fails."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.options import Seconds, check_value
+from torchgco.base.options import PositiveOrInfinite, Seconds, check_value
+from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.status import Status
-from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Answer, Compiled, compile
+from torchgco.compiled.answer import Answer
+from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled, compile
+from torchgco.compiled.holding import Held, better, held
 from torchgco.compiled.numbers import Numbers, measured
 from torchgco.compiled.plan import Plan
 from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of, stages_between
+from torchgco.compiled.stopping import clamped
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 
@@ -28,9 +32,11 @@ class MPC:
         u = mpc.step(x, x_ref=reference)  # for 0.02 s
 
     Controls, states and multipliers of the plan before are moved on by the period, which needn't be a whole number of
-    stages, and the interior point continues from there (`torchgco.compile`). Where a solve fails or is late, the plan
-    before is held: its control of that time with feedback on the measured state, within the bounds. `RateBounds` with a
-    `previous` count from the controls that were returned last.
+    stages, and the interior point continues from there (`torchgco.compile`). Where that fails, it tries again from what
+    can be flown then, and after it the solver does. Where all fail or are late, a vehicle flies the plan before with
+    feedback on the measured state, if the constraints of now allow that, else what comes to rest, else what breaks them
+    least. All controls are within their bounds. `RateBounds` with a `previous` count from the controls that were
+    returned last.
 
     Where the time is free, a plan lasts as long as is left of the one before, or as is best. Controls are the plan's
     means over the next period, and of stages that are longer those of the first.
@@ -41,14 +47,15 @@ class MPC:
             obstacle has come into the way, say. None: "gco" among obstacles, as only it searches for other ways, else
             "interior_point".
         period: s, from one step to the next; None: a stage of dt.
-        max_seconds: of a step; a solve that isn't ready by then is late. None: none is.
+        max_seconds: of a step; a solve that isn't ready by then is late. None: the period, if one is given, of all
+            steps but the first; infinity: none is late.
         changes: names of the numbers that steps may change, beside the starts and `previous`, which each step writes.
             None: all.
         tolerance: as `torchgco.compile` takes it.
 
     Attributes:
         t: time of the last step, s; the first one's is 0, or what `step` was given.
-        plan: what is flown since then, each vehicle's from the time that it was solved at; None before the first step.
+        plan: what is flown since then, each vehicle's from the time that it was made at; None before the first step.
         answer: the last solve's `Answer`, whether it is flown or not; None before the first step.
 
     Raises:
@@ -75,21 +82,26 @@ class MPC:
         self.period = self.dt if period is None else check_value(period, Seconds, "period")
         if self._free:
             check_loop_in_free_time(problem, self.period)
-        self.max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
+        self.max_seconds = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
         self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if follows(part)]
         changes = None if changes is None else ["x0", *self._previous, *changes]
         self.compiled: Compiled = compile(problem, solver, changes, tolerance=tolerance)
-        self._problem = problem
+        self._problem, self._limit = problem, self.max_seconds
+        if self._limit is None and period is not None:
+            self._limit = self.period
+        self._at_first = {name: self.numbers[name] for name in self._previous}
         self.reset()
 
     def reset(self) -> None:
         """Forget the plan, and begin at time 0 again: the next step solves as the first one does."""
         self.t, self.answer, self._plan = 0.0, None, None
         self._held = np.zeros(self._problem.B, dtype=bool)
+        self._feasible = np.zeros(self._problem.B, dtype=bool)
         self._begun = np.zeros(self._problem.B)
         self._u: Tensor | None = None
+        self.numbers.write(self._at_first)
 
     t: float
     answer: Answer | None
@@ -108,8 +120,17 @@ class MPC:
 
     @property
     def held(self) -> Tensor:
-        """Which vehicles fly a plan of an earlier step, (B,) bool."""
+        """Which vehicles fly no plan that was solved for now: one of an earlier step, or one to stop, (B,) bool."""
         return torch.from_numpy(self._held.copy())
+
+    @property
+    def feasible(self) -> Tensor:
+        """Which vehicles are known to keep their constraints by what they fly, (B,) bool.
+
+        A plan that is held needn't reach a required goal. False before the first step, and of plans that are held where
+        the time is free: they aren't looked at.
+        """
+        return torch.from_numpy(self._feasible.copy())
 
     @property
     def status(self) -> Tensor:
@@ -151,32 +172,77 @@ class MPC:
             InputError: states, a time or numbers that don't fit. Nothing is changed then.
         """
         state, now = measured(x, *self._problem.x0.shape), self._time(t)
-        if self._previous and self._u is not None and "previous" not in named:
-            numbers = dict.fromkeys(self._previous, self._u) | dict(numbers or {})
-        later = 0.0 if self.answer is None else self.period if t is None else now - self.t
+        values = self.numbers.named(numbers, named)
+        if "x0" in values:
+            raise InputError("numbers", "other numbers than x0, which the states x are", "x0")
+        if self._u is not None:
+            values = dict.fromkeys(self._previous, self._u) | values
+        values["x0"] = state
+        first, limit = self.answer is None, self.max_seconds if self.answer is None else self._limit
+        limit = limit if max_seconds is None else max_seconds
+        later = 0.0 if first else self.period if t is None else now - self.t
         moved = {"elapsed": later} if self._free else {"shift": stages_between(later / self.dt)}
-        answer = self.compiled(
-            x0=state, warm=self.answer is not None, numbers=numbers, **moved,
-            max_seconds=self.max_seconds if max_seconds is None else max_seconds, **named,
+        known = dict[int, Held]()
+        answer = self.compiled.call(
+            values, not first, **moved, max_seconds=None if limit == np.inf else limit,
+            begin=None if first or self._free else lambda problem, rows: self._known(problem, rows, now, known),
         )  # fmt: skip
         ended = answer.status.numpy()
         solved = (ended == CONVERGED) | (ended == FEASIBLE)
-        if self.answer is None or solved.all():
-            self._held = np.zeros_like(solved)
+        self._held, self._feasible = ~solved, solved
+        if solved.all():
             self._begun, self._plan = np.full(len(solved), now), None
             u = self._made(answer).mean(now, self.period) if self._free else answer.u
         else:
-            before = self.plan
-            assert before is not None
-            self._held, self._begun = ~solved, np.where(solved, now, self._begun)
-            self._plan = _mixed(solved, self._made(answer), before)
-            u = self._plan.mean(now, self.period, state) if self._free else self._plan.at(now, state).u
+            with computing_on(CPU), torch.inference_mode(False):
+                u = self._hold(answer, solved, now, state, known)
+        if not solved.all() or bool(answer.violation.any()):
+            u = self._within(u)
         self.t, self.answer, self._u = now, answer, u
         return u[0].clone() if state.ndim == 1 and len(u) == 1 else u.clone()
 
-    def _made(self, answer: Answer) -> Plan:
-        problem = self.compiled.problem
-        parts = answer.X, answer.U, answer.K, self._begun, self.dt, problem.dynamics, problem.control_bounds
+    def _known(self, problem: Problem, rows: Tensor, now: float, known: dict[int, Held]) -> tuple[Tensor, Tensor]:
+        """States and controls that the problems in `rows` could fly by now; `known` takes them."""
+        plan = self.plan
+        found = held(problem, None if plan is None else plan.take(rows), now)
+        known |= {b: Held(*(part[i : i + 1] for part in found)) for i, b in enumerate(rows.tolist())}
+        return found.X, found.U
+
+    def _hold(
+        self, answer: Answer, solved: np.ndarray, now: float, state: np.ndarray, known: dict[int, Held]
+    ) -> Tensor:
+        """The controls (B, m), where some problems have no plan that was solved for now."""
+        made, before, kept = self._made(answer, now), self.plan, np.zeros_like(solved)
+        if self._free:
+            kept = ~solved & (before is not None)
+        else:
+            rows = torch.from_numpy(~solved).nonzero().flatten()
+            missing = torch.tensor([b for b in rows.tolist() if b not in known], dtype=torch.int64)
+            if missing.numel() > 0:
+                self._known(self.compiled.now.take(missing), missing, now, known)
+            found = Held(*map(torch.cat, zip(*(known[b] for b in rows.tolist()), strict=True)))
+            found = better(self.compiled.now.take(rows), found, answer.U[rows])
+            made = made.with_rows(rows, found.X, found.U, found.K)
+            # At other times than its knots a plan before isn't, to the last millimetre, what was looked at.
+            at_knots = [isinstance(stages_between((now - self._begun[b]) / self.dt), int) for b in rows.tolist()]
+            kept[rows.numpy()] = found.is_before.numpy() & at_knots
+            self._feasible[rows.numpy()] = found.feasible
+        self._begun = np.where(kept, self._begun, now)
+        self._plan = made if before is None else _mixed(~kept, made, before)
+        return self._plan.mean(now, self.period, state) if self._free else self._plan.at(now, state).u
+
+    def _within(self, u: Tensor) -> Tensor:
+        """Controls (B, m) within the bounds of the first stage, which a solver's tolerance may exceed."""
+        bounds = self.compiled.problem.control_bounds
+        if bounds is None:
+            return u
+        low, high = bounds.over(self._problem.N)
+        return clamped(u, low[:, 0], high[:, 0])
+
+    def _made(self, answer: Answer, now: float | None = None) -> Plan:
+        """An answer's plans, from the times that they were made at, or all from now."""
+        problem, begun = self.compiled.problem, self._begun if now is None else np.full_like(self._begun, now)
+        parts = answer.X, answer.U, answer.K, begun, self.dt, problem.dynamics, problem.control_bounds
         return Plan(*parts, answer.t)
 
     def _time(self, t: float | None) -> float:

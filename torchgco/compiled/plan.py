@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +58,19 @@ class Plan:
     def end(self) -> Tensor:
         """Times of the last knots, (B,), s."""
         return self.t[:, -1]
+
+    def take(self, rows: Tensor) -> Plan:
+        """The plans of some vehicles (b,), without their bounds, which are of all."""
+        X, U, K = (part[rows] for part in (self.X, self.U, self.K))
+        knots = None if self.knots is None else self.knots[rows]
+        return replace(self, X=X, U=U, K=K, start=self.start[rows.numpy()], bounds=None, knots=knots)
+
+    def with_rows(self, rows: Tensor, *new: Tensor) -> Plan:
+        """The same, but for some vehicles (b,) with these states, controls and gains."""
+        parts = self.X.clone(), self.U.clone(), self.K.clone()
+        for part, own in zip(parts, new, strict=True):
+            part[rows] = own
+        return replace(self, X=parts[0], U=parts[1], K=parts[2])
 
     def at(self, t: float, x: Any = None) -> Instant:
         """States (B, n) and controls (B, m) at a time, s.

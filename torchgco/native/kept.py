@@ -92,6 +92,12 @@ class Kept(KeptProblem):
         for lam, own in zip(self.lam, found.multipliers.lam, strict=True):
             lam[rows] = own
 
+    def begin_at(self, rows: Tensor, X: Tensor, U: Tensor) -> None:
+        """Put trajectories in the places `rows` (b,), without multipliers."""
+        self.X[rows], self.U[rows] = X, U
+        for lam in self.lam:
+            lam[rows] = 0.0
+
     @property
     def times(self) -> Tensor | None:
         """Of the knots, (B, N+1), s, where they are free; else None."""

@@ -50,6 +50,12 @@ def sampled(dynamics: Dynamics | None, X: Tensor, U: Tensor, t: Tensor, rate: fl
     return {label: values.detach().cpu().numpy() for label, values in columns.items()}
 
 
+def sample_times(first: float, last: float, rate: float) -> np.ndarray:
+    """Times from `first` on, s, `rate` a second, and the `last` one, which may come sooner after the one before."""
+    at = first + np.arange(int((last - first) * rate + ROUNDING) + 1) / rate
+    return at if (last - at[-1]) * rate <= ROUNDING else np.append(at, last)
+
+
 def _places(t: Tensor, rate: float | None) -> tuple[Tensor, Tensor, Tensor]:
     """Stages k (T,), times h since their knots and lengths of stages, s, of the samples from t[0] to t[-1]."""
     N = len(t) - 1
@@ -58,8 +64,7 @@ def _places(t: Tensor, rate: float | None) -> tuple[Tensor, Tensor, Tensor]:
         h = torch.zeros_like(t)
         h[-1] = t[-1] - t[-2]
     else:
-        count = int(float(t[-1] - t[0]) * rate + ROUNDING)
-        at = t[0] + torch.arange(count + 1, dtype=t.dtype, device=t.device) / rate
+        at = torch.from_numpy(sample_times(float(t[0]), float(t[-1]), rate)).to(t)
         k = (torch.searchsorted(t.contiguous(), at + ROUNDING / rate, right=True) - 1).clamp(0, N - 1)
         h = (at - t[k]).clamp(min=0.0)
     return k, h, t[k + 1] - t[k]

@@ -7,7 +7,9 @@ whenever they are asked for, and a problem's own numbers for each problem. Only 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cached_property
 from typing import Any
 
@@ -121,6 +123,8 @@ class Traced:
         self.shared = torch.cat((self._numbers, self._nets.numbers(computed, self._numbers.numel())))
         sizes = [computed[slot].numel() for slot in self._shared]
         self.pattern = _pattern(self._numbers, np.repeat([slot in learned for slot in self._shared], sizes))
+        if (alike := _earlier(field, self.pattern.shape)) is not None:
+            self.pattern = np.where(np.isnan(alike.pattern), np.nan, self.pattern)
         indices = {slot for one in self._symbolic if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
         self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
@@ -328,6 +332,32 @@ class Traced:
         known: dict[Slot, Any] = {self._index: index} | self._captured
         replay_all(self._plain, known)
         return known
+
+
+@contextmanager
+def traced_like(traces: Sequence[Traced]) -> Iterator[None]:
+    """What is traced within leaves open the numbers that earlier traces of the same functions left open.
+
+    By itself a number that has become 0 or 1 since then is part of the form, and the form another one, though the
+    earlier one computes the same.
+    """
+    before = _EARLIER.set(list(traces))
+    try:
+        yield
+    finally:
+        _EARLIER.reset(before)
+
+
+_EARLIER: ContextVar[list[Traced]] = ContextVar("earlier")
+
+
+def _earlier(field: str, shape: tuple[int, ...]) -> Traced | None:
+    """The first of the earlier traces that is of this function, each once."""
+    left = _EARLIER.get([])
+    found = next((one for one in left if one.field == field and one.pattern.shape == shape), None)
+    if found is not None:
+        left.remove(found)
+    return found
 
 
 def _one_row(value: Tensor) -> bool:

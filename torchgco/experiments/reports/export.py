@@ -22,7 +22,7 @@ from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS
-from torchgco.problem.sampled import TIME_COLUMN, sampled
+from torchgco.problem.sampled import TIME_COLUMN, sample_times, sampled
 from torchgco.problem.times import times
 
 FOLDER = "export"
@@ -114,7 +114,7 @@ def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:
     """The columns of a mission, from its log."""
     plant = QuadrotorPlant()
     t, x, u = (log[names].to_numpy(float) for names in (["t"], _numbered("x", plant.n), _numbered("u", plant.m, 1)))
-    at = t[:, 0] if rate is None else np.arange(int((t[-1, 0] - t[0, 0]) * rate + 1e-9) + 1) / rate + t[0, 0]
+    at = t[:, 0] if rate is None else sample_times(t[0, 0], t[-1, 0], rate)
     if rate is not None:
         u = u[np.clip(np.searchsorted(t[:, 0], at + 1e-9, side="right") - 1, 0, len(u) - 1)]  # they hold
     rates = np.gradient(x[:, VELOCITY], t[:, 0], axis=0) if len(t) > 1 else np.zeros((1, 3))

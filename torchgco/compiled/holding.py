@@ -1,0 +1,135 @@
+"""What a loop flies where no solve gives a plan: the plan before moved on, or a way to rest, by the rows of now."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.compiled.plan import Plan
+from torchgco.compiled.stages import moved, stages_between
+from torchgco.compiled.stopping import clamped, limits, stopping
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.norms import within_norms
+from torchgco.kernels import current, followed, measured, open_loop
+from torchgco.lagrangian.quality import has_arrived, ranks_arrival, violation
+from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.goal import GoalBall, GoalState
+from torchgco.problem.horizons import for_solvers
+from torchgco.problem.problem import Problem
+from torchgco.problem.rates import rates_of
+
+
+class Held(NamedTuple):
+    """Trajectories that can be flown, (b, ...)."""
+
+    X: Tensor  # (b, N+1, n)
+    U: Tensor  # (b, N, m)
+    K: Tensor  # (b, N, m, n): feedback of the plan before; 0 of others
+    feasible: Tensor  # (b,) bool: whether they keep all constraints but that of a required goal
+    is_before: Tensor  # (b,) bool: the plan before with its feedback
+
+
+def held(problem: Problem, plan: Plan | None, now: float) -> Held:
+    """For each problem the plan before, as it goes on from the measured state, or what comes to rest where that fails.
+
+    Args:
+        problem: from the states that are measured `now`, s, and with the numbers of now.
+        plan: of these problems, or None.
+    """
+    whole, before, found = current(for_solvers(problem)), None, None
+    if plan is not None:
+        X, before, K = _moved_on(plan, now)
+        lifted = rates_of(problem) is not None  # feedback could break the bounds of rates
+        ways = [before] if lifted else [followed(whole, X, before, K)[1], before]
+        found = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
+    if found is None:
+        return _best(problem, whole, stopping(problem, None))
+    left = (~found.feasible).nonzero().flatten()
+    if left.numel() > 0:
+        stops = stopping(problem.take(left), None if before is None else before[left])
+        ways = torch.cat((found.U[left].unsqueeze(1), stops), dim=1)
+        other = _best(problem.take(left), whole.take(left), ways, found.K[left], 1)
+        other.is_before.logical_and_(found.is_before[left])
+        for part, new in zip(found, other, strict=True):
+            part[left] = new
+    return found
+
+
+def better(problem: Problem, kept: Held, U: Tensor) -> Held:
+    """What is held, or the controls (b, N, m) of a solve that failed, within their bounds, where these are better.
+
+    A plan before that is feasible stays.
+    """
+    whole = current(for_solvers(problem))
+    U = torch.where((kept.is_before & kept.feasible).view(-1, 1, 1), kept.U, U)
+    found = _best(problem, whole, torch.stack((kept.U, U), dim=1), kept.K, 1)
+    return found._replace(is_before=found.is_before & kept.is_before)
+
+
+def within(problem: Problem, U: Tensor) -> Tensor:
+    """Controls (B, N, m) within the bounds of controls, of their rates, norms and cones."""
+    if rates_of(problem) is None:
+        bounds = problem.control_bounds
+        U = U.nan_to_num() if bounds is None else clamped(U, *bounds.over(problem.N))
+    else:
+        U, at, u = U.clone(), limits(problem), U[:, 0]
+        for k in range(problem.N):
+            u = U[:, k] = clamped(U[:, k], *at(torch.full((problem.B,), k), u))
+    return within_norms(U, problem.constraints)
+
+
+def _best(problem: Problem, whole: Problem, U: Tensor, K: Tensor | None = None, count: int = 0) -> Held:
+    """The best of candidates U (B, C, N, m), the first `count` of which are the plan before with its feedback K.
+
+    Feasible arrival at a stated goal counts first, then the cost of what is feasible. Of what isn't, the least violated
+    counts, and of those that differ by less than what is admitted the one that is out of it soonest.
+    """
+    B, C = U.shape[:2]
+    each = torch.arange(B).repeat_interleave(C)
+    many, own = whole.take(each), problem.take(each)
+    U = within(own, U.flatten(0, 1))
+    X = open_loop(many, U)
+    worst, cost = _violation(many, X, U), many.cost.total(X, U).nan_to_num(torch.inf)
+    fits = (worst <= ADMITTED) & torch.isfinite(X).flatten(1).all(-1)
+    arrives = fits & has_arrived(own, X[..., : problem.n]) if ranks_arrival(own) else fits
+    near = (worst.view(B, C) <= worst.view(B, C).amin(1, keepdim=True) + ADMITTED).flatten()
+    rank = torch.where(arrives, 0, torch.where(fits, 1, torch.where(near, 2, 3))).view(B, C)
+    value = cost if bool(fits.view(B, C).any(1).all()) else torch.where(fits, cost, _sum_of_violations(many, X, U))
+    chosen = value.view(B, C).masked_fill(rank > rank.amin(1, keepdim=True), torch.inf).argmin(1)
+    rows = torch.arange(B) * C + chosen
+    fed = chosen < count
+    gains = U.new_zeros(B, problem.N, problem.m, problem.n)
+    if K is not None:
+        gains[fed] = K[fed]
+    return Held(X[rows, :, : problem.n].clone(), U[rows], gains, fits[rows], fed)
+
+
+def _violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The largest violation (B,) of all constraints but a required goal: what comes to rest doesn't reach it."""
+    parts = _but_goal(problem)
+    if len(parts) == len(problem.constraints):
+        return measured(problem, X, U).nan_to_num(torch.inf)
+    return violation(parts, X, U).nan_to_num(torch.inf)
+
+
+def _sum_of_violations(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The sum (B,) over the same constraints and their knots."""
+    rows = [part.violation(X, U) for part in _but_goal(problem)]
+    return sum((one.amax(-1).sum(-1) for one in rows if one.shape[-1] > 0), X.new_zeros(len(X))).nan_to_num(torch.inf)
+
+
+def _but_goal(problem: Problem) -> list[Constraint]:
+    return [part for part in problem.constraints if not isinstance(part.bare, GoalBall | GoalState)]
+
+
+def _moved_on(plan: Plan, now: float) -> tuple[Tensor, Tensor, Tensor]:
+    """States, controls and feedback of plans that begin now."""
+    parts = [part.clone() for part in (plan.X, plan.U, plan.K)]
+    for start in np.unique(plan.start).tolist():
+        rows = torch.from_numpy(plan.start == start)
+        for part in parts:
+            part[rows] = moved(part[rows], stages_between((now - start) / plan.dt))
+    return parts[0], parts[1], parts[2]
