@@ -59,10 +59,9 @@ def solve(
     """Solve every problem of the batch.
 
     A ContactWarning names feasible trajectories that touch an obstacle between knots; a ScaleWarning those with a
-    tolerated violation that is large beside its row; a StepWarning those whose `dt` is too long for their model; a
-    HorizonWarning horizons too short for the way to a stated goal, or longest times (`solution.needed`). Where tensors
-    in the problem, or captured ones, ask for gradients, X, U, cost and multipliers are functions of them
-    (`solution.differentiable`); under `torch.no_grad()` they are numbers.
+    violation that is large beside its row; a StepWarning those with too long a `dt` for the model; a HorizonWarning
+    horizons, or longest times, too short for the way to a stated goal (`solution.needed`). Where tensors in or around
+    the problem ask for gradients, X, U, cost and multipliers have them (`solution.differentiable`); not in `no_grad()`.
 
     Args:
         problem: B problems.

@@ -57,22 +57,21 @@ def drawn(integrator: Any, linear: bool = True, B: int = 64, seed: int = 1, fast
 
 def exact(problem: Problem, X: Tensor, U: Tensor, linear: bool) -> tuple[Tensor, Tensor]:
     """The cost (B,) of controls that are held exactly, and one exact step from every state of X, (B, N, 3)."""
-    path, ahead = X.clone(), X[:, :-1].clone()
-    for b in range(len(U)):
-        rate = float(problem.dynamics.values.rows[0][b])
+    path, ahead = X.clone(), torch.full_like(X[:, :-1], torch.inf)
+    for b, rate in enumerate(problem.dynamics.values.rows[0].tolist()):
+        A = np.array([[0, 1, 0, 0], [0, -0.3, 1, 0], [0, 0, -rate, rate], [0, 0, 0, 0]])
+        E = sl.expm(DT * A)
 
-        def step(x: np.ndarray, u: float, rate: float = rate) -> np.ndarray:
+        def step(x: Tensor, u: float, rate: float = rate, E: np.ndarray = E) -> Tensor:
             if linear:
-                A = np.array([[0, 1, 0, 0], [0, -0.3, 1, 0], [0, 0, -rate, rate], [0, 0, 0, 0]])
-                return (sl.expm(DT * A) @ np.append(x, u))[:3]
+                return torch.from_numpy((E @ np.append(x.numpy(), u))[:3])
             rates = lambda t, y: [y[1], y[2] - drag(y[1], linear), rate * (u - y[2])]
-            return solve_ivp(rates, (0, DT), x, method="Radau", rtol=1e-8, atol=1e-10).y[:, -1]
+            return torch.from_numpy(solve_ivp(rates, (0, DT), x.numpy(), "Radau", rtol=1e-7, atol=1e-9).y[:, -1])
 
         for k in range(problem.N):
-            u = float(U[b, k, 0])
-            path[b, k + 1] = torch.from_numpy(step(path[b, k].numpy(), u))
-            exploded = not float(X[b, k].abs().max()) <= 1e3
-            ahead[b, k] = torch.inf if exploded else torch.from_numpy(step(X[b, k].numpy(), u))
+            path[b, k + 1] = step(path[b, k], float(U[b, k, 0]))
+            if float(X[b, k].abs().max()) < 1e2:  # else the model's own steps have exploded
+                ahead[b, k] = step(X[b, k], float(U[b, k, 0]))
     return problem.cost.total(path, U), ahead
 
 
@@ -82,23 +81,25 @@ def solved(problem: Problem) -> torchgco.Solution:
         return torchgco.solve(problem, solver="interior_point")
 
 
-@pytest.mark.parametrize(("integrator", "linear", "B"), [("rk4", True, 64), ("midpoint", True, 64), ("rk4", False, 24)])
+@pytest.mark.parametrize(("integrator", "linear", "B"), [("rk4", True, 64), ("midpoint", True, 64), ("rk4", False, 16)])
 def test_no_wrong_cost_is_missed_and_no_right_one_flagged(integrator: str, linear: bool, B: int) -> None:
-    problem = drawn(integrator, linear, B, fastest=1.5 if linear else 2.0)
+    problem = drawn(integrator, linear, B, seed=1 if linear else 2, fastest=1.5 if linear else 2.0)
     found = solved(problem)
+    claims = torch.tensor([status.name in ("CONVERGED", "FEASIBLE") for status in found.statuses])
+    problem, found = problem.take(claims.nonzero().flatten()), found.take(claims)
+    assert int(claims.sum()) >= 0.9 * B
     errors = step_errors(problem, found.X, found.U, None, found.multipliers.lam)
     cost, ahead = exact(problem, found.X, found.U, linear)
     wrong = (cost - found.cost).abs() / found.cost.abs()
     ranges = (found.X.amax(1, keepdim=True) - found.X.amin(1, keepdim=True)).clamp(min=1e-9)
     of_states = ((ahead - found.X[:, 1:]).abs() / ranges).flatten(1).amax(-1)
-    claims = torch.tensor([status.name in ("CONVERGED", "FEASIBLE") for status in found.statuses])
     assert int((wrong > 0.01).sum()) >= B // 8 and int((wrong < 1e-3).sum()) >= B // 3
-    assert bool(errors.large[claims & (wrong > 0.01)].all())
+    assert bool(errors.large[wrong > 0.01].all())
     assert not bool(errors.large[(wrong < 1e-3) & (of_states < 0.08)].any())
-    small = claims & (of_states < 0.1)  # to leading order the difference is the error, but for 1 - 2^-p of it
+    small = of_states < 0.1  # to leading order the difference is the error, but for 1 - 2^-p of it
     assert bool((errors.step_error[small] < of_states[small] + 1e-9).all())
     assert bool((errors.step_error[small] > 0.6 * of_states[small] - 1e-9).all())
-    slow = claims & (errors.step_cost > 1e-6) & (errors.step_error < 0.02)
+    slow = (errors.step_cost > 1e-6) & (errors.step_error < 0.02)
     assert bool((errors.step_cost[slow] / wrong[slow] - 0.85).abs().lt(0.25).float().mean() > 0.8)
 
 

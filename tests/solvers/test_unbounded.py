@@ -148,7 +148,7 @@ def firm(power: float, *constraints: Constraint) -> Problem:
 @pytest.mark.parametrize("power", mostly([1, 3], 3))
 def test_a_cost_that_falls_at_a_pole(solver: str, power: int) -> None:
     found = torchgco.solve(firm(power), solver=solver)
-    assert found.statuses.count(Status.UNBOUNDED) >= 12, found  # the others end elsewhere, or no slope leads to the pole
+    assert found.statuses.count(Status.UNBOUNDED) >= 12, found  # others end elsewhere, or no slope leads there
     assert found.statuses.count(Status.NOT_POSITIVE_DEFINITE) <= 2, found
 
 

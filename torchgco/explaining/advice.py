@@ -19,8 +19,8 @@ BY_STATUS = {
     Status.MAX_ITERATIONS: "Higher limits{limits}, or torchgco.solve(problem, warm=solution), which goes on from here.",
     Status.LINE_SEARCH_FAILED: "Units in which states, controls and costs are of similar size; no kinks (abs, clamp) "
     "in dynamics, cost and constraints.",
-    Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost; bounds, where the cost "
-    "may fall without end.",
+    Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost; bounds, where the "
+    "cost may fall without end.",
     Status.NON_FINITE: 'Another U0, bounds on the controls, a smaller dt, or integrator="rk4".',
     Status.INFEASIBLE: "Another guess U0, a longer horizon N, wider bounds; or loosen {row}, to see whether it is what "
     "makes the problem infeasible.",

@@ -37,7 +37,7 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, current_problem
 
-HARDLY_SEEN = 1e-6  # share of the cost that a control changes over its range at least, as far as slopes are measured by it
+HARDLY_SEEN = 1e-6  # share of the cost that a control is held to change over its range at least
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
 
@@ -343,7 +343,7 @@ def _free(problem: Problem) -> Tensor:
 
 
 def _hardly_seen(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """Slopes (m,) of the cost by controls that the cost hardly sees: `HARDLY_SEEN` of it over the range of their bounds.
+    """The least scales (m,) of slopes by controls: `HARDLY_SEEN` of the cost over the range of their bounds.
 
     By a control on which nothing depends, as where time alone costs, no terms cancel: what is left of rounding and of
     far rows' multipliers isn't measured by itself.
@@ -357,9 +357,10 @@ def _hardly_seen(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 def _share(rest: Tensor, U: Tensor, scale: Tensor, least: Tensor) -> Tensor:
     """The largest component of a gradient by U (N, m) and what is free in the start, (N m + f,), as a share of those
     of `scale` (m + f,), for controls at least `least` (m,)."""
-    rest, scale = rest.abs(), torch.cat((torch.maximum(scale[: len(least)], least), scale[len(least) :]))
+    rest = rest.abs()
     rest = torch.cat((rest[: U.numel()].view_as(U).amax(0), rest[U.numel() :]))
     scale = torch.maximum(scale, NEGLIGIBLE * scale.amax())
+    scale = torch.cat((torch.maximum(scale[: len(least)], least), scale[len(least) :]))
     return torch.where(rest > 0, rest / scale, 0.0).amax()
 
 

@@ -22,7 +22,7 @@ from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import LEAST_COST
 
-ORDER = {"euler": 1, "midpoint": 2, "rk4": 4}
+ORDER_OF = {"euler": 1, "midpoint": 2, "rk4": 4}
 # Step errors above these are large. Euler's difference is a quarter of the second difference of the states, half of
 # their range at most, which controls that change at every stage come close to without a stiff model.
 LARGE_ERROR = {"euler": 0.5, "midpoint": 0.1, "rk4": 0.1}
@@ -31,7 +31,7 @@ LARGE_COST = 0.01  # step costs above this are large
 # much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
 COARSE = 2.5
 LEAST_RANGE = 1e-3  # of a state's largest size: its range counts as no less
-NOISE = 1e-9  # of the largest size of any state: no range counts as less
+LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 ELASTIC = 100.0  # by how many per cent no cost changes where a state changes by one per cent of its range
 JACOBIANS_AT_ONCE = 2**20  # numbers of one intermediate tensor at once: 8 MB
 
@@ -96,7 +96,7 @@ def step_errors(
                 costs[some] = _cost_of(problem.take(own), *parts, [lam[own] for lam in multipliers or ()])
             found.step_cost[rows] = costs
         method, stages = problem.dynamics.integrator, problem.stages.to(X.dtype)
-        too_much = (COARSE / stages ** ORDER[method]).clamp(min=LARGE_COST)
+        too_much = (COARSE / stages ** ORDER_OF[method]).clamp(min=LARGE_COST)
         found.large[:] = (found.step_error > LARGE_ERROR[method]) | (found.step_cost > too_much)
     return found
 
@@ -132,7 +132,7 @@ def _along(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> tupl
     e = e if problem.horizon is None else torch.where(problem.running.unsqueeze(-1), e, 0.0)
     size, apart = X.abs().amax(1, keepdim=True), e.abs()
     ranges = torch.maximum(X.amax(1, keepdim=True) - X.amin(1, keepdim=True), LEAST_RANGE * size)
-    ranges = torch.maximum(ranges, NOISE * size.amax(-1, keepdim=True))
+    ranges = torch.maximum(ranges, LEAST_OF_ALL * size.amax(-1, keepdim=True))
     return e, torch.where(apart > 0, apart / ranges, apart)
 
 

@@ -17,7 +17,7 @@ DEEP_FALL = 1e6  # a fall that asks for a closer look
 BOTTOMLESS = 1e20  # one that needs none: IPOPT's diverging_iterates_tol
 FAR_CONTROLS = 1e6  # times 1 + the guess's own controls: a way of controls that asks for a look
 FARTHER = 10.0, 1e3, 1e6  # times the way from the guess, for that look
-POLE_WAYS, POLE_PLACES, POLE_ROUNDS = (-8.0, 2.0), 41, 9  # powers of ten of the way down the slope, times tried, and how often
+POLE_WAYS, POLE_PLACES, POLE_ROUNDS = (-8.0, 2.0), 41, 9  # powers of ten of the way, places tried, and how often
 GROWING = 1e-3  # controls that moved by less than this share of the largest move stay where they are
 
 
