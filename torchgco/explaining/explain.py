@@ -124,7 +124,7 @@ class _One:
 
     def long_steps(self) -> str | None:
         """What shows that dt is too long for the model; None where nothing does."""
-        found = step_errors(self.problem, self.X, self.U, self.times, self.lams)
+        found = step_errors(self.problem, self.X, self.U, self.times, self.lams, doubted=True)
         return found.told(0, self.problem) if bool(found.large) else None
 
     def verdict(self) -> dict[str, Any]:

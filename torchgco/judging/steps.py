@@ -55,6 +55,7 @@ class StepErrors:
         error, cost = float(self.step_error[b]), float(self.step_cost[b])
         dt = "dt of a stage" if problem.time is not None else f"dt = {problem.dynamics.dt:g} s"
         more = "" if cost != cost else f", and the cost by {cost:.2g} of itself"
+        more = more if not cost > 10.0 else ", and the cost by many times itself"
         what = f"half of {dt} changes state {where}{name} by {error:.2g} of its range"
         return f"{what} at stage {int(self.stage[b])}{more}"
 
@@ -73,7 +74,7 @@ def step_errors(
         times: (B, N+1), s, of the knots where the time is free.
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
-            all stages together to be large.
+            all stages together to be large, or no error is more than that of even steps, `COARSE` / N^(p+1).
     """
     lost = X.new_full((problem.B,), torch.nan)
     places = torch.zeros(2, problem.B, dtype=torch.int64, device=X.device)
@@ -88,6 +89,7 @@ def step_errors(
             asked = torch.isfinite(worst)
             if doubted:
                 asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
+                asked &= worst > COARSE / problem.stages[rows].to(worst) ** (ORDER_OF[problem.dynamics.integrator] + 1)
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
             some = asked.nonzero().flatten()
             if some.numel() > 0:
@@ -152,20 +154,20 @@ def _cost_of(
         (slopes,), fx = gradients_at_once(lagrangian, X), _by_states(whole, X[:, :-1], U)
     except RuntimeError:  # code that autograd can't differentiate, which samplers serve
         return torch.full_like(X[:, 0, 0], torch.nan)
-    costate, change = slopes[:, -1], torch.zeros_like(X[:, 0, 0])
-    for k in range(problem.N - 1, -1, -1):
-        change = change + (costate[:, :n] * e[:, k]).sum(-1)
-        costate = slopes[:, k] + (costate.unsqueeze(1) @ fx[:, :, k]).squeeze(1)
+    costates, rows = [slopes[:, -1:]], slopes.unsqueeze(2).unbind(1)
+    for k, by_x in zip(range(problem.N - 1, 0, -1), reversed(fx.unbind(1)[1:]), strict=True):
+        costates.append(torch.baddbmm(rows[k], costates[-1], by_x))
+    change = (torch.cat(costates[::-1], dim=1)[..., :n] * e).flatten(1).sum(-1)
     return torch.where(change != 0, change.abs() / _size(whole, X, U), 0.0)
 
 
 def _by_states(problem: Problem, x: Tensor, U: Tensor) -> Tensor:
-    """Jacobians of the steps by the states, [b, i, k, j] of problem b, component i, stage k, state j."""
+    """Jacobians of the steps by the states, (B, N, n, n)."""
     B, N, n = x.shape
     each = torch.arange(B, device=x.device).repeat_interleave(n)
     twins, u = problem.take(each).along, U[each]
     rows = lambda z: twins.step(z, u).view(B, n, N, n).diagonal(dim1=1, dim2=3)
-    return gradients_at_once(rows, x[each])[0].view(B, n, N, n)
+    return gradients_at_once(rows, x[each])[0].view(B, n, N, n).transpose(1, 2).contiguous()
 
 
 def _size(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
