@@ -30,6 +30,8 @@ LARGE_COST = 0.01  # step costs above this are large
 # A method of order p changes the cost by c / N^p where nothing changes faster than within the whole duration: up to so
 # much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
 COARSE = 2.5
+# Step errors up to which no step cost is doubted: whoever takes Euler steps takes errors that add up.
+DOUBTED = {"euler": 0.05, "midpoint": 0.0, "rk4": 0.0}
 LEAST_RANGE = 1e-3  # of a state's largest size: its range counts as no less
 LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 ELASTIC = 100.0  # by how many per cent no cost changes where a state changes by one per cent of its range
@@ -74,7 +76,7 @@ def step_errors(
         times: (B, N+1), s, of the knots where the time is free.
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
-            all stages together to be large, or no error is more than that of even steps, `COARSE` / N^(p+1).
+            all stages together to be large, or no error is above `DOUBTED`.
     """
     lost = X.new_full((problem.B,), torch.nan)
     places = torch.zeros(2, problem.B, dtype=torch.int64, device=X.device)
@@ -89,7 +91,7 @@ def step_errors(
             asked = torch.isfinite(worst)
             if doubted:
                 asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
-                asked &= worst > COARSE / problem.stages[rows].to(worst) ** (ORDER_OF[problem.dynamics.integrator] + 1)
+                asked &= worst > DOUBTED[problem.dynamics.integrator]
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
             some = asked.nonzero().flatten()
             if some.numel() > 0:
