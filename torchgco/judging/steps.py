@@ -31,7 +31,7 @@ LARGE_COST = 0.01  # step costs above this are large
 # much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
 COARSE = 2.5
 # Step errors up to which no step cost is doubted: whoever takes Euler steps takes errors that add up.
-DOUBTED = {"euler": 0.05, "midpoint": 0.0, "rk4": 0.0}
+HARMLESS_ERROR = {"euler": 0.05, "midpoint": 0.0, "rk4": 0.0}
 LEAST_RANGE = 1e-3  # of a state's largest size: its range counts as no less
 LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 ELASTIC = 100.0  # by how many per cent no cost changes where a state changes by one per cent of its range
@@ -76,7 +76,7 @@ def step_errors(
         times: (B, N+1), s, of the knots where the time is free.
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
-            all stages together to be large, or no error is above `DOUBTED`.
+            all stages together to be large, or no error is above `HARMLESS_ERROR`.
     """
     lost = X.new_full((problem.B,), torch.nan)
     places = torch.zeros(2, problem.B, dtype=torch.int64, device=X.device)
@@ -91,7 +91,7 @@ def step_errors(
             asked = torch.isfinite(worst)
             if doubted:
                 asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
-                asked &= worst > DOUBTED[problem.dynamics.integrator]
+                asked &= worst > HARMLESS_ERROR[problem.dynamics.integrator]
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
             some = asked.nonzero().flatten()
             if some.numel() > 0:
