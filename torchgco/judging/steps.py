@@ -79,8 +79,8 @@ def step_errors(
             all stages together to be large, or no error is above `HARMLESS_ERROR`.
     """
     lost = X.new_full((problem.B,), torch.nan)
-    places = torch.zeros(2, problem.B, dtype=torch.int64, device=X.device)
-    found = StepErrors(lost, lost.clone(), *places, torch.zeros_like(lost, dtype=torch.bool))
+    at = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
+    found = StepErrors(lost, lost.clone(), at, at.clone(), torch.zeros_like(at, dtype=torch.bool))
     if not _halves(problem):
         return found
     with computing_on(X.device), torch.no_grad():
