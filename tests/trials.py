@@ -29,6 +29,8 @@ PLAIN = {
     "clearance_full": 0.01,
     "bound_violation": 0.0,
     "kkt_residual": 1e-3,
+    "step_error": 1e-3,
+    "step_cost": 1e-3,
     "iterations": 40,
     "outer_iterations": 10,
     "guided": 2,

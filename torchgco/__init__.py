@@ -27,6 +27,7 @@ from torchgco.base.errors import (
     InputError,
     ScaleWarning,
     StartWarning,
+    StepWarning,
     TraceWarning,
 )
 from torchgco.base.status import Status
@@ -94,7 +95,7 @@ __all__ = [  # noqa: RUF022
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
     "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning", "ScaleWarning",
-    "StartWarning", "TraceWarning",
+    "StartWarning", "StepWarning", "TraceWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from torchgco.base import clock
-from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
+from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, StepWarning, shown
 from torchgco.base.options import check_value, option_places
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.constraints.norms import within_norms
 from torchgco.judging.scale import SHARE, dwarfed, noise
+from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
 from torchgco.kernels import current, open_loop
 from torchgco.obstacles.base import ADMITTED
@@ -60,9 +61,9 @@ def solve(
     """Solve every problem of the batch.
 
     A ContactWarning names feasible trajectories that touch an obstacle between knots; a ScaleWarning those with a
-    tolerated violation that is large beside its row; a HorizonWarning horizons too short for the way to a stated goal,
-    or longest times (`solution.needed`). Where tensors in the problem, or captured ones, ask for gradients, X, U, cost
-    and multipliers are functions of them (`solution.differentiable`); under `torch.no_grad()` they are numbers.
+    violation that is large beside its row; a StepWarning those with too long a `dt` for the model; a HorizonWarning
+    horizons, or longest times, too short for the way to a stated goal (`solution.needed`). Where tensors in or around
+    the problem ask for gradients, X, U, cost and multipliers have them (`solution.differentiable`); not in `no_grad()`.
 
     Args:
         problem: B problems.
@@ -229,6 +230,7 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
 def _warn_of_contact(problem: Problem, solution: Solution) -> None:
     """A ContactWarning at the caller's caller where trajectories keep all rows and are INFEASIBLE between the knots."""
     _warn_of_scale(problem, solution)
+    _warn_of_steps(problem, solution)
     touching = touches(solution).nonzero().flatten().tolist()
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
@@ -260,6 +262,24 @@ def _warn_of_scale(problem: Problem, solution: Solution) -> None:
             f"{float(solution.violation[b]):.2g}; choose units in which the constraint is larger, or a smaller "
             "violation_tolerance of the solver",
             ScaleWarning,
+            stacklevel=4,
+        )
+
+
+def _warn_of_steps(problem: Problem, solution: Solution) -> None:
+    """A StepWarning where a trajectory that counts as feasible takes steps that are too long for the model."""
+    rows = torch.stack([solution.status == status for status in CLAIMS]).any(0).nonzero().flatten()
+    if rows.numel() == 0:
+        return
+    part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]
+    times = None if solution.times is None else solution.times[rows]
+    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], doubted=True)
+    long = found.large.nonzero().flatten().tolist()
+    if long:
+        warnings.warn(
+            f"{len(long)} of {problem.B} trajectories take steps that are too long for their model: problem "
+            f"{int(rows[long[0]])}, where {found.told(long[0], problem)}; a smaller dt shows what is true",
+            StepWarning,
             stacklevel=4,
         )
 

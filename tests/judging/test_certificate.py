@@ -342,7 +342,7 @@ def test_only_requested_problems_are_certified_each_on_its_own() -> None:
         assert float(getattr(some, name)[0]) == float(column[0])
         alone = certify(problem.take(torch.tensor([1])), X[[1]], U[[1]])
         assert float(getattr(alone, name)) == float(column[1])
-    assert set(frame_columns(whole)) <= set(COLUMNS) and len(frame_columns(whole)) == 4
+    assert set(frame_columns(whole)) <= set(COLUMNS) and len(frame_columns(whole)) == 6
 
 
 def test_bad_calls_are_named() -> None:

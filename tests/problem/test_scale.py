@@ -26,6 +26,8 @@ from torchgco import (
     presets,
 )
 from torchgco.costs.base import ShiftedCost
+from torchgco.judging.scale import dwarfed
+from torchgco.judging.worst import NO_PLACE
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.solvers.ending import optimality
 
@@ -319,3 +321,28 @@ def test_slopes_are_numbers_in_any_precision(dtype: torch.dtype) -> None:
     multipliers = replace(found.multipliers, mu=torch.full_like(found.cost, 1e12))  # stiffness that rounds
     left = optimality(Lagrangian(problem, multipliers, None, True), found.X, found.U).left
     assert bool(torch.isfinite(left).all()) and float(left) < 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_periodic_row_that_is_met_to_rounding_has_no_size(seed: int) -> None:
+    """Curves that close: at rest the rows have what the start, which is free, leaves of the one at knot 0."""
+    draws, N = torch.Generator().manual_seed(seed), 40
+    decay, turns = 0.2 + torch.rand(8, generator=draws, dtype=D), 1.0 + torch.arange(8, dtype=D) % 3
+    turns[1::2] *= 0.5 + torch.rand(4, generator=draws, dtype=D)  # waves that don't close: curves away from 0
+    wave = (turns.unsqueeze(-1) * torch.arange(N + 1, dtype=D) * 2 * torch.pi / N).sin()
+
+    def field(x: Tensor, u: Tensor, decay: Tensor) -> Tensor:
+        return torch.stack((u[..., 0] - decay * x[..., 0], 0 * x[..., 1]), dim=-1)
+
+    model = FunctionDynamics(field, 2, 1, 0.1, "rk4", values={"decay": decay})
+    cost = FunctionCost(lambda x, u, w: (x[..., 0] - w) ** 2 + 0.1 * u[..., 0] ** 2, knot_values={"w": wave})
+    same = lambda x: x[..., :1] - x[..., 1:]
+    rows = [FunctionConstraint(same, "equality", knots=[k]) for k in (0, N)]
+    problem = Problem(model, cost, rows, torch.zeros(8, 2, dtype=D), N, free_start=[True, True])
+    found = torchgco.solve(problem)  # a ScaleWarning is an error here
+    assert found.statuses == [Status.CONVERGED] * 8 and float(found.violation.max()) < 1e-7
+    for off, warned in ((1e-9, False), (1e-8, False), (1e-2, True)):  # of what tolerances leave nothing is said
+        X = found.X.clone()
+        X[:, :, 1] += off * (1.0 + torch.rand(8, 1, generator=draws, dtype=D))
+        X[:, -1, 1] += off
+        assert bool((dwarfed(problem, X, found.U) != NO_PLACE).any()) == warned

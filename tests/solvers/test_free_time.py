@@ -97,6 +97,22 @@ def test_segments_switch_exactly() -> None:
     assert bool((certificate.kkt_residual < 1e-6).all())
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_left_of_controls_that_cost_nothing_is_measured_by_the_cost(seed: int) -> None:
+    """Time alone costs, and one axis waits for the other: its controls are pushed by far rows alone."""
+    draws = torch.Generator().manual_seed(seed)
+    places = 1.0 + 2.0 * torch.rand(3, 2, generator=draws, dtype=D)
+    speeds = -0.2 + 0.5 * torch.rand(3, 2, generator=draws, dtype=D)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), dim=-1), 4, 2, 0.1, "rk4")
+    rows = [ControlBounds(-1.0, 1.0), FunctionConstraint(lambda x: x, "equality", knots=[-1])]
+    time, nothing = FreeTime(0.2, 6.0, weight=1.0, segments=3), FunctionCost(lambda x, u: 0.0 * u[..., 0])
+    problem = Problem(model, nothing, rows, torch.cat((places, speeds), dim=-1), 24, time=time)
+    found = torchgco.solve(problem)
+    assert found.statuses == [Status.CONVERGED] * 3
+    for lams in (None, found.multipliers.lam):
+        assert float(certify(problem, found.X, found.U, None, lams, found.t).kkt_residual.max()) < 5e-3
+
+
 def test_judge_certificate_tables_and_files_know_the_times(tmp_path: Path) -> None:
     problem = carts()
     found = torchgco.solve(problem)

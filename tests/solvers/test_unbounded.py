@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -12,6 +14,7 @@ from torchgco import ControlBounds, FunctionCost, FunctionDynamics, Problem, Sta
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint
 from torchgco.native.compiler import find_compiler
+from torchgco.solvers.unbounded import _falls_at_a_pole
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 D, INF = torch.float64, torch.inf
@@ -122,3 +125,50 @@ def test_a_logarithm_below_a_large_constant(solver: str) -> None:
 
 def drawn_guesses() -> Tensor:
     return 0.5 + 4.5 * torch.rand(64, 8, 1, dtype=D, generator=torch.Generator().manual_seed(3))
+
+
+# Poles ----------------------------------------------------------------------------------------------------------------
+
+
+def firm(power: float, *constraints: Constraint) -> Problem:
+    """Investment that costs its square over a power of the capital, which nothing keeps above 0, for drawn rates."""
+    draws = torch.Generator().manual_seed(3)
+    value = 0.15 + 0.1 * torch.rand(16, generator=draws, dtype=D)
+    x0 = (0.5 + torch.rand(16, 1, generator=draws, dtype=D)).clone()
+
+    def stage(x: Tensor, u: Tensor, k: Any, value: Tensor) -> Tensor:
+        capital = x[..., 0]
+        return -(0.86**k) * (value * capital - u[..., 0] - (u[..., 0] - 0.1 * capital).square() / capital**power)
+
+    model = FunctionDynamics(lambda x, u: u - 0.1 * x, 1, 1, 1.0, "rk4")
+    return Problem(model, FunctionCost(stage, values={"value": value}), constraints, x0, 60)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("power", mostly([1, 3], 3))
+def test_a_cost_that_falls_at_a_pole(solver: str, power: int) -> None:
+    found = torchgco.solve(firm(power), solver=solver)
+    assert found.statuses.count(Status.UNBOUNDED) >= 12, found  # others end elsewhere, or no slope leads there
+    assert found.statuses.count(Status.NOT_POSITIVE_DEFINITE) <= 2, found
+
+
+@pytest.mark.parametrize("solver", ["interior_point", "gco"])
+def test_a_pole_that_bounds_keep_away(solver: str) -> None:
+    found = torchgco.solve(firm(1, StateBounds(1e-3, INF)), solver=solver)
+    assert found.statuses == [Status.CONVERGED] * 16, found
+
+
+def test_where_a_cost_ends_its_slope_leads_to_no_pole() -> None:
+    """Minima, kinks and jumps down the slope: near them less and less is gained."""
+    model = FunctionDynamics(lambda x, u: u, 1, 1, 0.1, "none")
+    ends = {
+        "minimum": lambda z: (z - 3.0).square(),
+        "kink": lambda z: (z - 3.0).abs(),
+        "jump": lambda z: torch.where(z > 3.0, -50.0, -z),
+        "saddle": lambda z: (z.square() - 4.0).square(),
+    }
+    poles = {"pole": lambda z: 1.0 / (z - 3.0), "logarithm": lambda z: (z - 3.0).abs().log()}
+    for name, of in (ends | poles).items():
+        problem = Problem(model, FunctionCost(lambda x, u, of=of: of(u[..., 0])), [], torch.zeros(32, 1, dtype=D), 4)
+        U = torch.rand(32, 4, 1, dtype=D, generator=torch.Generator().manual_seed(4))
+        assert bool((_falls_at_a_pole(problem, U, torch.ones(32, dtype=D), 1e-3) == (name in poles)).all()), name

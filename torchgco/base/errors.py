@@ -71,6 +71,10 @@ class HorizonWarning(UserWarning):
     """A horizon is shorter than the way to the goal needs at the limits on speed."""
 
 
+class StepWarning(UserWarning):
+    """A model's time step is too long: half of it gives other states, or another cost."""
+
+
 class TraceWarning(UserWarning):
     """A model's compiled code gives other states than the model itself."""
 

@@ -19,7 +19,8 @@ BY_STATUS = {
     Status.MAX_ITERATIONS: "Higher limits{limits}, or torchgco.solve(problem, warm=solution), which goes on from here.",
     Status.LINE_SEARCH_FAILED: "Units in which states, controls and costs are of similar size; no kinks (abs, clamp) "
     "in dynamics, cost and constraints.",
-    Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost.",
+    Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost; bounds, where the "
+    "cost may fall without end.",
     Status.NON_FINITE: 'Another U0, bounds on the controls, a smaller dt, or integrator="rk4".',
     Status.INFEASIBLE: "Another guess U0, {longer}wider bounds; or loosen {row}, to see whether it is what "
     "makes the problem infeasible.",
@@ -52,6 +53,10 @@ OFF_MAP = (
     "around it."
 )
 OTHER_GOAL = "A goal that no obstacle covers, or a larger radius of it."
+SHORTER_STEPS = (
+    'A smaller dt, or integrator="rk4" where it is another one. A stiff model takes an implicit step, '
+    'with integrator="none".'
+)
 KNOWN_START = (
     "A start where the map knows that it is free; or let unknown cells, which count as occupied, count as free: "
     'DistanceField.of(grid, unknown="free"), on the command line scenario.unknown=free.'
@@ -81,6 +86,7 @@ class Facts:
         named: whether the row that is violated most is named to the reader before.
         missed: by how much a required goal is missed, with its unit; None: it isn't, or isn't required.
         covered: whether one obstacle covers all of a required goal.
+        steps: what shows that dt is too long for the model; None: nothing does.
     """
 
     status: Status
@@ -103,6 +109,7 @@ class Facts:
     horizon: Any = None
     body: bool = False
     off_map: str | None = None
+    steps: str | None = None
 
     @property
     def touches(self) -> bool:
@@ -151,6 +158,8 @@ def advice(facts: Facts) -> list[str]:
         smaller = f", or {size}" if facts.passage > 0 else ""
         return [f"A goal on the start's side of the walls, or a map with a wider way{smaller}."]
     found = list[str]()
+    if facts.steps is not None:
+        found.append(SHORTER_STEPS)
     if facts.among_obstacles and facts.seeks_paths is False and not (facts.status in FITS and facts.reached):
         found.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')
     if facts.horizon is not None and facts.horizon.suffices is False and not facts.reached:

@@ -18,6 +18,8 @@ from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, gates_told, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
+from torchgco.judging.steps import step_errors
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.unmoved import unmoved, without_slope
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import within_horizons
@@ -45,6 +47,7 @@ class Solved(Protocol):
     trace: pd.DataFrame | None
     search: SearchRecord | None
     account: Account | None
+    multipliers: Multipliers
     times: Tensor | None
     needed: Tensor | None
 
@@ -96,6 +99,7 @@ class _One:
         rows = torch.tensor([b], device=whole.x0.device)
         self.rows, self.problem = rows, whole.take(rows)
         self.X, self.U = solved.X[rows], solved.U[rows]
+        self.lams = [lam[rows] for lam in solved.multipliers.lam]
         self.t: Tensor | None = None
         self.times = None if solved.times is None else solved.times[rows]  # where the time is free
         self.held, self.full_X, self.full_U = at_times(within_horizons(self.problem), self.X, self.U, self.times)
@@ -117,6 +121,11 @@ class _One:
         if problem.goal is None:
             return None
         return float(problem.goal.distance(self.X[:, -1, problem.position])[0])
+
+    def long_steps(self) -> str | None:
+        """What shows that dt is too long for the model; None where nothing does."""
+        found = step_errors(self.problem, self.X, self.U, self.times, self.lams, doubted=True)
+        return found.told(0, self.problem) if bool(found.large) else None
 
     def verdict(self) -> dict[str, Any]:
         """`clearance` and `reached` by the judge, where it knows them."""
@@ -149,6 +158,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.full_X, one.full_U, ADMITTED)),
         horizon=None if reached or not hasattr(solver, "horizon") else solver.horizon(one.problem),
         flat=one.lost_at is None and bool(without_slope(one.held, one.full_X, one.full_U, ADMITTED)),
+        steps=one.long_steps(),
         named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,
         **goal_facts(one.problem, one.X, one.U),
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
@@ -171,6 +181,8 @@ def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]
     worst = place_told(one.problem, one.X, one.U, one.t)
     lines.append("no constraint is violated" if worst is None else f"violated most: {worst}")
     lines += gates_told(one.held, one.full_X)
+    if facts.steps is not None:
+        lines.append(f"steps are too long for the model: {facts.steps}")
     if facts.clearance is not None and facts.clearance < float("inf"):
         side = "touches an obstacle" if facts.clearance < 0 else "clear of obstacles"
         lines.append(f"{side}: {number(facts.clearance)} m to contact, between the knots too")

@@ -25,6 +25,7 @@ from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances, segment_distance
 from torchgco.judging.judge import by_kind, doubled, in_double
 from torchgco.judging.maps import segment_distances
+from torchgco.judging.steps import step_errors
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
@@ -37,6 +38,7 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, current_problem
 
+HARDLY_SEEN = 1e-6  # share of the cost that a control is held to change over its range at least
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
 
@@ -65,6 +67,8 @@ class Certificate:
     # largest component of the Lagrangian's gradient, as a share of the largest terms that cancel in it with respect to
     # the same control; the second the largest product of a multiplier and its row, as a share of the cost.
     kkt_residual: Tensor
+    step_error: Tensor  # whether dt is short enough: see `StepErrors`; NaN without a known field, too
+    step_cost: Tensor
 
 
 def certify(
@@ -113,7 +117,14 @@ def certify(
         multipliers = _checked_multipliers(problem, multipliers)
     with computing_on(problem.x0.device):
         given = None if times is None else doubled(times, "times", problem)
-        return _certified(*at_times(problem, X, U, given), asked, multipliers)
+        columns = _certified(*at_times(problem, X, U, given), asked, multipliers)
+        steps = columns.new_full((2, problem.B), torch.nan)
+        if (some := (~columns[0].isnan()).nonzero().flatten()).numel() > 0:
+            part, t = problem.take(some), None if given is None else given[some]
+            lams = None if multipliers is None else [lam[some] for lam in multipliers]
+            errors = step_errors(part, X[some], U[some], t, lams)
+            steps[:, some] = torch.stack((errors.step_error, errors.step_cost))
+        return Certificate(*columns, *steps)
 
 
 def _checked_multipliers(problem: Problem, multipliers: Sequence[Tensor]) -> list[Tensor]:
@@ -126,9 +137,8 @@ def _checked_multipliers(problem: Problem, multipliers: Sequence[Tensor]) -> lis
     return given
 
 
-def _certified(
-    problem: Problem, X: Tensor, U: Tensor, asked: Tensor, multipliers: Sequence[Tensor] | None
-) -> Certificate:
+def _certified(problem: Problem, X: Tensor, U: Tensor, asked: Tensor, multipliers: Sequence[Tensor] | None) -> Tensor:
+    """The columns of a certificate but those of the steps, (4, B)."""
     columns = torch.full((4, problem.B), torch.nan, dtype=X.dtype, device=X.device)
     finite = torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)
     for b in (asked & finite).nonzero().flatten():
@@ -140,7 +150,7 @@ def _certified(
         columns[:, b] = torch.stack(
             (_dynamics_residual(part, x, u), _clearance(part, x, u), _bound_violation(part, x, u), kkt)
         )
-    return Certificate(*columns)
+    return columns
 
 
 def frame_columns(certificate: Certificate) -> dict[str, Any]:
@@ -282,7 +292,7 @@ def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     slopes = torch.cat((reduced.flatten(1), start[0][:, free]), dim=1).cpu().numpy()
     senses = [equality for equality, (rows, _) in active for _ in rows]
     rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool)))
-    return _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
+    return _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])), _hardly_seen(problem, X, U))
 
 
 def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]) -> Tensor:
@@ -295,7 +305,7 @@ def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]
     reduced, terms, start = _reduced(problem, X, U, *gradients(_lagrangian(problem, lams), X, U))
     free = _free(problem)
     rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
-    unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
+    unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])), _hardly_seen(problem, X, U))
     cost = (problem.cost.total(X, U) - problem.cost_scale.constant)[0].abs()
     cost = cost + problem.cost_scale.size[0]
     products = [torch.where(lam != 0, lam * c, 0.0).abs().flatten() for lam, c in zip(lams, rows, strict=True)]
@@ -333,12 +343,25 @@ def _free(problem: Problem) -> Tensor:
     return torch.zeros_like(problem.x0[0], dtype=torch.bool) if problem.free_start is None else problem.free_start[0]
 
 
-def _share(rest: Tensor, U: Tensor, scale: Tensor) -> Tensor:
+def _hardly_seen(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The least scales (m,) of slopes by controls: `HARDLY_SEEN` of the cost over the range of their bounds.
+
+    By a control on which nothing depends, as where time alone costs, no terms cancel: what is left of rounding and of
+    far rows' multipliers isn't measured by itself.
+    """
+    bounds = problem.control_bounds
+    if bounds is None:
+        return torch.zeros_like(U[0, 0])
+    return (HARDLY_SEEN * problem.cost.total(X, U).abs() / bounds.range[0]).nan_to_num(0.0, 0.0).expand(U.shape[-1])
+
+
+def _share(rest: Tensor, U: Tensor, scale: Tensor, least: Tensor) -> Tensor:
     """The largest component of a gradient by U (N, m) and what is free in the start, (N m + f,), as a share of those
-    of `scale` (m + f,)."""
+    of `scale` (m + f,), for controls at least `least` (m,)."""
     rest = rest.abs()
     rest = torch.cat((rest[: U.numel()].view_as(U).amax(0), rest[U.numel() :]))
     scale = torch.maximum(scale, NEGLIGIBLE * scale.amax())
+    scale = torch.cat((torch.maximum(scale[: len(least)], least), scale[len(least) :]))
     return torch.where(rest > 0, rest / scale, 0.0).amax()
 
 

@@ -21,6 +21,7 @@ from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances, segment_distance
 from torchgco.judging.gates import passes
 from torchgco.judging.maps import segment_distances
+from torchgco.judging.steps import StepErrors, step_errors
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.body import BoundBody
@@ -57,6 +58,8 @@ class Verdict:
     reached: Tensor
     clear_95: Tensor  # bool, the paper's notion: clearance_knots >= 0, every other constraint within 1e-3
     gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, at or between any knots
+    step_error: Tensor  # whether dt is short enough: see `StepErrors`; NaN without a known field
+    step_cost: Tensor
 
     def success(self, best_cost: Tensor) -> Tensor:
         """Whether reached, and within 5 % of the best known cost (B,), (B,) bool.
@@ -107,12 +110,14 @@ def judge(
     problem, U = row_by_row(in_double(problem)), doubled(U, "U", problem)
     problem.check_controls(U, "U")
     more = goal, goal_radius, start
-    given: list[Any] = [value.double() if single and isinstance(value, Tensor) else value for value in more]
+    stated: list[Any] = [value.double() if single and isinstance(value, Tensor) else value for value in more]
     with computing_on(problem.x0.device):
-        end = _goal(problem, *given[:2])
-        first = _start(problem, given[2])
+        end = _goal(problem, *stated[:2])
+        first = _start(problem, stated[2])
         held = first.unsqueeze(1).expand(-1, problem.N + 1, -1)
-        problem, held, U = at_times(problem, held, U, None if times is None else doubled(times, "times", problem))
+        times = None if times is None else doubled(times, "times", problem)
+        given, controls = problem, U
+        problem, held, U = at_times(problem, held, U, times)
         first = held[:, 0]
         X, moved = [first], _moved(problem, first)
         cost = torch.zeros_like(problem.x0[:, 0])
@@ -121,7 +126,9 @@ def judge(
             cost = cost + torch.where(runs, problem.cost.stage(x, U[:, k], k), 0.0)
             X.append(torch.where(runs.unsqueeze(-1), problem.dynamics.at(k).step(x, U[:, k]), x))
         cost = cost + problem.cost.terminal(X[-1])
-        return _verdict(problem, torch.stack(X, dim=1), U, cost, end, moved)
+        states = torch.stack(X, dim=1)
+        errors = step_errors(given, states[..., : given.n], controls, times)
+        return _verdict(problem, states, U, cost, end, moved, errors)
 
 
 def in_double(problem: Problem) -> Problem:
@@ -193,7 +200,13 @@ def _own_goal(problem: Problem) -> Goal:
 
 
 def _verdict(
-    problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: tuple[Tensor, Tensor] | None, moved: Tensor
+    problem: Problem,
+    X: Tensor,
+    U: Tensor,
+    cost: Tensor,
+    goal: tuple[Tensor, Tensor] | None,
+    moved: Tensor,
+    errors: StepErrors,
 ) -> Verdict:
     far, along = torch.full_like(cost, torch.inf), paths(problem, X, U)
     clearance_knots, clearance, violation, others = far, far, moved, torch.zeros_like(cost)
@@ -220,7 +233,8 @@ def _verdict(
         reached = feasible & (goal_distance < goal[1] + (ADMITTED if required else 0.0))
     if problem.dynamics.position is None and not any(isinstance(part, Separation) for part in problem.constraints):
         clearance_knots = clearance = torch.full_like(cost, torch.nan)
-    return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, clear_95, passed)
+    of_goal, of_steps = (goal_distance, feasible, reached), (errors.step_error, errors.step_cost)
+    return Verdict(cost, violation, clearance_knots, clearance, *of_goal, clear_95, passed, *of_steps)
 
 
 def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:

@@ -35,8 +35,9 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         X, U: trajectories, (B, N+1, n) and (B, N, m).
     """
     place = torch.full((problem.B,), NO_PLACE, device=problem.x0.device)
+    free = torch.zeros_like(X[:, :1, :1]) if problem.free_start is None else _of_start(problem, X, U)
     problem = within_horizons(problem.held_at(X[:, 0]))
-    moved = tuple(z * (1.0 + STATE_NOISE * scattered(z[:1])) for z in (X, U))
+    moved = tuple(_moved(z, problem.N) for z in (X, U))
     for number, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             continue
@@ -47,10 +48,24 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
         rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
         size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))
-        admitted = torch.where(size > least, torch.maximum(SHARE * size, least), LARGE_VIOLATION)
+        known = size > torch.maximum(least, free)
+        admitted = torch.where(known, torch.maximum(SHARE * size, least), LARGE_VIOLATION)
         large = (constraint.violation(X, U) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place
+
+
+def _moved(z: Tensor, N: int) -> Tensor:
+    """States or controls z (B, K, n) with changes that say nothing: of themselves, and by what N stages round off."""
+    rounding = N * torch.finfo(z.dtype).eps * z.abs().amax(1, keepdim=True)
+    return z + (STATE_NOISE * z.abs() + rounding) * scattered(z[:1])
+
+
+def _of_start(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """How far free starts are from those that keep the equalities of knot 0, (B, 1, 1), in units of these."""
+    rows = [c for c in problem.constraints if c.sense == "equality" and c.holds_at(0)]
+    worst = [torch.zeros_like(X[:, 0, 0]), *(c.worst(X, U) for c in rows)]
+    return torch.stack(worst).amax(0).view(-1, 1, 1)
 
 
 def _of_both_sides(constraint: Constraint, sizes: Tensor) -> Tensor:

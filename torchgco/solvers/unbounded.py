@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.base.autodiff import gradients_at_once
+from torchgco.dynamics.rollout import open_loop as rolled_out
 from torchgco.kernels import cost_scale, cost_unit, measured, open_loop
 from torchgco.lagrangian.state import Iterate
 from torchgco.problem.problem import Problem
@@ -15,6 +17,7 @@ DEEP_FALL = 1e6  # a fall that asks for a closer look
 BOTTOMLESS = 1e20  # one that needs none: IPOPT's diverging_iterates_tol
 FAR_CONTROLS = 1e6  # times 1 + the guess's own controls: a way of controls that asks for a look
 FARTHER = 10.0, 1e3, 1e6  # times the way from the guess, for that look
+POLE_WAYS, POLE_PLACES, POLE_ROUNDS = (-8.0, 2.0), 41, 9  # powers of ten of the way, places tried, and how often
 GROWING = 1e-3  # controls that moved by less than this share of the largest move stay where they are
 
 
@@ -44,7 +47,34 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     without = (cost - cost_scale(held).constant).abs() + unit
     by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]
     falls[rows] = (fall[0] >= BOTTOMLESS * size) | ((linear | by_decades) & clear)
+    stuck = (torch.isinf(left[rows]) & ~falls[rows]).nonzero().flatten()
+    if stuck.numel() > 0:  # no control Hessian was convex enough: the cost may fall without end at a pole
+        falls[rows[stuck]] = _falls_at_a_pole(held.take(stuck), U[stuck], without[stuck], tolerance)
     return falls
+
+
+def _falls_at_a_pole(problem: Problem, U: Tensor, size: Tensor, tolerance: float) -> Tensor:
+    """Whether the cost falls as it did, the nearer the controls come to a place down its slope, (b,) bool.
+
+    Places (b, P) between the two around the best one are tried again and again: at a pole, and at that of a logarithm,
+    later rounds gain at least about as much as earlier ones; near a minimum, next to nothing.
+    """
+    (slope,) = gradients_at_once(lambda V: problem.cost.total(rolled_out(problem.dynamics, problem.x0, V), V), U)
+    slope = torch.where(torch.isfinite(slope), slope, 0.0)
+    scale = U.abs().flatten(1).amax(-1) / slope.abs().flatten(1).amax(-1).clamp(min=torch.finfo(U.dtype).tiny)
+    places = scale.unsqueeze(-1) * torch.logspace(*POLE_WAYS, POLE_PLACES, dtype=U.dtype, device=U.device)
+    each, best = torch.arange(len(U), device=U.device).repeat_interleave(POLE_PLACES), list[Tensor]()
+    many = problem.take(each)
+    for _ in range(POLE_ROUNDS):
+        V = U[each] - places.view(-1, 1, 1) * slope[each]
+        path = open_loop(many, V)
+        costs = torch.where(measured(many, path, V) <= tolerance, many.cost.total(path, V), torch.inf)
+        lowest, at = costs.nan_to_num(torch.inf, torch.inf, torch.inf).view(-1, POLE_PLACES).min(-1)
+        best.append(lowest)
+        ends = [places.gather(1, (at + by).clamp(0, POLE_PLACES - 1).unsqueeze(-1)) for by in (-1, 1)]
+        places = ends[0] + (ends[1] - ends[0]) * torch.linspace(0.0, 1.0, POLE_PLACES, dtype=U.dtype, device=U.device)
+    first, later = best[0] - best[POLE_ROUNDS // 2], best[POLE_ROUNDS // 2] - best[-1]
+    return (later >= 0.5 * first) & (later > STATIONARY * size)
 
 
 def _farther(problem: Problem, U0: Tensor, U: Tensor, tolerance: float) -> tuple[list[Tensor], Tensor]:

@@ -22,7 +22,9 @@ from torchgco.missions.tables import clearances, ending, mission_row, packed
 PLANS_KEPT = 4  # missions in a study, up to which plans are kept and each mission gets figures
 FAILED = (Outcome.COLLISION, Outcome.DIVERGED)
 # Columns of a study that a mission leaves empty: they belong to a single trajectory.
-SINGLE = ("cost", "dynamics_residual", "clearance_full", "bound_violation", "kkt_residual")
+SINGLE = (
+    "cost", "dynamics_residual", "clearance_full", "bound_violation", "kkt_residual", "step_error", "step_cost"
+)  # fmt: skip
 
 
 @dataclass

@@ -33,8 +33,8 @@ from torchgco.scenarios import Layouts
 COLUMNS = (
     "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "clear_95", "cost",
     "best_cost", "violation", "clearance", "clearance_knots", "goal_distance", "dynamics_residual", "clearance_full",
-    "bound_violation", "kkt_residual", "iterations", "outer_iterations", "guided", "seconds", "batch_size", "threads",
-    "device", "dtype", "kernels", "version", "best_from", "layout_digest", "settings_digest",
+    "bound_violation", "kkt_residual", "step_error", "step_cost", "iterations", "outer_iterations", "guided", "seconds",
+    "batch_size", "threads", "device", "dtype", "kernels", "version", "best_from", "layout_digest", "settings_digest",
 )  # fmt: skip
 JUDGED = ("success", "best_cost", "best_from")  # columns that compare rows: not in shards
 MANIFEST, TRIALS, SOLUTIONS, LAYOUTS, DONE = "study.json", "trials.parquet", "solutions.npz", "layouts.npz", "done"

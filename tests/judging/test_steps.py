@@ -1,0 +1,259 @@
+"""Steps that are too long for their model, against exact solutions of drawn models, stiff ones and others."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg as sl
+import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+import torchgco
+from torchgco import (
+    ControlBounds,
+    FreeTime,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    Problem,
+    QuadraticCost,
+    QuadrotorPlant,
+    RateBounds,
+    StepWarning,
+    certify,
+    judge,
+)
+from torchgco.judging.steps import step_errors
+
+D, DT, N = torch.float64, 0.1, 40
+NAMES = ("place", "speed", "force")
+
+
+def drag(speed: Any, linear: bool) -> Any:
+    return 0.3 * speed * (1.0 if linear else (speed * speed + 0.1) ** 0.5)
+
+
+def drawn(integrator: Any, linear: bool = True, B: int = 64, seed: int = 1, fastest: float = 1.5) -> Problem:
+    """Carts pushed by an actuator that follows within 1 / rate: rate DT is drawn between 1 / 300 and 10^fastest."""
+    draws = torch.Generator().manual_seed(seed)
+    stiff = 10 ** (-2.5 + (2.5 + fastest) * torch.rand(B, generator=draws, dtype=D))
+
+    def field(x: Tensor, u: Tensor, rate: Tensor) -> Tensor:
+        pushed = x[..., 2] - drag(x[..., 1], linear)
+        return torch.stack((x[..., 1], pushed, rate * (u[..., 0] - x[..., 2])), dim=-1)
+
+    model = FunctionDynamics(field, 3, 1, DT, integrator, values={"rate": stiff / DT}, state_names=NAMES)
+    ends = 0.5 + 2.0 * torch.rand(B, 1, 1, generator=draws, dtype=D)
+    x_ref = ends * torch.tensor([1.0, 0.0, 0.0], dtype=D)
+    cost = QuadraticCost([0.1, 0.0, 0.0], [0.05], [50.0, 20.0, 0.0], x_ref=x_ref)
+    x0 = torch.randn(B, 3, generator=draws, dtype=D) * torch.tensor([0.2, 0.2, 1.0]).double()
+    return Problem(model, cost, [ControlBounds(-2.0, 2.0)], x0, N)
+
+
+def exact(problem: Problem, X: Tensor, U: Tensor, linear: bool) -> tuple[Tensor, Tensor]:
+    """The cost (B,) of controls that are held exactly, and one exact step from every state of X, (B, N, 3)."""
+    path, ahead = X.clone(), torch.full_like(X[:, :-1], torch.inf)
+    for b, rate in enumerate(problem.dynamics.values.rows[0].tolist()):
+        A = np.array([[0, 1, 0, 0], [0, -0.3, 1, 0], [0, 0, -rate, rate], [0, 0, 0, 0]])
+        E = sl.expm(DT * A)
+
+        def step(x: Tensor, u: float, rate: float = rate, E: np.ndarray = E) -> Tensor:
+            if linear:
+                return torch.from_numpy((E @ np.append(x.numpy(), u))[:3])
+            rates = lambda t, y: [y[1], y[2] - drag(y[1], linear), rate * (u - y[2])]
+            return torch.from_numpy(solve_ivp(rates, (0, DT), x.numpy(), "Radau", rtol=1e-7, atol=1e-9).y[:, -1])
+
+        for k in range(problem.N):
+            path[b, k + 1] = step(path[b, k], float(U[b, k, 0]))
+            if float(X[b, k].abs().max()) < 1e2:  # else the model's own steps have exploded
+                ahead[b, k] = step(X[b, k], float(U[b, k, 0]))
+    return problem.cost.total(path, U), ahead
+
+
+def solved(problem: Problem) -> torchgco.Solution:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", StepWarning)
+        return torchgco.solve(problem, solver="interior_point")
+
+
+@pytest.mark.parametrize(
+    ("integrator", "linear", "B"),
+    [("rk4", True, 64), ("midpoint", True, 64), pytest.param("rk4", False, 16, marks=pytest.mark.slow)],
+)
+def test_no_wrong_cost_is_missed_and_no_right_one_flagged(integrator: str, linear: bool, B: int) -> None:
+    problem = drawn(integrator, linear, B, seed=1 if linear else 2, fastest=1.5 if linear else 2.0)
+    found = solved(problem)
+    claims = torch.tensor([status.name in ("CONVERGED", "FEASIBLE") for status in found.statuses])
+    problem, found = problem.take(claims.nonzero().flatten()), found.take(claims)
+    assert int(claims.sum()) >= 0.9 * B
+    errors = step_errors(problem, found.X, found.U, None, found.multipliers.lam)
+    cost, ahead = exact(problem, found.X, found.U, linear)
+    wrong = (cost - found.cost).abs() / found.cost.abs()
+    ranges = (found.X.amax(1, keepdim=True) - found.X.amin(1, keepdim=True)).clamp(min=1e-9)
+    of_states = ((ahead - found.X[:, 1:]).abs() / ranges).flatten(1).amax(-1)
+    assert int((wrong > 0.01).sum()) >= B // 16 and int((wrong < 1e-3).sum()) >= B // 3
+    assert bool(errors.large[wrong > 0.01].all())
+    assert not bool(errors.large[(wrong < 1e-3) & (of_states < 0.08)].any())
+    small = of_states < 0.1  # to leading order the difference is the error, but for 1 - 2^-p of it
+    assert bool((errors.step_error[small] < of_states[small] + 1e-9).all())
+    assert bool((errors.step_error[small] > 0.6 * of_states[small] - 1e-9).all())
+    slow = (errors.step_cost > 1e-6) & (errors.step_error < 0.02)
+    assert bool((errors.step_cost[slow] / wrong[slow] - 0.85).abs().lt(0.25).float().mean() > 0.8)
+
+
+def test_euler_steps_are_measured_by_their_own_order() -> None:
+    """Costs that are off by a share of 1 / N or so are usual for Euler steps; beyond rate dt = 2 these explode."""
+    problem = drawn("euler")
+    found = solved(problem)
+    errors = step_errors(problem, found.X, found.U, None, found.multipliers.lam)
+    stiff = problem.dynamics.values.rows[0] * DT
+    assert bool(errors.large[stiff > 2.0].all()) and int((stiff > 2.0).sum()) >= 16
+    assert int(errors.large[stiff < 1.0].sum()) <= 4 and int((stiff < 1.0).sum()) >= 32
+    assert bool((errors.step_cost[errors.large & (stiff < 1.0)] > 0.06).all())
+
+
+def test_a_solve_warns_of_dt_and_the_state_and_explain_and_judge_say_it() -> None:
+    problem = drawn("rk4", B=4, seed=3).take(torch.tensor([0, 1, 2, 3]))
+    rates = torch.tensor([1.0, 100.0, 2.0, 0.5], dtype=D)
+    values = replace(problem.dynamics.values, rows=(rates,))
+    problem = replace(problem, dynamics=replace(problem.dynamics, values=values))
+    with pytest.warns(StepWarning, match=r"1 of 4 .* problem 1, where half of dt = 0.1 s changes state 2 \(force\)"):
+        found = torchgco.solve(problem)
+    assert "steps are too long for the model: half of dt = 0.1 s changes state 2 (force)" in found.explain(1)
+    assert "A smaller dt" in found.explain(1) and "too long" not in found.explain(0)
+    lams = found.multipliers.lam
+    of_all = step_errors(problem, found.X, found.U, None, lams)
+    verdict, certificate = judge(problem, found.U), certify(problem, found.X, found.U, multipliers=lams)
+    assert torch.equal(certificate.step_error, of_all.step_error)
+    assert torch.equal(certificate.step_cost, of_all.step_cost)
+    torch.testing.assert_close(verdict.step_error, of_all.step_error, rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(verdict.step_cost, of_all.step_cost, rtol=1e-3, atol=1e-9)  # no row of states binds
+    assert of_all.large.tolist() == [False, True, False, False]
+    for b in range(4):  # no number depends on the others
+        rows = torch.tensor([b])
+        alone = step_errors(problem.take(rows), found.X[rows], found.U[rows], None, [lam[rows] for lam in lams])
+        assert torch.equal(alone.step_error, of_all.step_error[rows])
+        assert torch.equal(alone.step_cost, of_all.step_cost[rows])
+    asked = torch.tensor([True, True, False, True])
+    broken = torch.where(torch.tensor([0.0, 0.0, 0.0, torch.nan]).view(-1, 1, 1).isnan(), torch.nan, found.X)
+    some = certify(problem, broken, found.U, asked)
+    assert some.step_error.isnan().tolist() == some.step_cost.isnan().tolist() == [False, False, True, True]
+    single = judge(problem.cast(torch.float32), found.U.float())
+    torch.testing.assert_close(single.step_error[[0, 2, 3]], verdict.step_error[[0, 2, 3]], rtol=1e-3, atol=1e-9)
+
+
+def test_a_model_without_a_known_field_has_no_errors() -> None:
+    plain = drawn("rk4", B=3)
+    step = lambda x, u: x + DT * torch.stack((x[..., 1], u[..., 0], 100.0 * (u[..., 0] - x[..., 2])), -1)
+    problem = replace(plain, dynamics=FunctionDynamics(step, 3, 1, DT, "none"))
+    found = torchgco.solve(problem)  # every warning is an error here
+    verdict = judge(problem, found.U)
+    assert bool(verdict.step_error.isnan().all()) and bool(verdict.step_cost.isnan().all())
+    assert "too long" not in found.explain(0)
+
+
+def by_hand(field: Any, x: Tensor, u: Tensor, h: Tensor) -> Tensor:
+    """A step of Runge and Kutta over h (..., 1)."""
+    k1 = field(x, u)
+    k2 = field(x + 0.5 * h * k1, u)
+    k3 = field(x + 0.5 * h * k2, u)
+    return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + field(x + h * k3, u))
+
+
+def swing(x: Tensor, u: Tensor) -> Tensor:
+    return torch.stack((x[..., 1], u[..., 0] - 3.0 * x[..., 0].sin() * x[..., 1].cos()), dim=-1)
+
+
+class ByHand:
+    """Twelve stages of `swing` for two problems that last `last` stages: states, differences of steps, costs.
+
+    Stages of `lengths` (2, 12), s, at which the field counts `factor` (12,) times.
+    """
+
+    x0 = torch.tensor([[1.0, 0.0], [0.4, -1.0]], dtype=D)
+    U = torch.randn(2, 12, 1, dtype=D, generator=torch.Generator().manual_seed(2))
+
+    def __init__(self, last: list[int], times: Tensor | None, factor: Tensor) -> None:
+        self.last, self.timed, self.factor = last, times is not None, factor
+        self.lengths = torch.full((2, 12), 0.3, dtype=D) if times is None else times.diff(dim=1)
+
+    def rolled(self, share: float) -> tuple[Tensor, Tensor]:
+        """States whose steps have that share of the differences taken back, and these differences."""
+        x, X, E = self.x0, [self.x0], []
+        for k in range(12):
+            h, u = (self.lengths[:, k] * self.factor[k]).unsqueeze(-1), self.U[:, k]
+            once, twice = by_hand(swing, x, u, h), by_hand(swing, by_hand(swing, x, u, 0.5 * h), u, 0.5 * h)
+            runs = torch.tensor([k < last for last in self.last]).unsqueeze(-1)
+            E.append(torch.where(runs, once - twice, 0.0))
+            x = torch.where(runs, once - share * E[-1], x)
+            X.append(x)
+        return torch.stack(X, 1), torch.stack(E, 1)
+
+    def cost(self, X: Tensor) -> Tensor:
+        found = []
+        for b, last in enumerate(self.last):
+            own = self.lengths[b, :last]
+            tau, clock = (own / 0.3, own.sum()) if self.timed else (torch.ones_like(own), 0.0)
+            found.append((tau * (self.U[b, :last, 0].square() + 1.0)).sum() + clock + X[b, -1].square().sum())
+        return torch.stack(found)
+
+
+@pytest.mark.parametrize("kind", ["free time", "horizons", "stages"])
+def test_free_times_horizons_rates_and_stages_count(kind: str) -> None:
+    """The differences by hand; and the step cost against costs of rollouts with these differences put in."""
+    model, limits = FunctionDynamics(swing, 2, 1, 0.3, "rk4"), [RateBounds(-9.0, 9.0)]
+    effort = FunctionCost(lambda x, u: u[..., 0].square() + 1.0, lambda x: x.square().sum(-1))
+    times, last, factor = None, [12, 12], torch.ones(12, dtype=D)
+    if kind == "free time":
+        times = 0.3 * torch.tensor([0.5] * 4 + [1.0] * 4 + [2.5] * 4, dtype=D).cumsum(0).expand(2, -1)
+        times = torch.cat((torch.zeros(2, 1, dtype=D), times), dim=1)
+        problem = Problem(model, effort, limits, ByHand.x0, 12, time=FreeTime(0.1, 4.0, segments=3))
+    elif kind == "horizons":
+        last = [12, 7]
+        problem = Problem(model, effort, limits, ByHand.x0, 12, horizon=torch.tensor(last))
+    else:
+        factor = torch.linspace(0.5, 3.0, 12, dtype=D)
+        rates = lambda x, u, pull: swing(x, u) * pull
+        more = {"knot_values": {"pull": factor.view(1, 12, 1)}}
+        problem = Problem(FunctionDynamics(rates, 2, 1, 0.3, "rk4", **more), effort, [], ByHand.x0, 12)
+    plain = ByHand(last, times, factor)
+    X, E = plain.rolled(0.0)
+    found = step_errors(problem, X, plain.U, times)
+    ranges = X.amax(1, keepdim=True) - X.amin(1, keepdim=True)
+    torch.testing.assert_close(found.step_error, (E.abs() / ranges).flatten(1).amax(-1), rtol=1e-8, atol=0)
+    slope = (plain.cost(plain.rolled(1e-4)[0]) - plain.cost(plain.rolled(-1e-4)[0])) / 2e-4
+    torch.testing.assert_close(found.step_cost, slope.abs() / plain.cost(X), rtol=1e-3, atol=1e-12)
+    assert bool((found.step_cost > 1e-7).all())
+
+
+def test_given_multipliers_count_what_a_row_costs() -> None:
+    """A required end: the cost of the controls alone hardly changes, that of arriving does."""
+    field = lambda x, u: torch.stack((x[..., 1], u[..., 0] - 2.0 * x[..., 0].sin()), dim=-1)
+    ends = FunctionConstraint(lambda x: x - torch.tensor([1.0, 0.0], dtype=x.dtype), "equality", [-1])
+    costs = {}
+    for dt, stages in ((0.4, 10), (0.1, 40)):
+        effort = FunctionCost(lambda x, u, dt=dt: dt * u[..., 0].square())
+        problem = Problem(FunctionDynamics(field, 2, 1, dt, "midpoint"), effort, [ends], [[0.0, 0.0]], stages)
+        found = solved(problem)
+        own = judge(problem, found.U)
+        given = certify(problem, found.X, found.U, multipliers=found.multipliers.lam)
+        assert float(own.step_cost) == 0.0
+        costs[dt] = float(given.step_cost)
+    assert costs[0.4] > 5 * costs[0.1] > 0
+
+
+def test_limits_and_unit_quaternions_are_kept_within_half_steps() -> None:
+    """A plant that settles after every step: in its hover the errors are those of rounding."""
+    plant = QuadrotorPlant()
+    x = torch.zeros(1, 17, dtype=D)
+    x[:, 6], x[:, 13:] = 1.0, plant.airframe.mass * plant.airframe.gravity / 4
+    hover = Problem(plant, QuadraticCost([1.0] * 17, [0.0] * 4, [1.0] * 17), [], x, 5)
+    speed = plant.airframe.speed(x[:, 13:]) if hasattr(plant.airframe, "speed") else None
+    U = torch.full((1, 5, 4), 15000.0, dtype=D) if speed is None else speed.unsqueeze(1).expand(1, 5, 4)
+    found = judge(hover, U.contiguous())
+    assert float(found.step_error) < 0.05 and bool(torch.isfinite(found.step_cost).all())

@@ -1,0 +1,186 @@
+"""Whether a model's time step is short enough: each step of a trajectory against two of half its length.
+
+Both start at the same state, with the stage's control held. Their difference is 1 - 2^-p of the error of one step of
+order p, to leading order: half of Euler's, nearly all of that of rk4 (Hairer, Norsett and Wanner, Solving Ordinary
+Differential Equations I, section II.4). A model whose field isn't known can't take half steps, and has no such errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.base.autodiff import gradients_at_once
+from torchgco.base.shapes import computing_on
+from torchgco.costs.base import Cost
+from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.problem.horizons import at_rest_after, within_horizons
+from torchgco.problem.in_time import at_times
+from torchgco.problem.problem import Problem
+from torchgco.problem.scale import LEAST_COST
+
+ORDER_OF = {"euler": 1, "midpoint": 2, "rk4": 4}
+# Step errors above these are large. Euler's difference is a quarter of the second difference of the states, half of
+# their range at most, which controls that change at every stage come close to without a stiff model.
+LARGE_ERROR = {"euler": 0.5, "midpoint": 0.1, "rk4": 0.1}
+LARGE_COST = 0.01  # step costs above this are large
+# A method of order p changes the cost by c / N^p where nothing changes faster than within the whole duration: up to so
+# much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
+COARSE = 2.5
+# Step errors up to which no step cost is doubted: whoever takes Euler steps takes errors that add up.
+HARMLESS_ERROR = {"euler": 0.05, "midpoint": 0.0, "rk4": 0.0}
+LEAST_RANGE = 1e-3  # of a state's largest size: its range counts as no less
+LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
+ELASTIC = 100.0  # by how many per cent no cost changes where a state changes by one per cent of its range
+JACOBIANS_AT_ONCE = 2**20  # numbers of one intermediate tensor at once: 8 MB
+
+
+@dataclass(frozen=True)
+class StepErrors:
+    """One value per problem, (B,); NaN where the model's steps can't be halved."""
+
+    step_error: Tensor  # largest difference of one step and two of half its length, as a share of the state's range
+    # By how much the differences of all steps change the cost to first order, as a share of the sum of the absolute
+    # costs of the stages and the end: with given multipliers the least cost, else that of the same controls.
+    step_cost: Tensor
+    state: Tensor  # int64: the state of `step_error`
+    stage: Tensor  # int64: its stage
+    large: Tensor  # bool: one of them is, and dt too long for the model
+
+    def told(self, b: int, problem: Problem) -> str:
+        """What is wrong with the steps of problem b, in words: dt, the state and the shares."""
+        where, names = int(self.state[b]), problem.dynamics.state_names
+        name = f" ({names[where]})" if len(names) else ""
+        error, cost = float(self.step_error[b]), float(self.step_cost[b])
+        dt = "dt of a stage" if problem.time is not None else f"dt = {problem.dynamics.dt:g} s"
+        more = "" if cost != cost else f", and the cost by {cost:.2g} of itself"
+        more = more if not cost > 10.0 else ", and the cost by many times itself"
+        what = f"half of {dt} changes state {where}{name} by {error:.2g} of its range"
+        return f"{what} at stage {int(self.stage[b])}{more}"
+
+
+def step_errors(
+    problem: Problem,
+    X: Tensor,
+    U: Tensor,
+    times: Tensor | None = None,
+    multipliers: Sequence[Tensor] | None = None,
+    doubted: bool = False,
+) -> StepErrors:
+    """The errors of the steps along trajectories X (B, N+1, n), U (B, N, m), where each state follows from the last.
+
+    Args:
+        times: (B, N+1), s, of the knots where the time is free.
+        multipliers: of every constraint, (B, K, p); None: the cost alone counts.
+        doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
+            all stages together to be large, or no error is above `HARMLESS_ERROR`.
+    """
+    lost = X.new_full((problem.B,), torch.nan)
+    at = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
+    found = StepErrors(lost, lost.clone(), at, at.clone(), torch.zeros_like(at, dtype=torch.bool))
+    if not _halves(problem):
+        return found
+    with computing_on(X.device), torch.no_grad():
+        for rows in _in_parts(problem.B, problem.N * problem.n**2):
+            e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
+            worst, place = share.flatten(1).max(-1)
+            found.step_error[rows], found.stage[rows], found.state[rows] = worst, place // problem.n, place % problem.n
+            asked = torch.isfinite(worst)
+            if doubted:
+                asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
+                asked &= worst > HARMLESS_ERROR[problem.dynamics.integrator]
+            costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
+            some = asked.nonzero().flatten()
+            if some.numel() > 0:
+                own = some + rows.start
+                parts = X[own], U[own], e[some], None if times is None else times[own]
+                costs[some] = _cost_of(problem.take(own), *parts, [lam[own] for lam in multipliers or ()])
+            found.step_cost[rows] = costs
+        method, stages = problem.dynamics.integrator, problem.stages.to(X.dtype)
+        too_much = (COARSE / stages ** ORDER_OF[method]).clamp(min=LARGE_COST)
+        found.large[:] = (found.step_error > LARGE_ERROR[method]) | (found.step_cost > too_much)
+    return found
+
+
+def _halves(problem: Problem) -> bool:
+    """Whether a step integrates a known field."""
+    model = problem.dynamics
+    return model.stretches and model.integrator in INTEGRATORS
+
+
+def _in_parts(B: int, numbers: int) -> Iterator[slice]:
+    """The rows of a batch in parts, of which each holds so many numbers per row."""
+    rows = max(1, JACOBIANS_AT_ONCE // max(1, numbers))
+    return (slice(i, min(i + rows, B)) for i in range(0, B, rows))
+
+
+def _along(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor]:
+    """X_{k+1} minus two steps of half the length from X_k, (B, N, n), and its size as a share of the states' ranges.
+
+    0 after a problem's own last stage.
+    """
+    model, x = problem.along, X[:, :-1]
+    as_it_is = lambda z: z
+    ahead = as_it_is if times is None and model.is_integrated else model.settled
+    if times is None:
+        rates, half = lambda z: model.field(z, U), 0.5 * model.dt
+    else:
+        lengths = times.diff(dim=1).unsqueeze(-1)
+        rates, half = lambda z: lengths * model.field(model.settled(z), U), 0.5
+    for _ in range(2):
+        x = ahead(INTEGRATORS[model.integrator](rates, x, half))
+    e = X[:, 1:] - x
+    e = e if problem.horizon is None else torch.where(problem.running.unsqueeze(-1), e, 0.0)
+    size, apart = X.abs().amax(1, keepdim=True), e.abs()
+    ranges = torch.maximum(X.amax(1, keepdim=True) - X.amin(1, keepdim=True), LEAST_RANGE * size)
+    ranges = torch.maximum(ranges, LEAST_OF_ALL * size.amax(-1, keepdim=True))
+    return e, torch.where(apart > 0, apart / ranges, apart)
+
+
+def _cost_of(
+    problem: Problem, X: Tensor, U: Tensor, e: Tensor, times: Tensor | None, multipliers: Sequence[Tensor]
+) -> Tensor:
+    """`StepErrors.step_cost` (B,) of the differences e (B, N, n)."""
+    n = problem.n
+    whole, X, U = at_times(within_horizons(problem), X, at_rest_after(problem, U), times)
+    pairs = list(zip(whole.constraints, multipliers, strict=False))
+
+    def lagrangian(x: Tensor) -> Tensor:
+        pushes = (torch.where(lam != 0, lam * c.value(x, U), 0.0).flatten(1).sum(-1) for c, lam in pairs)
+        return sum(pushes, whole.cost.total(x, U))
+
+    try:
+        (slopes,), fx = gradients_at_once(lagrangian, X), _by_states(whole, X[:, :-1], U)
+    except RuntimeError:  # code that autograd can't differentiate, which samplers serve
+        return torch.full_like(X[:, 0, 0], torch.nan)
+    costates, rows = [slopes[:, -1:]], slopes.unsqueeze(2).unbind(1)
+    for k, by_x in zip(range(problem.N - 1, 0, -1), reversed(fx.unbind(1)[1:]), strict=True):
+        costates.append(torch.baddbmm(rows[k], costates[-1], by_x))
+    change = (torch.cat(costates[::-1], dim=1)[..., :n] * e).flatten(1).sum(-1)
+    return torch.where(change != 0, change.abs() / _size(whole, X, U), 0.0)
+
+
+def _by_states(problem: Problem, x: Tensor, U: Tensor) -> Tensor:
+    """Jacobians of the steps by the states, (B, N, n, n)."""
+    B, N, n = x.shape
+    each = torch.arange(B, device=x.device).repeat_interleave(n)
+    twins, u = problem.take(each).along, U[each]
+    rows = lambda z: twins.step(z, u).view(B, n, N, n).diagonal(dim1=1, dim2=3)
+    return gradients_at_once(rows, x[each])[0].view(B, n, N, n).transpose(1, 2).contiguous()
+
+
+def _size(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """What changes of the cost are shares of, (B,): the sum of its absolute values at all stages and the end.
+
+    At least `LEAST_COST` of the cost of staying at the start: what vanishes there, as a fit's misfit, has no size.
+    """
+    cost, least = problem.cost, LEAST_COST * problem.cost.total(*problem.at_rest).abs().nan_to_num(0.0, 0.0)
+    if type(cost).total is not Cost.total:
+        return torch.maximum(cost.total(X, U).abs(), least)
+    k = torch.arange(U.shape[1], device=U.device)
+    with cost.precision(X.dtype):
+        own = cost.stage(X[:, :-1], U, k).abs().sum(-1) + cost.terminal(X[:, -1]).abs()
+    return torch.maximum(own, least)
