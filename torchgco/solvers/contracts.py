@@ -179,7 +179,9 @@ class Solver(Brief):
             warm: multipliers and penalties of an earlier solution, for solvers that use them.
             callback: called with the progress after every pass.
             max_seconds: the batched solvers check the time after every pass; once it is over, they return the best
-                trajectories so far. Results then depend on the speed of the machine. The baselines ignore it.
+                trajectories so far. Results then depend on the speed of the machine. ipopt and fatrop solve each
+                problem in its share of the time, in a process that ends then, and return the guess where they aren't
+                ready; the other baselines ignore it.
             X0: states to begin with (B, N+1, n), which U0 need not lead to, for solvers that `take_states`; where one
                 isn't finite, the problem begins with its start held. The first states are those of the problem, but
                 where these are free.
