@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TypeVar
 T = TypeVar("T")
 
 TIMERS = {signal.ITIMER_REAL: signal.SIGALRM, signal.ITIMER_PROF: signal.SIGPROF}
-SHORTEST = 1e-3  # s; a timer of less than its resolution never ends
+LEAST_TIMER = 1e-3  # s; a timer of less than its resolution never ends
 DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux's prctl
 
 
@@ -72,7 +72,7 @@ def _work(work: Callable[[], Any], seconds: float, timer: int, parent: int, writ
         if sys.platform == "linux":
             ctypes.CDLL(None).prctl(DIES_WITH_PARENT, signal.SIGKILL)
         if os.getppid() == parent:  # it lived until now
-            signal.setitimer(timer, max(seconds, SHORTEST))
+            signal.setitimer(timer, max(seconds, LEAST_TIMER))
             with open(writer, "wb") as pipe:
                 pipe.write(pickle.dumps(_tried(work)))
             code = 0
