@@ -73,7 +73,8 @@ def solve(
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
             its controls; where starts are free, from its starts too; where the time is, from its states and times.
-        max_seconds: time after which the best trajectories so far are returned, without compiling; see `Solver.solve`.
+        max_seconds: after which the best trajectories so far are returned, by peers the guess; compiling doesn't count;
+            see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
             and `fatrop`, and without obstacles, or with a free time, `gco`. Default: those that U0 leads to; where the
             time is free, those of its estimate.

@@ -13,6 +13,7 @@ from argparse import ArgumentParser
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from signal import ITIMER_PROF
 from typing import Any, Literal
 
 import numpy as np
@@ -34,10 +35,10 @@ from benchmarks.lib import DATA
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.comparison import timed
 from benchmarks.lib.kept import append, rows_of
-from benchmarks.lib.limited import limited
 from torchgco import InputError, Problem
 from torchgco.baselines import CasADiSolver
 from torchgco.baselines.casadi import PreparedCasADi
+from torchgco.baselines.limited import limited
 
 FILE = DATA / "general_peers.csv"
 COLUMNS = (
@@ -137,7 +138,7 @@ def fly(peer: PreparedCasADi | None, b: int, start: Start, limit: int) -> Flight
         return v, bool(stats["success"]), str(stats.get("return_status", "")), int(stats["iter_count"]), seconds
 
     try:
-        v, success, said, iterations, seconds = limited(work, limit)
+        v, success, said, iterations, seconds = limited(work, limit, ITIMER_PROF)
     except TimeoutError:
         return Flight(TIME_LIMIT, seconds=limit)
     except (ChildProcessError, RuntimeError) as fault:

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from signal import ITIMER_PROF
 from typing import Any
 
 import torch
@@ -25,12 +26,12 @@ from benchmarks.lib.command import parser_of
 from benchmarks.lib.comparison import timed
 from benchmarks.lib.families import DATA, WORLDS, Family
 from benchmarks.lib.kept import append, rows_of
-from benchmarks.lib.limited import limited
 from benchmarks.lib.provenance import provenance
 from torchgco import Problem, compose, judge, presets
 from torchgco.base.status import Status
 from torchgco.baselines import CasADiSolver, GuidedCasADi
 from torchgco.baselines.casadi import PreparedCasADi
+from torchgco.baselines.limited import limited
 from torchgco.baselines.nlp import Program
 from torchgco.experiments.results.identity import layout_digests
 from torchgco.obstacles import Obstacles
@@ -209,7 +210,7 @@ class Peers:
             solution, took = timed(lambda: prepared.solve(problem, U))
             return solution.U.numpy(), solution.statuses[0].name, took, int(solution.iterations)
 
-        controls, *rest = limited(solve, limit)
+        controls, *rest = limited(solve, limit, ITIMER_PROF)
         return Flight(torch.from_numpy(controls), *rest)
 
 

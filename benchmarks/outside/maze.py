@@ -7,6 +7,7 @@ run in one thread. With --write the table goes into benchmarks/results/maze.md.
 from __future__ import annotations
 
 from dataclasses import replace
+from signal import ITIMER_PROF
 
 import numpy as np
 import pandas as pd
@@ -16,11 +17,11 @@ from torch import Tensor
 import torchgco
 from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, cost_ratios, mean, median, named, share_within, timed
-from benchmarks.lib.limited import limited
 from benchmarks.outside.golden import IPOPT
 from benchmarks.outside.maze_problem import drawn, maze, recount, waypoint_guess
 from torchgco import Problem, presets
 from torchgco.baselines import CasADiSolver
+from torchgco.baselines.limited import limited
 from torchgco.search.restarts import Restarts
 
 TOLERANCE = 1e-6  # violation of a solved problem: m, m/s, rad/s, N
@@ -82,7 +83,7 @@ def alone(problem: Problem) -> pd.DataFrame:
             return solution.U[0].numpy(), int(solution.iterations), took
 
         try:
-            controls, iterations[b], seconds[b] = limited(solve, FATROP_LIMIT)
+            controls, iterations[b], seconds[b] = limited(solve, FATROP_LIMIT, ITIMER_PROF)
             U[b] = torch.from_numpy(controls)
         except (TimeoutError, ChildProcessError):
             pass

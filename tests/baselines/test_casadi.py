@@ -220,7 +220,9 @@ def test_every_option_is_read(plugin: str) -> None:
     assert not torch.equal(replace(base, options={"mu_init": 10.0}).solve(problem, U0).U, full.U)
     other = {"ipopt": "fatrop", "fatrop": "ipopt"}[plugin]
     assert not torch.equal(replace(base, plugin=other).solve(problem, U0).U, full.U)
-    assert {f.name for f in fields(base)} == {"plugin", "max_iterations", "tolerance", "violation_tolerance", "options"}
+    assert {f.name for f in fields(base)} == {
+        "plugin", "max_iterations", "tolerance", "violation_tolerance", "max_seconds", "options",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 from benchmarks.lib import command, page
 from benchmarks.lib.command import Command, parser_of
 from benchmarks.lib.comparison import Comparison, cost_ratios, count, mean, median, named, share_within, within, worst
-from benchmarks.lib.limited import limited
 from benchmarks.lib.provenance import provenance
 from tests.problems import planar_batch
 from torchgco import solve
@@ -103,15 +100,3 @@ def test_a_flight_is_what_the_judge_counts() -> None:
     assert flight.seconds.nunique() == 1 and flight.seconds[0] > 0 and len(flight.iterations) == 2
     text = comparison.table(comparison.rows([flight], flight))
     assert text.splitlines()[2] == f"| gco | {float(U.square().sum((1, 2)).mean()):.3f} |"
-
-
-def test_work_ends_at_its_limit_and_says_how_it_ended() -> None:
-    def endless() -> None:
-        while True:
-            pass
-
-    assert limited(lambda: torch.ones(2).sum().item(), 60) == 2.0
-    with pytest.raises(TimeoutError, match="longer than 1 s"):
-        limited(endless, 1)
-    with pytest.raises(ChildProcessError, match="ended with 3"):
-        limited(lambda: sys.exit(3), 60)

@@ -147,6 +147,8 @@ def begin(
     scale = how["steepest"] / largest if largest > 0 else 1.0
     s = np.maximum(-at.c, how["push"] * room(program))
     z, e = (mu / s, np.zeros_like(at.e)) if warm is None else (scale * warm[0], scale * warm[1])
+    if warm is None:
+        z = np.where(loose(program, at, w, scale, s, how["held"]), 1.0, z)
     z = np.maximum(z, mu / (how["central"] * s))
     point = Point(w, np.zeros_like(at.gap), e, z, s, mu, scale)
     at = linear(program, w, scale)
@@ -154,6 +156,30 @@ def begin(
     states = slice(0, program.problem.N * program.problem.n)
     y = np.linalg.solve(at.G[:, states].T, -residual(at, point)[states])
     return replace(point, y=y if abs(y).max() <= how["largest_multiplier"] else 0 * y)
+
+
+def loose(program: Program, at: Linear, w: Array, scale: float, s: Array, held: float) -> Array:
+    """Bounds whose variable the cost hardly holds: its curvature, and that of all it leads to, is small beside 1 / s.
+
+    Of bounds on the given start, which no variable moves, none.
+    """
+    problem = program.problem
+    N, n, m = problem.N, problem.n, problem.m
+    costs = scale * abs(curvature_of_cost(program, w).diagonal())
+    squares = at.G**2
+    for k in range(N - 1, -1, -1):
+        rows = slice(k * n, (k + 1) * n)
+        after = costs[rows].copy()  # x_{k+1}
+        for first, count in (((k - 1) * n, n if k else 0), (N * n + k * m, m)):
+            moved = slice(max(first, 0), max(first, 0) + count)
+            costs[moved] += squares[rows, moved].T @ after
+    bounds = [
+        np.full(part.value(*problem.at_rest).numel(), isinstance(part, ControlBounds | StateBounds))
+        for part in problem.constraints
+        if part.sense == "inequality"
+    ]
+    is_bound = np.concatenate([np.zeros(0, dtype=bool), *bounds]) & abs(at.C).any(1)
+    return is_bound & (abs(at.C) @ costs * s <= held)
 
 
 def room(program: Program) -> Array:

@@ -6,6 +6,7 @@ program with exact derivatives (`nlp`). Every problem of the batch is a set of i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -17,9 +18,10 @@ from torch import Tensor
 
 from torchgco.base.clock import setting_up
 from torchgco.base.errors import InputError
-from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.options import Count, Positive, Seconds, check_options
 from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
+from torchgco.baselines.limited import limited
 from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, current_problem
@@ -42,6 +44,8 @@ class CasADiSolver(Solver):
         max_iterations: of each problem.
         tolerance: the plugin's own, on its optimality conditions.
         violation_tolerance: violation (metres for lengths) up to which a result counts as feasible.
+        max_seconds: of each problem, beside that of the whole solve. A limited problem is solved in a process that ends
+            then, as a plugin may hang: its guess is returned. The program is built before.
         options: further options of the plugin, by its names.
 
     Raises:
@@ -54,6 +58,7 @@ class CasADiSolver(Solver):
     max_iterations: Count = 1000
     tolerance: Positive = 1e-8
     violation_tolerance: Positive = ADMITTED
+    max_seconds: Seconds | None = None
     options: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -157,12 +162,20 @@ class PreparedCasADi(Solver):
         X0 = torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1))
         valid = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
         U, start, ends = U0.clone(), problem.x0.clone(), [(Status.CONVERGED, 0)] * problem.B
-        for b in range(problem.B):
-            if bool(valid[b]):
-                start[b], U[b], ends[b] = self._one(b, X0[b], U0[b])
-            if call.callback is not None:
-                rows = torch.arange(b, b + int(valid[b]), device=U.device)
-                call.callback(Progress(b + 1, rows, b + 1, problem.B))
+        own, left = math.inf if self.solver.max_seconds is None else self.solver.max_seconds, list(range(problem.B))
+        while left:
+            cut = []
+            for done, b in enumerate(left):
+                # One that hangs takes its share of the time alone; what others leave of theirs is for those cut short.
+                share, before = call.seconds_left / (len(left) - done), ends[b]
+                if bool(valid[b]):
+                    start[b], U[b], ends[b] = self._one(b, X0[b], U0[b], min(share, own))
+                if ends[b][0] == Status.TIME_LIMIT and 0.0 < share < own:
+                    cut.append(b)
+                if call.callback is not None and before[0] != Status.TIME_LIMIT:
+                    rows = torch.arange(b, b + int(valid[b]), device=U.device)
+                    call.callback(Progress(b + 1, rows, b + 1, problem.B))
+            left = cut if len(cut) < len(left) else []  # a share that all needed won't be larger
         solution = rolled_out(problem.held_at(start), U, self.solver.violation_tolerance, iterations=0)
         return _with_ends(solution, ends)
 
@@ -175,8 +188,8 @@ class PreparedCasADi(Solver):
         problem = current_problem(problem)
         return replace(self, problem=problem, program=self.program.of(problem))
 
-    def _one(self, b: int, X0: Tensor, U0: Tensor) -> tuple[Tensor, Tensor, _End]:
-        """The start (n,) and the controls (N, m) of problem b, and how it ended."""
+    def _one(self, b: int, X0: Tensor, U0: Tensor, seconds: float) -> tuple[Tensor, Tensor, _End]:
+        """The start (n,) and the controls (N, m) of problem b, found in so many seconds, and how it ended."""
         n, size = X0.shape[-1], self.program.variables.numel()
         p = self.program.values(self.problem, b)
         lower, upper = self.program.limits.bounds(p, size)
@@ -184,19 +197,26 @@ class PreparedCasADi(Solver):
         guess = torch.cat((stages, X0[-1])).double().cpu().numpy()
         highest = np.zeros(len(self.program.equality))
         lowest = np.where(self.program.equality, 0.0, -np.inf)
-        try:
+
+        def solve() -> tuple[np.ndarray, bool, int]:
             found = self.function(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
             stats = self.function.stats()
-        except RuntimeError as error:  # crossed bounds, for example; the other problems are still solved
+            return np.array(found["x"]).reshape(-1)[:-n], bool(stats["success"]), int(stats["iter_count"])
+
+        try:
+            if seconds <= 0.0:
+                raise TimeoutError
+            found, success, iterations = solve() if seconds == math.inf else limited(solve, seconds)
+        except TimeoutError:
+            return X0[0], U0, (Status.TIME_LIMIT, 0)
+        except (RuntimeError, ChildProcessError) as error:  # crossed bounds, for example; others are still solved
             if "option" in str(error).lower():  # FATROP reads its options only here
                 raise _refused(self.solver.plugin, error) from None
             return X0[0], U0, (Status.LINE_SEARCH_FAILED, 0)
-        v = torch.from_numpy(np.array(found["x"]).reshape(-1)[:-n]).to(U0)
-        iterations = int(stats["iter_count"])
+        v = torch.from_numpy(found).to(U0).view(U0.shape[0], -1)
         at_limit = iterations >= self.solver.max_iterations
         failed = Status.MAX_ITERATIONS if at_limit else Status.LINE_SEARCH_FAILED
-        v = v.view(U0.shape[0], -1)
-        return v[0, :n], v[:, n:], (Status.CONVERGED if stats["success"] else failed, iterations)
+        return v[0, :n], v[:, n:], (Status.CONVERGED if success else failed, iterations)
 
 
 def _refused(plugin: str, error: RuntimeError) -> InputError:
@@ -205,9 +225,11 @@ def _refused(plugin: str, error: RuntimeError) -> InputError:
 
 
 def _with_ends(solution: Solution, ends: list[_End]) -> Solution:
-    """CONVERGED where the plugin reports success and the trajectory is feasible."""
+    """CONVERGED where the plugin reports success and the trajectory is feasible; TIME_LIMIT where it was ended."""
     status = solution.status
     ended = status.new_tensor([int(end) for end, _ in ends])
     iterations = status.new_tensor([count for _, count in ends])
-    status = torch.where((status == Status.FEASIBLE) & (ended == Status.CONVERGED), ended, status)
+    tells = (status == Status.FEASIBLE) & (ended == Status.CONVERGED)
+    tells |= (ended == Status.TIME_LIMIT) & (status != Status.NON_FINITE)
+    status = torch.where(tells, ended, status)
     return replace(solution, status=status, iterations=iterations)

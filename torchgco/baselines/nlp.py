@@ -18,6 +18,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement, apart
 from torchgco.constraints.bounds import LOOSE
+from torchgco.maps.field import BoundField
 from torchgco.native.codegen.dynamics import elements
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
@@ -80,8 +81,12 @@ def transcribe(problem: Problem) -> Program:
     """The program of a batch.
 
     Raises:
-        InputError: a part that can't be traced, or that uses an operation without a counterpart in CasADi; horizons.
+        InputError: a part that can't be traced, or that uses an operation without a counterpart in CasADi; horizons;
+            maps.
     """
+    if any(isinstance(part.inscribed, BoundField) for part in problem.obstacles):
+        expected = "no Field: ipopt and fatrop can't take maps; gco, multistart and interior_point do"
+        raise InputError("problem.constraints", expected, "a Field")
     if problem.horizon is not None:
         raise InputError("horizon", "None for CasADi: a solve for each length", "horizons of each problem")
     N, n, m = problem.N, problem.n, problem.m

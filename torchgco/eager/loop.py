@@ -22,6 +22,7 @@ from torchgco.eager.fixed import (
     sort_rows,
     split_multipliers,
 )
+from torchgco.eager.loose import hold_loose
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.search import Step, curvature, go_back, search, stepped
 from torchgco.eager.sizes import steepest
@@ -107,14 +108,15 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
     t.mu = first_barrier(kinds, t)
     settle(kinds, model, t)
     sort_rows(kinds, model, t)
+    diagonal = t.scale.view(-1, 1, 1) * H.diagonal(dim1=-2, dim2=-1).abs()
     if bool(kinds.equality.any()):
-        diagonal = t.scale.view(-1, 1, 1) * H.diagonal(dim1=-2, dim2=-1).abs()
         share, rows = torch.full_like(t.mu, how.slight), kinds.equality.expand_as(t.out)
         t.gives = gives_of(model, model.slopes(t.X, t.U), diagonal, share, rows)
     t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
     remeasure(kinds, t)
     if not how.warm:
         renew(kinds, model, t)
+        hold_loose(kinds, model, t, diagonal)
         return
     join_multipliers(model, t)
     z = column(t.scale) * t.z

@@ -35,6 +35,21 @@ def gives_of(model: Model, at: Derivatives, curvature: Tensor, share: Tensor, ro
     return gives
 
 
+def costs_of(F: Tensor, curvature: Tensor) -> list[Tensor]:
+    """What it costs to move the variables of each knot, (b, S), with all they lead to; from the last, (b, n), on.
+
+    Args:
+        F: slopes of the dynamics (b, N, n, S).
+        curvature: of the cost by each variable, (b, N+1, S), at least 0.
+    """
+    n, N = F.shape[-2], F.shape[1]
+    costs = [curvature[:, N, :n]]
+    for k in range(N - 1, -1, -1):
+        after = costs[-1][:, :n].unsqueeze(-1)
+        costs.append(curvature[:, k] + (F[:, k].square().mT @ after).squeeze(-1))
+    return costs
+
+
 def _freedom(F: Tensor, curvature: Tensor, free: Tensor | None) -> Tensor:
     """How far the cost lets the variables of each knot move, squared, (b, N+1, S): the inverse of its curvature.
 
@@ -42,13 +57,7 @@ def _freedom(F: Tensor, curvature: Tensor, free: Tensor | None) -> Tensor:
     variables don't count, so this is right but for a factor. Variables that cost nothing have 0.
     """
     n, N = F.shape[-2], F.shape[1]
-    squares = F.square()
-    after = curvature[:, N, :n]  # of moving a state, with what follows
-    costs = [after]
-    for k in range(N - 1, -1, -1):
-        every = curvature[:, k] + (squares[:, k].mT @ after.unsqueeze(-1)).squeeze(-1)
-        after = every[:, :n]
-        costs.append(every)
+    squares, costs = F.square(), costs_of(F, curvature)
     inverse = lambda h: torch.where(h > 0.0, 1.0 / h, 0.0)
     start = inverse(costs[-1][:, :n])
     moved = torch.zeros_like(start) if free is None else torch.where(free, start, 0.0)

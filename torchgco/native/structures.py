@@ -176,7 +176,7 @@ class Interior(Structure):
             "double",
             "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest slight explodes relaxes",
         ),
-        ("double", "pivot noise rounding soft_growth soft_decay forced_growth"),
+        ("double", "held pivot noise rounding soft_growth soft_decay forced_growth"),
         ("double", "smoothing"),  # mu in units of the cost, at which the barrier stays; 0: it falls
         ("double", "seconds"),  # after which problems end with TIME_LIMIT; infinite: never
     )

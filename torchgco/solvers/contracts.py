@@ -183,7 +183,8 @@ class Solver(Brief):
             callback: called with the progress after every pass.
             max_seconds: the batched solvers check the time after every pass; once it is over, they return the best
                 trajectories so far. Results then depend on the speed of the machine. Compiling, which a form of problem
-                needs once, doesn't count. The baselines ignore it.
+                needs once, doesn't count. ipopt and fatrop solve each problem in its share of the time, in a process
+                that ends then, and return the guess where they aren't ready; the other baselines ignore it.
             X0: states to begin with (B, N+1, n), which U0 need not lead to, for solvers that `take_states`; where one
                 isn't finite, the problem begins with its start held. The first states are those of the problem, but
                 where these are free.

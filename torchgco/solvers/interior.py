@@ -48,13 +48,14 @@ FILTER: dict[str, Any] = {
     "shift_decay": 1.0 / 3.0, "shift_growth": 8.0, "shift_growth_first": 100.0,  # kappa_w: minus, plus, plus-bar
     "patience": 10, "trials": 3,  # short steps before the watchdog, and its full steps
     "corrects": 1, "smallest": 1e-10,  # second-order corrections; least step length
+    "held": 1e-3,  # of the cost's steepest slope, by which its curvature changes it over a slack: less holds no step
     "steepest": 1.0,  # slope or curvature of the cost, to which it is scaled
     "pivot": 1e-14, "noise": 10.0,  # least pivot, as a share of its entry; rounding of phi, in units of its last bit
     "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
     "slight": 2e-5,  # times delta_c: the least share, 1e3 roundings, of what the cost lets equalities give way
     "relaxes": 0.01,  # of the violation tolerance, by which rows are relaxed there (1e-8: IPOPT's bound_relax_factor)
     "soft_growth": 100.0, "soft_decay": 0.1,
-    "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
+    "crawl": 0.02, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,
     "smoothing": 0.0,  # mu, in units of the cost, at which the barrier stays
     "minimum": 0,  # 1: says where the cost falls to second order from a point that meets the conditions of first order

@@ -95,6 +95,29 @@ static double first_barrier(const Barrier *t, int l) {
     return own > end ? own : end;
 }
 
+/* Multipliers of bounds begin at 1 where the cost hardly holds a step back: eager/loose.py says why. */
+static void hold_loose(Barrier *t, I of) {
+    const Lanes *s = &t->lanes;
+    I some = of & ~of;
+    measure_costs(t);
+    for (int64_t i = 0; i < s->of->constraints; i++) {
+        const Constraint *con = s->of->constraint + i;
+        if (con->kind != BOUNDS) continue;
+        for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
+            int v = con->variable[j];
+            int64_t q = row_of(t, i, k) + j;
+            V costs = v < NX ? t->dx[k * NX + v] : t->du[k * NU + v - NX];
+            I loose = of & ~t->out[q] & (costs * t->s[q] <= SET(t->how->held));
+            if (k == 0 && v < NX) loose &= t->is_free ? tgco_is(t->is_free[v]) : of & ~of; /* nothing moves a given one */
+            t->z[q] = tgco_choose(loose, SET(1.0), t->z[q]);
+            some |= loose;
+        }
+    }
+    if (!any(some)) return;
+    expand(t);
+    adjoin(t, some, 0);
+}
+
 /* Lanes `of` have just been loaded: the scale of their cost, slacks and multipliers. */
 static void begin(Barrier *t, Track *k, I of) {
     V one = SET(1.0), zero = SET(0.0), largest, plain;
@@ -136,6 +159,7 @@ static void begin(Barrier *t, Track *k, I of) {
         adjoin(t, of, 0);
     } else {
         renew(t, of);
+        hold_loose(t, of);
     }
     soften_rows(t, of, SET(how->slight), 0);
 }

@@ -164,25 +164,29 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
         calls=calls.all,
     ).reshape(len(span.knots), -1)
     x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
-    functions, places, forms, first = [], [], {}, None
+    at = {number.element_hash(): i for i, number in enumerate(each)}
+    functions, reads, places, forms, first = [], [], [], {}, None
     for k, row in zip(span.knots, found, strict=True):
         x_k, u_k = X[k * span.n : (k + 1) * span.n], U[k * span.m : (k + 1) * span.m] if k < span.controls else u
         column = ca.densify(ca.vertcat(ca.SX(0, 1), *row))
         inside = calls.inside(column)
         made = [call.outputs for call in inside]
         results = [column, *(call.inputs for call in inside)]
-        function = ca.Function("knot", [x_k, u_k, numbers, *made], results, {"allow_free": True})
+        # Its own numbers alone: functions of those of all knots would together be as long as the horizon squared.
+        reads.append([at[name] for name in _names(*results) if name in at])
+        own = numbers[reads[-1]]
+        function = ca.Function("knot", [x_k, u_k, own, *made], results, {"allow_free": True})
         if function.has_free():
             raise InputError(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
         # Of the same symbols: most knots have the same text, and reading its instructions one by one takes long.
-        inputs = [x, u, numbers, *calls.symbols(inside)]
+        inputs = [x, u, numbers[: own.numel()], *calls.symbols(inside)]
         functions.append(ca.Function("knot", inputs, function.call(inputs)))
         text = functions[-1].serialize()
         if text not in forms:
             forms[text] = _form(functions[-1])
         form, used = forms[text]
         form = [*form, *(calls.key(call) for call in inside)]
-        places.append(used)
+        places.append([reads[-1][i] for i in used])
         first = first or form
         if form != first:
             raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
@@ -194,7 +198,8 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
     for i, place in enumerate(own):
         values[places[0][place]] = p[i]
     inside, made = calls.first, calls.symbols(calls.first)
-    rows, *points = functions[0].call([x, u, ca.vertcat(ca.SX(0, 1), *values), *made])
+    read = ca.vertcat(ca.SX(0, 1), *(values[i] for i in reads[0]))
+    rows, *points = functions[0].call([x, u, read, *made])
     chosen = [[used[i] for i in own] for used in (places if any(differ) else places[:1])]
     found = [Call(call.net, point, out) for call, point, out in zip(inside, points, made, strict=True)]
     return Knot(x, u, p, w, rows, found), chosen
@@ -240,11 +245,11 @@ class _Calls:
         return self._keys[id(call.net)]
 
 
-def _names(expression: Any) -> set[int]:
-    """The symbols of an expression."""
+def _names(*expressions: Any) -> list[int]:
+    """The symbols of some expressions."""
     import casadi as ca
 
-    return {symbol.element_hash() for symbol in ca.symvar(expression)}
+    return [symbol.element_hash() for symbol in ca.symvar(ca.vertcat(ca.SX(0, 1), *expressions))]
 
 
 def _form(function: Any) -> tuple[list[tuple], list[int]]:
