@@ -224,7 +224,7 @@ class MPC:
             found = better(self.compiled.now.take(rows), found, answer.U[rows])
             made = made.with_rows(rows, found.X, found.U, found.K)
             # At other times than its knots a plan before isn't, to the last millimetre, what was looked at.
-            at_knots = [isinstance(stages_between((now - self._begun[b]) / self.dt), int) for b in rows.tolist()]
+            at_knots = [isinstance(stages_between(float(now - self._begun[b]) / self.dt), int) for b in rows.tolist()]
             kept[rows.numpy()] = found.is_before.numpy() & at_knots
             self._feasible[rows.numpy()] = found.feasible
         self._begun = np.where(kept, self._begun, now)

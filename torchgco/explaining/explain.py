@@ -142,6 +142,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
     could = solved.trace is None and recording is not None and recording() != solver
     if one is None:
         return Facts(status, solver, could_record=could)
+    horizon = getattr(solver, "horizon", None)
     verdict = one.verdict()
     reached = bool(verdict["reached"]) if "reached" in verdict else None
     clearance = float(verdict["clearance"]) if "clearance" in verdict else None
@@ -156,7 +157,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
         unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.full_X, one.full_U, ADMITTED)),
-        horizon=None if reached or not hasattr(solver, "horizon") else solver.horizon(one.problem),
+        horizon=None if reached or horizon is None else horizon(one.problem),
         flat=one.lost_at is None and bool(without_slope(one.held, one.full_X, one.full_U, ADMITTED)),
         steps=one.long_steps(),
         named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,

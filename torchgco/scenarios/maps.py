@@ -16,7 +16,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Seed, check_options, check_value
 from torchgco.maps.distance import DistanceField, Unknown
 from torchgco.maps.files import read, read_task, usual_outside
-from torchgco.maps.grid import coordinates
+from torchgco.maps.grid import OccupancyGrid, coordinates
 from torchgco.roadmap.shortest import shortest_way
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import MAX_DRAWS, Scenario, generator
@@ -123,7 +123,8 @@ class MapFile(Scenario):
         if place.shape != (self.dimension,) or not (np.abs(place) <= checks.TOO_LARGE).all():
             expected = f"{self.dimension} coordinates within {checks.TOO_LARGE:g} m, as the map is {self.dimension}-D"
             raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
-        if self.outside == "occupied" and not self.map.source.holds(place):
+        source = self.map.source
+        if self.outside == "occupied" and isinstance(source, OccupancyGrid) and not source.holds(place):
             expected = "a place on the map, around which all is occupied unless scenario.outside=free"
             raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
         return place

@@ -125,7 +125,7 @@ class _Wave:
             turn = np.abs(pose[:, 2] - self.target[2]) / (TIGHTEST * self.space.curvature * self.space.step)
             left = np.maximum(left, turn)
         some = np.isfinite(left)
-        pose, way, ahead, place, left = (part[some] for part in (pose, way, ahead, place, left))
+        pose, way, ahead, place, left = pose[some], way[some], ahead[some], place[some], left[some]
         bucket = np.floor(way + left).astype(np.int64)
         for one in np.unique(bucket):
             some = bucket == one
