@@ -179,7 +179,7 @@ def loose(program: Program, at: Linear, w: Array, scale: float, s: Array, held: 
         if part.sense == "inequality"
     ]
     is_bound = np.concatenate([np.zeros(0, dtype=bool), *bounds]) & abs(at.C).any(1)
-    return is_bound & (abs(at.C) @ costs * s <= held)
+    return is_bound & (abs(at.C) @ costs * np.maximum(s, 1.0) <= held)
 
 
 def room(program: Program) -> Array:

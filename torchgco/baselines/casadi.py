@@ -219,7 +219,7 @@ class PreparedCasADi(Solver):
         return v[0, :n], v[:, n:], (Status.CONVERGED if success else failed, iterations)
 
 
-def _refused(plugin: str, error: RuntimeError) -> InputError:
+def _refused(plugin: str, error: Exception) -> InputError:
     message = " ".join(str(error).split())[-300:]  # CasADi names the cause last
     return InputError("solver", f"a problem and options that {plugin} takes", message)
 

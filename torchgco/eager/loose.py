@@ -19,7 +19,8 @@ from torchgco.eager.state import Kinds, State, adjoin
 def hold_loose(kinds: Kinds, model: Model, t: State, curvature: Tensor) -> None:
     """Multipliers of bounds are 1 where moving their variable through the slack changes the cost's slope by too little.
 
-    What moving it leads to counts, too; in place, with costates that fit.
+    What moving it leads to counts, too, and a slack as 1 at least: at a bound nearby small slacks hold a step. In
+    place, with costates that fit.
 
     Args:
         curvature: that of the cost by each variable, (b, N+1, S), at least 0.
@@ -36,6 +37,6 @@ def hold_loose(kinds: Kinds, model: Model, t: State, curvature: Tensor) -> None:
     for group in bounds:
         variables, z = torch.cat(group.variables(n)), group.place.of(t.z)
         of, can = (values[:, group.place.knots][..., variables] for values in (costs, moves))
-        loose = group.place.of(inside) & can & (of * group.place.of(t.s) <= kinds.how.held)
+        loose = group.place.of(inside) & can & (of * group.place.of(t.s).clamp(min=1.0) <= kinds.how.held)
         z[loose] = 1.0
     adjoin(kinds, at, t)

@@ -107,7 +107,7 @@ static void hold_loose(Barrier *t, I of) {
             int v = con->variable[j];
             int64_t q = row_of(t, i, k) + j;
             V costs = v < NX ? t->dx[k * NX + v] : t->du[k * NU + v - NX];
-            I loose = of & ~t->out[q] & (costs * t->s[q] <= SET(t->how->held));
+            I loose = of & ~t->out[q] & (costs * most(t->s[q], SET(1.0)) <= SET(t->how->held));
             if (k == 0 && v < NX) loose &= t->is_free ? tgco_is(t->is_free[v]) : of & ~of; /* nothing moves a given one */
             t->z[q] = tgco_choose(loose, SET(1.0), t->z[q]);
             some |= loose;
