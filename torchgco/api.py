@@ -73,8 +73,7 @@ def solve(
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
             its controls; where starts are free, from its starts too; where the time is, from its states and times.
-        max_seconds: after which the best trajectories so far are returned, by peers the guess; compiling doesn't count;
-            see `Solver.solve`.
+        max_seconds: after which the best trajectories so far are returned, of peers the guess; see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
             and `fatrop`, and without obstacles, or with a free time, `gco`. Default: those that U0 leads to; where the
             time is free, those of its estimate.
@@ -86,9 +85,8 @@ def solve(
             solver's, FEASIBLE, whose gradients are smooth; `solution.reason` where none is found. None: the solver's.
 
     Raises:
-        InputError: U0, ids, warm, X0 or an argument don't fit, no preset has this name, the solver can't begin with
-            states X0, an argument is one that solve doesn't have, or a function that branches on values mixes knots or
-            problems along what was found.
+        InputError: U0, ids, warm, X0 or an argument don't fit, no preset has this name, the solver can't begin with X0,
+            solve has no such argument, or a function that branches on values mixes knots or problems in what is found.
     """
     check_untransformed("solve")
     asked = problem = current_problem(problem)

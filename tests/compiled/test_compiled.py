@@ -390,6 +390,7 @@ def test_a_mistake_changes_nothing_and_gets_one_line(numbers: Numbers, message: 
     assert all(np.array_equal(mpc.numbers[name], value) for name, value in before.items() if name != "x0")
 
 
+@pytest.mark.filterwarnings("ignore::torchgco.StepWarning")  # of a car far beyond its bounds
 def test_numbers_of_one_call_are_checked_together() -> None:
     problem = driven(of_driven(2, 8))
     weights = QuadraticCost([1.0] * 4, [0.1] * 2, [1.0] * 4, H=0.01 * np.ones((2, 4)))

@@ -220,7 +220,7 @@ def test_advice_names_the_limits_of_the_solver_and_ends_where_nothing_is_amiss()
     assert advice(Facts(Status.CONVERGED, solver, seeks_paths=True, among_obstacles=True, reached=True)) == []
     first, *_ = advice(Facts(Status.FEASIBLE, solver, seeks_paths=False, among_obstacles=True, reached=False))
     assert 'solver="gco"' in first
-    touching = Facts(Status.CONVERGED, solver, True, True, reached=True, clearance=-0.1)
+    touching = Facts(Status.INFEASIBLE, solver, True, True, reached=False, clearance=-0.1)
     assert any("smaller dt" in line for line in advice(touching))
 
 

@@ -116,6 +116,14 @@ class Obstacles(Constraint):
         return False
 
     @property
+    def has_chords(self) -> bool:
+        """Whether its distances from segments are known, which a user's kind need not define."""
+        own = type(self)
+        return not (
+            own.segment_clearance is Obstacles.segment_clearance and own.chord_clearance is Obstacles.chord_clearance
+        )
+
+    @property
     def inscribed(self) -> Obstacles:
         """The obstacles of a vehicle that is a ball: themselves, or of a body those of the ball that it holds."""
         return self

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.status import STOPPED
 from torchgco.base.tree import copied, put, take
-from torchgco.kernels import chord_clearance
+from torchgco.kernels import path_clearance
 from torchgco.lagrangian.quality import arrive_alike, has_arrived, is_preferred
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
@@ -76,8 +76,15 @@ class Best:
         fits &= arrive_alike(problem, new.best.X, old.best.X)
         if not bool(fits.any()):
             return
-        before, now = (chord_clearance(problem, end.best.X) >= 0 for end in (old, new))
-        for at in (fits & (before != now) & (before == preferred)).nonzero().flatten():
+        chosen = preferred.view(-1, 1, 1)
+        for winner in (False, True):  # of the pair, the one that loses first: mostly it isn't clear either
+            some, swapped = fits.nonzero().flatten(), chosen if winner else ~chosen
+            X, U = (torch.where(swapped, a, b)[some] for a, b in ((new.best.X, old.best.X), (new.best.U, old.best.U)))
+            clear = path_clearance(problem.take(some), X, U) >= 0
+            fits[some] &= ~clear if winner else clear
+            if not bool(fits.any()):
+                return
+        for at in fits.nonzero().flatten():
             one = take(old if bool(preferred[at]) else new, at.unsqueeze(0))
             kept = self.spare.setdefault(int(rows[at]), one)
             if bool(one.best.cost < kept.best.cost):

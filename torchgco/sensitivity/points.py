@@ -20,6 +20,7 @@ from torchgco.base.tree import copied, put, take
 from torchgco.kernels import chord_clearance, cost_unit, interior_of, measured
 from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.lagrangian.quality import leaves_goal
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
@@ -78,6 +79,8 @@ def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> P
     """The points of solutions, with every reason against derivatives; with smoothing, mu in units of the cost."""
     result = copied(replace(solution, trace=None, search=None, account=None))
     solved = (solution.status == Status.CONVERGED) | (solution.status == Status.FEASIBLE)
+    # What only touches an obstacle between two knots is stationary for the rows at them all the same.
+    solved |= (solution.status == Status.INFEASIBLE) & (solution.violation <= ADMITTED)
     reason = torch.full_like(solution.status, int(Why.NOT_SOLVED))
     growth = torch.zeros_like(solution.cost)
     _polish(problem, solved.nonzero().flatten(), growth, result, reason, smoothing)

@@ -117,13 +117,14 @@ def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
 def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Tensor:
     """The statuses (B,), but INFEASIBLE where a trajectory keeps all rows and isn't feasible between the knots.
 
-    It touches an obstacle there, or doesn't pass a gate, as the tolerance of the rows was too large for that.
+    It touches an obstacle there, of a kind that can be measured, or doesn't pass a gate, as the tolerance of the rows
+    was too large for that.
     """
     rows = ((status == Status.CONVERGED) | (status == Status.FEASIBLE)).nonzero().flatten()
     if rows.numel() == 0:
         return status
     part, X, U = problem.take(rows), X[rows], U[rows]
-    bad = path_clearance(part, X, U) < 0
+    bad = path_clearance(part, X, U) < 0 if all(one.has_chords for one in part.obstacles) else rows < 0
     for way in (passes(constraint, X) for constraint in part.constraints):
         bad = bad if way is None else bad | ~way.passed.all(-1)
     status = status.clone()

@@ -28,6 +28,7 @@ from torchgco.solvers.ending import STATIONARY, start_status
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
+from torchgco.solvers.unbounded import beyond_rounding
 
 REPORTED_AT_ONCE = 256  # problems between two reports of progress
 SADDLE_STEPS = 1e-3, 1e-1  # sizes of the controls, by which a solve goes on beside a saddle point or a maximum
@@ -195,7 +196,8 @@ class InteriorPoint(Solver):
         problem, found = call.problem, end.best
         X, cost, worst = guess.X, guess.cost, guess.violation
         lost = ~(torch.isfinite(found.cost) & torch.isfinite(found.violation))
-        worse = is_better(cost, worst, found.cost, found.violation, self.admitted(problem)) | lost
+        held = beyond_rounding(found.violation, found.U)
+        worse = is_better(cost, worst, found.cost, held, self.admitted(problem)) | lost
         rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
         if rows.numel() > 0:
             multipliers = take(found.multipliers, rows)

@@ -21,6 +21,12 @@ POLE_WAYS, POLE_PLACES, POLE_ROUNDS = (-8.0, 2.0), 41, 9  # powers of ten of the
 GROWING = 1e-3  # controls that moved by less than this share of the largest move stay where they are
 
 
+def beyond_rounding(violation: Tensor, U: Tensor) -> Tensor:
+    """Violations (B,), and 0 where the last digits of controls U (B, N, m) make as much: costs that fall go far."""
+    rounding = torch.finfo(U.dtype).eps * U.abs().flatten(1).amax(-1)
+    return torch.where(violation <= rounding, 0.0, violation)
+
+
 def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor, tolerance: float) -> Tensor:
     """Whether the cost of feasible trajectories falls without end, (B,) bool.
 
@@ -32,7 +38,7 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     unit = problem.N * cost_unit(problem)
     way = (found.U - U0).abs().flatten(1).amax(-1) / (1.0 + U0.abs().flatten(1).amax(-1))
     open_ended = (left > STATIONARY) | (way >= FAR_CONTROLS)
-    falls = ((found.cost < -DEEP_FALL * unit) | open_ended) & (found.violation <= tolerance)
+    falls = ((found.cost < -DEEP_FALL * unit) | open_ended) & (beyond_rounding(found.violation, found.U) <= tolerance)
     rows = falls.nonzero().flatten()
     if rows.numel() == 0:
         return falls
@@ -86,5 +92,5 @@ def _farther(problem: Problem, U0: Tensor, U: Tensor, tolerance: float) -> tuple
         beyond = U + torch.where(large, (times - 1) * move, 0.0)
         path = open_loop(problem, beyond)
         costs.append(problem.cost.total(path, beyond))
-        clear &= measured(problem, path, beyond) <= tolerance
+        clear &= beyond_rounding(measured(problem, path, beyond), beyond) <= tolerance
     return costs, clear
