@@ -46,7 +46,7 @@ from torchgco.maps.distance import DistanceField
 from torchgco.missions import RotorPlant
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
-from torchgco.search.reach import Step, limit_of
+from torchgco.search.reach import limit_of
 
 N, R = 3, 0.06
 DOUBLE: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
@@ -135,7 +135,7 @@ def test_the_longest_step_is_found() -> None:
     def work(problem: Problem, U0: Tensor) -> list[Tensor]:
         with computing_on(problem.x0.device):
             found = limit_of(problem)
-        assert isinstance(found, Step)
+        assert found is not None and bool(found.step.isfinite().all())
         return [found.step]
 
     on_both(work, "states")

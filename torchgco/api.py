@@ -33,6 +33,7 @@ from torchgco.search.reach import short_horizons
 from torchgco.sensitivity import asks_for_gradients, attached, check_smoothing
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
+from torchgco.solvers.ending import touches
 from torchgco.solvers.watching import Watcher
 
 if TYPE_CHECKING:
@@ -230,7 +231,7 @@ def _warn_of_contact(problem: Problem, solution: Solution) -> None:
     """A ContactWarning at the caller's caller where trajectories keep all rows and are INFEASIBLE between the knots."""
     _warn_of_scale(problem, solution)
     _warn_of_steps(problem, solution)
-    touching = touches(solution).nonzero().flatten().tolist()
+    touching = touches(problem, solution).nonzero().flatten().tolist()
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
         warnings.warn(
@@ -281,11 +282,6 @@ def _warn_of_steps(problem: Problem, solution: Solution) -> None:
             StepWarning,
             stacklevel=4,
         )
-
-
-def touches(solution: Solution) -> Tensor:
-    """Which trajectories (B,) are INFEASIBLE although they keep all rows: they touch an obstacle between two knots."""
-    return (solution.status == Status.INFEASIBLE) & (solution.violation <= ADMITTED)
 
 
 def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:

@@ -167,7 +167,7 @@ def ipopt(space: Space) -> CasADiSolver:
 
 def fatrop(space: Space) -> CasADiSolver:
     """FATROP through CasADi: like `ipopt`, with a Riccati recursion over the stages as linear algebra."""
-    return CasADiSolver("fatrop")
+    return CasADiSolver("fatrop", max_seconds=120.0)  # it may hang within a call
 
 
 def fatrop_guided(space: Space) -> GuidedCasADi:

@@ -140,3 +140,49 @@ def test_a_start_that_is_too_near_may_leave() -> None:
     U[0, 1, 1] = 0.3
     assert not bool(torchgco.judge(problem, U).feasible)
     assert math.isclose(float(torchgco.judge(problem, U).violation), 0.015, abs_tol=2e-3)
+
+
+def test_a_model_that_looks_at_values_is_judged_between_the_knots() -> None:
+    """Whatever the number of pieces: also where chords are close enough."""
+
+    def guarded(x: Tensor, u: Tensor) -> Tensor:
+        if bool(torch.isnan(x).any()):
+            raise ValueError("not a number")
+        return rates(x, u)
+
+    model = FunctionDynamics(guarded, n=4, m=2, dt=0.3, integrator="rk4", position=slice(0, 2))
+    plain = scene(1, B=2)
+    problem = replace(plain, dynamics=model)
+    for size in (0.0, 3.0):
+        U = size * torch.as_tensor(np.random.default_rng(5).uniform(-1, 1, (2, 16, 2)))
+        found, expected = torchgco.judge(problem, U), torchgco.judge(plain, U)
+        torch.testing.assert_close(found.clearance, expected.clearance)
+
+
+def test_a_body_that_turns_within_a_stage_is_followed() -> None:
+    """A bar of 2 m turns by a quarter in each stage: halfway its tip passes a post that both knots are far from."""
+    bar = torchgco.Body([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]], 0.05)
+    field = lambda x, u: torch.stack((0 * x[..., 0], 0 * x[..., 1], x[..., 3], u[..., 0]), -1)
+    model = FunctionDynamics(
+        field, n=4, m=1, dt=1.0, integrator="rk4", position=slice(0, 2), state_names=("x", "y", "heading", "rate")
+    )
+    turned = 0.25 * math.pi * 0.5  # of the heading, halfway through a stage that begins at rest
+    post = [[math.cos(turned), math.sin(turned)]]
+    cost = QuadraticCost([0.0] * 4, [1.0], [0.0] * 4)
+    x0 = torch.zeros(1, 4, dtype=DOUBLE)
+    problem = Problem(model, cost, [Spheres(post, 0.05, bar)], x0, 2)
+    verdict = torchgco.judge(problem, torch.full((1, 2, 1), math.pi, dtype=DOUBLE))
+    assert float(verdict.clearance_knots) > 0.2 and float(verdict.clearance) < 0.0
+
+
+@pytest.mark.parametrize("share", [0.96, 0.98])
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@compiled
+def test_a_way_out_of_the_band_at_a_wall_is_feasible(share: float, integrator: str) -> None:
+    """From 0.96 of the radius away from a map the way leads straight out: solvers and judge agree."""
+    problem, _ = beside_a_wall(0.25 * share)
+    model = replace(problem.dynamics, integrator=integrator)
+    away = QuadraticCost([1.0, 1], [0.1, 0.1], [10.0, 10], [1.0, 1.6])
+    problem = replace(problem, dynamics=model, cost=away, goal=Goal([1.0, 1.6], 0.3))
+    found = torchgco.solve(problem, verbose=False)
+    assert found.statuses[0] in CLAIMS and bool(torchgco.judge(problem, found.U).feasible)

@@ -10,6 +10,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable
+from threading import TIMEOUT_MAX
 from typing import Any, NoReturn, TypeVar
 
 T = TypeVar("T")
@@ -53,7 +54,7 @@ def limited(work: Callable[[], T], seconds: float, timer: int = signal.ITIMER_RE
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if code == -TIMERS[timer]:
         raise TimeoutError(f"took longer than {seconds:g} s")
-    if code != 0:
+    if code != 0 or not answer:
         raise ChildProcessError(f"ended with {code}")
     failed, result = pickle.loads(answer)
     if failed:
@@ -72,7 +73,7 @@ def _work(work: Callable[[], Any], seconds: float, timer: int, parent: int, writ
         if sys.platform == "linux":
             ctypes.CDLL(None).prctl(DIES_WITH_PARENT, signal.SIGKILL)
         if os.getppid() == parent:  # it lived until now
-            signal.setitimer(timer, max(seconds, LEAST_TIMER))
+            signal.setitimer(timer, min(max(seconds, LEAST_TIMER), TIMEOUT_MAX))
             with open(writer, "wb") as pipe:
                 pipe.write(pickle.dumps(_tried(work)))
             code = 0

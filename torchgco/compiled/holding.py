@@ -13,7 +13,7 @@ from torchgco.compiled.stages import moved, stages_between
 from torchgco.compiled.stopping import clamped, limits, stopping
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.norms import within_norms
-from torchgco.kernels import current, followed, measured, open_loop
+from torchgco.kernels import current, followed, measured, open_loop, path_clearance
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival, violation
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.goal import GoalBall, GoalState
@@ -94,6 +94,7 @@ def _best(problem: Problem, whole: Problem, U: Tensor, K: Tensor | None = None, 
     X = open_loop(many, U)
     worst, cost = _violation(many, X, U), many.cost.total(X, U).nan_to_num(torch.inf)
     fits = (worst <= ADMITTED) & torch.isfinite(X).flatten(1).all(-1)
+    fits &= path_clearance(many, X, U) >= 0  # NaN, of states that aren't finite, isn't
     arrives = fits & has_arrived(own, X[..., : problem.n]) if ranks_arrival(own) else fits
     near = (worst.view(B, C) <= worst.view(B, C).amin(1, keepdim=True) + ADMITTED).flatten()
     rank = torch.where(arrives, 0, torch.where(fits, 1, torch.where(near, 2, 3))).view(B, C)

@@ -189,7 +189,7 @@ class MPC:
         )  # fmt: skip
         ended = answer.status.numpy()
         solved = (ended == CONVERGED) | (ended == FEASIBLE)
-        self._held, self._feasible = ~solved, solved
+        self._held, self._feasible = ~solved, solved.copy()
         if solved.all():
             self._begun, self._plan = np.full(len(solved), now), None
             u = self._made(answer).mean(now, self.period) if self._free else answer.u

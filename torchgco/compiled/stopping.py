@@ -158,7 +158,8 @@ def _toward_rest(
     v, *others, still = speeds.view(m + 2, R, -1).unbind(0)
     J = (torch.stack(others, dim=-1) - v.unsqueeze(-1)) / PROBE  # (R, d, m), by shares of the ranges
     squares, one = J.mT @ J, torch.eye(m, dtype=x.dtype)
-    size = squares.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(x.dtype).tiny)
+    size = squares.diagonal(dim1=-2, dim2=-1).sum(-1)
+    size = torch.where(size > 0, size, 1.0)  # of a speed that no control changes yet
     squares = squares + SMALLEST_SQUARE * size[:, None, None] * one
     squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, one)
     change = -torch.linalg.solve(squares, (J.mT @ v.unsqueeze(-1)).nan_to_num()).squeeze(-1)

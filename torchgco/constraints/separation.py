@@ -63,16 +63,16 @@ class Separation(Constraint):
         return replace(self, positions=states, pairs=pairs, min_distance=distance.reshape(-1), knots=knots)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.min_distance.square().view(-1, 1, 1) - self._away(X[:, self.knots]).square().sum(-1)
+        return self.min_distance.square().view(-1, 1, 1) - self.away(X[:, self.knots]).square().sum(-1)
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """By how much pairs are too close, m."""
-        return (self.min_distance.view(-1, 1, 1) - self._away(X[:, self.knots]).norm(dim=-1)).clamp(min=0.0)
+        return (self.min_distance.view(-1, 1, 1) - self.away(X[:, self.knots]).norm(dim=-1)).clamp(min=0.0)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         rows, (first, second) = torch.arange(len(self.pairs), device=X.device).unsqueeze(1), self.ends
         slopes = X.new_zeros(*g.shape, X.shape[-1])
-        slopes[..., rows, second] = 2.0 * self._away(X[:, self.knots])
+        slopes[..., rows, second] = 2.0 * self.away(X[:, self.knots])
         slopes[..., rows, first] = -slopes[..., rows, second]
         add = H.new_zeros(*g.shape[:2], *H.shape[2:])
         gradient = (g.unsqueeze(-1) * slopes).sum(-2)
@@ -84,14 +84,14 @@ class Separation(Constraint):
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where bodies touch at the start, (B,)."""
-        return (self._away(x0).norm(dim=-1) >= CONTACT_FACTOR * self.min_distance.unsqueeze(-1)).all(-1)
+        return (self.away(x0).norm(dim=-1) >= CONTACT_FACTOR * self.min_distance.unsqueeze(-1)).all(-1)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """Smallest distance (B,) to where bodies touch, both on the straight lines between their knots, m.
 
         They touch a `share` of the distance below it.
         """
-        away = self._away(X)
+        away = self.away(X)
         a, along = away[:, :-1], away.diff(dim=1)
         length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(X.dtype).tiny)
         nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
@@ -103,7 +103,7 @@ class Separation(Constraint):
         """The states (Q, d) of the two positions of each pair, once bound."""
         return self.positions[self.pairs[:, 0]], self.positions[self.pairs[:, 1]]
 
-    def _away(self, x: Tensor) -> Tensor:
+    def away(self, x: Tensor) -> Tensor:
         """Vectors (..., Q, d) between the two positions of each pair, from states (..., n)."""
         first, second = self.ends
         return x[..., first] - x[..., second]

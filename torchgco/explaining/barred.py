@@ -49,7 +49,10 @@ def _barred(problem: Problem, part: Obstacles) -> dict[str, Any] | None:
     start = problem.x0[0, problem.position].detach().cpu().double().numpy()
     goal = problem.goal.position[0].detach().cpu().double().numpy()
     radius, goal_radius = float(field.vehicle_radius[0]), float(problem.goal.radius[0])
-    passage = widest_passage(field.field, int(field.which[0]), start, goal, goal_radius, CONTACT_FACTOR * radius)
+    b, near = int(field.which[0]), radius - ADMITTED
+    if distance_within(field.field.source, field.field.unknown, b, start, radius) < near:
+        near = CONTACT_FACTOR * radius  # from so near a start it may leave
+    passage = widest_passage(field.field, b, start, goal, goal_radius, near)
     if passage is None:
         return None
     ends = {"start": start, "goal": goal}

@@ -24,7 +24,6 @@ from torchgco.obstacles.inputs import dimension, vehicle_radii
 Interpolation = Literal["smooth", "linear"]
 SEGMENT_STEPS = 0.5  # spacings of the lattice between points at which a segment's distance is looked up
 POINTS_AT_ONCE = 2**16  # points looked up together
-BOUND = 1e-8  # m: more than bounds of distances lie below them
 PIECE = 2**10  # of these along one segment
 
 
@@ -97,6 +96,7 @@ class BoundField(OwnKind):
     position: slice
     dt: float
     stops: Tensor | None = None  # (B,)
+    pieces: int = 1  # of a stage, which are what its knots are apart
 
     batched: ClassVar[tuple[str, ...]] = ("which", "origins", "vehicle_radius", "absent", "stops")
 
@@ -141,9 +141,13 @@ class BoundField(OwnKind):
         What a start, `start` (B,), m, away from the surface, has less than the full distance is no contact of the way
         that leads out of it, up to where other obstacles touch.
         """
-        depths = self.contact_depths.repeat(1, count)
-        depths[:, 0] = torch.maximum(depths[:, 0], torch.minimum(BOUND - start, TOUCH * self.vehicle_radius))
+        depths, first = self.contact_depths.repeat(1, count), slice(0, self.pieces)
+        beneath = torch.minimum(ADMITTED - start, TOUCH * self.vehicle_radius).unsqueeze(-1)
+        depths[:, first] = torch.maximum(depths[:, first], beneath)
         return depths
+
+    def in_pieces(self, count: int) -> Self:
+        return replace(super().in_pieces(count), pieces=count * self.pieces)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         if share is not None:

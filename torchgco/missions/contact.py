@@ -15,8 +15,9 @@ from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.judging.judge import CLEARANCES, by_kind
+from torchgco.maps.field import BoundField
 from torchgco.missions.planning_problem import airframe_of, planning_state
-from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.base import ADMITTED, TOUCH, Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
@@ -44,6 +45,9 @@ class Contact(PerElement):
         found = tuple(part for part in problem.constraints if isinstance(part, Obstacles))
         for part in found:
             by_kind(CLEARANCES, part)
+        maps = [isinstance(part.inscribed, BoundField) for part in found]  # flown at 0.95 of the radius, too
+        shrunk = (part.grown(ADMITTED - TOUCH * part.vehicle_radius) for part in found)
+        found = tuple(less if is_map else part for less, is_map, part in zip(shrunk, maps, found, strict=True))
         return cls(found, airframe_of(problem.dynamics) if any(isinstance(part, BoundBody) for part in found) else None)
 
     @property

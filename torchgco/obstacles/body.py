@@ -322,6 +322,9 @@ class BoundBody(Obstacles):
         within = torch.lerp(X[:, :-1].unsqueeze(2), X[:, 1:].unsqueeze(2), share).flatten(1, 2)
         return self.in_pieces(PIECES), torch.cat((within, X[:, -1:]), dim=1)
 
+    def in_pieces(self, count: int) -> Self:
+        return self._of_each(lambda part: part.in_pieces(count))
+
     def start_is_clear(self, x0: Tensor) -> Tensor:
         return torch.stack([ball.start_is_clear(P) for ball, P in self.each(x0)]).all(0)
 

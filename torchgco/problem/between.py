@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torchgco.constraints.separation import Separation
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.obstacles.base import ADMITTED, Obstacles
+from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
 PIECES_AT_MOST = 16  # of a stage: their chords are 256 times as close to a path as the stage's own
@@ -48,13 +49,19 @@ def bends(problem: Problem) -> bool:
 
 
 def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """How far the paths of trajectories X (B, N+1, n), U (B, N, m), leave their chords halfway, (B,), m."""
-    states = _measured(problem)
-    if not states or len(X) == 0:
-        return torch.zeros_like(X[:, 0, 0])
-    middle, ends = _within(problem, X, U, 2)[:, :, 0, states], X[..., states]
-    off = middle - 0.5 * (ends[:, :-1] + ends[:, 1:])
-    return off.square().sum(-1).amax(-1).sqrt()
+    """How far what is measured leaves the chords of trajectories X (B, N+1, n), U (B, N, m), halfway, (B,), m.
+
+    Of a body that is where its balls are, of pairs that keep a distance the vector between them.
+    """
+    off = torch.zeros_like(X[:, 0, 0])
+    parts = [one.bare for one in problem.constraints if isinstance(one.bare, Obstacles | Separation)]
+    if not parts or len(X) == 0:
+        return off
+    middle, even = _within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
+    for part in parts:
+        apart = _places(part, middle) - _places(part, even)
+        off = torch.maximum(off, apart.norm(dim=-1).flatten(1).amax(-1))
+    return off
 
 
 def paths(problem: Problem, X: Tensor, U: Tensor, off: Tensor | None = None) -> list[Paths]:
@@ -74,6 +81,9 @@ def paths(problem: Problem, X: Tensor, U: Tensor, off: Tensor | None = None) -> 
     found = []
     for count in pieces.unique().int().tolist():
         rows = (pieces == count).nonzero().flatten()
+        if count == 1:
+            found.append(Paths(rows, 1, X[rows]))
+            continue
         part = problem.take(rows)
         fine = torch.cat((X[rows, :-1].unsqueeze(2), _within(part, X[rows], U[rows], count)), dim=2).flatten(1, 2)
         found.append(Paths(rows, count, torch.cat((fine, X[rows, -1:]), dim=1)))
@@ -91,12 +101,10 @@ def _within(problem: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:
     return torch.where(problem.running[..., None, None], inner, X[:, :-1].unsqueeze(2))  # at rest after the last knot
 
 
-def _measured(problem: Problem) -> list[int]:
-    """The states whose distances count."""
-    found: set[int] = set()
-    for part in (constraint.bare for constraint in problem.constraints):
-        if isinstance(part, Obstacles):
-            found |= set(range(problem.n)[part.position])
-        elif isinstance(part, Separation):
-            found |= {int(i) for at in part.positions for i in at}
-    return sorted(found)
+def _places(part: Any, X: Tensor) -> Tensor:
+    """What is measured of states X (B, K, n), as vectors (B, K, P, d)."""
+    if isinstance(part, BoundBody):
+        return part.points.at(X)
+    if isinstance(part, Separation):
+        return part.away(X)
+    return X[..., part.position].unsqueeze(-2)

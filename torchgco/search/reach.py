@@ -51,7 +51,7 @@ def short_horizons(problem: Problem) -> str | None:
     return (
         f"{len(short)} of {problem.B} horizons are too short for the way to the goal (problem {named}): the first is "
         f"{float(far[first]):.3g} m long, of which {int(problem.stages[first])} stages cover at most "
-        f"{float(limit.reach(problem)[first]):.3g} m; {limit.advice(needed)}"
+        f"{float(limit.reach(problem)[first]):.3g} m; {limit.advice(first, needed)}"
     )
 
 
@@ -63,7 +63,7 @@ def beyond_reach(problem: Problem) -> Tensor:
     return found[1] > found[0].reach(problem) + problem.goal.radius
 
 
-def _limit_and_way(problem: Problem) -> tuple[Step | Push, Tensor] | None:
+def _limit_and_way(problem: Problem) -> tuple[Limit, Tensor] | None:
     """What limits the way within the horizon, and the way (B,) to a stated goal, m; None where nothing does."""
     goal = problem.goal
     if goal is None or goal.assumed or problem.B == 0 or problem.time is not None:
@@ -118,7 +118,7 @@ def horizon_of(problem: Problem) -> Horizon | None:
         if not math.isfinite(needed):
             return None
         stages, reach = int(problem.stages[0]), float(limit.reach(problem)[0])
-        return Horizon(float(far[0]), reach, stages, math.ceil(needed), limit.advice(math.ceil(needed)))
+        return Horizon(float(far[0]), reach, stages, math.ceil(needed), limit.advice(0, math.ceil(needed)))
 
 
 def within_reach(problem: Problem) -> Tensor:
@@ -128,47 +128,34 @@ def within_reach(problem: Problem) -> Tensor:
     return torch.ones_like(far).bool() if limit is None else far <= limit.reach(problem) + problem.goal.radius
 
 
-class Step(NamedTuple):
-    """The longest way of a stage, (B,), m."""
+class Limit(NamedTuple):
+    """What limits the way of each problem; infinite: nothing of that kind does."""
 
-    step: Tensor
+    step: Tensor  # the longest way of a stage, (B,), m
+    push: Tensor  # the largest increase of the speed, (B,), m/s^2; of problems without a longest step alone
 
-    def advice(self, N: int) -> str:
-        """Which horizon to take."""
-        return f"N = {N} would do at full speed"
-
-    def reach(self, problem: Problem) -> Tensor:
-        """The way (B,), m, that the horizon covers at most."""
-        return problem.stages * self.step
-
-    def stages(self, problem: Problem, way: Tensor) -> Tensor:
-        """The stages (B,) that ways (B,), m, take at least."""
-        return way / self.step
-
-
-class Push(NamedTuple):
-    """The largest increase of the speed, (B,), m/s^2."""
-
-    push: Tensor
-
-    def advice(self, N: int) -> str:
-        """Which horizon to take."""
+    def advice(self, b: int, N: int) -> str:
+        """Which horizon problem b should take."""
+        if math.isfinite(float(self.step[b])):
+            return f"N = {N} would do at full speed"
         return f"from rest to rest it takes N = {N} at full acceleration"
 
     def reach(self, problem: Problem) -> Tensor:
-        """The way (B,), m, on which a vehicle accelerates until the end of the horizon."""
-        time = problem.stages * float(problem.dynamics.dt)
-        u = problem.x0.new_zeros(problem.B, problem.m)
+        """The way (B,), m, that the horizon covers at most, or on which a vehicle accelerates until its end."""
+        time, u = problem.stages * float(problem.dynamics.dt), problem.x0.new_zeros(problem.B, problem.m)
+        by_steps = problem.stages * self.step
+        if not bool(torch.isfinite(self.push).any()):
+            return by_steps
         speed = problem.dynamics.field(problem.x0, u)[:, problem.position].square().sum(-1).sqrt()
-        return speed * time + 0.5 * self.push * time.square()
+        return torch.minimum(by_steps, speed * time + 0.5 * self.push * time.square())
 
     def stages(self, problem: Problem, way: Tensor) -> Tensor:
-        """The stages (B,) that ways (B,), m, take from rest to rest: half of each accelerating, half braking."""
-        return 2.0 * (way / self.push).sqrt() / float(problem.dynamics.dt)
+        """The stages (B,) that ways (B,), m, take at least; by a push half accelerating and half braking."""
+        return torch.maximum(way / self.step, 2.0 * (way / self.push).sqrt() / float(problem.dynamics.dt))
 
 
-def limit_of(problem: Problem, climbs: int = 0) -> Step | Push | None:
-    """What limits the way within a horizon, by the bounds on states and controls; None where nothing does.
+def limit_of(problem: Problem, climbs: int = 0) -> Limit | None:
+    """What limits the way within a horizon, by the bounds on states and controls; None where nothing can.
 
     The longest step is the greatest of samples and corners of what it depends on, which has bounds at all knots, after
     so many rounds of projected gradient ascent from each. So is the strongest push, where controls don't change the
@@ -178,10 +165,14 @@ def limit_of(problem: Problem, climbs: int = 0) -> Step | Push | None:
     box = _Box.of(problem)
     if box is None:
         return None
-    if bool(box.bounded[:, box.depends].all()):
-        return Step(_climbed(lambda z: _way(problem, z), box.z, box.least, box.most, climbs).amax(-1).sqrt())
-    push = _strongest(problem, box, climbs)
-    return None if push is None else Push(push)
+    fits = (box.bounded | ~box.depends).all(-1)
+    step = push = torch.full_like(problem.x0[:, 0], torch.inf)
+    if bool(fits.any()):
+        ways = _climbed(lambda z: _way(problem, z), box.z, box.least, box.most, climbs).amax(-1).sqrt()
+        step = torch.where(fits, ways, step)
+    if not bool(fits.all()) and problem.dynamics.is_integrated:
+        push = torch.where(fits, push, _strongest(problem, box, climbs))
+    return Limit(step, push) if bool(torch.isfinite(torch.minimum(step, push)).any()) else None
 
 
 class _Box(NamedTuple):
@@ -191,7 +182,7 @@ class _Box(NamedTuple):
     least: Tensor  # (B, 1, n + m)
     most: Tensor
     z: Tensor  # (B, 2 STEP_SAMPLES, n + m): samples, and corners
-    depends: Tensor  # (n + m,) bool: on what the way of a stage does
+    depends: Tensor  # (B, n + m) bool: on what the way of a stage does
 
     @classmethod
     def of(cls, problem: Problem) -> _Box | None:
@@ -204,24 +195,21 @@ class _Box(NamedTuple):
         least, most = (torch.where(bounded, *ends).unsqueeze(1) for ends in ((low, -WIDE), (high, WIDE)))
         z = least + share * (most - least)
         (slopes,) = gradients_at_once(lambda z: _way(problem, z), z)
-        depends = (slopes.abs() > INERT * slopes.abs().amax()).flatten(0, 1).any(0)
+        depends = (slopes.abs() > INERT * slopes.abs().amax((1, 2), keepdim=True)).any(1)
         return cls(bounded, least, most, torch.cat((z, least + (share > 0.5) * (most - least)), dim=1), depends)
 
 
-def _strongest(problem: Problem, box: _Box, climbs: int) -> Tensor | None:
-    """The strongest push, (B,), m/s^2; None where it isn't limited."""
-    if bool(box.depends[problem.n :].any()) or not problem.dynamics.is_integrated:
-        return None
+def _strongest(problem: Problem, box: _Box, climbs: int) -> Tensor:
+    """The strongest push, (B,), m/s^2; infinite where it isn't limited."""
     bounded, some = box.bounded.unsqueeze(1), box.z[:, ::FEWER]
     z = torch.cat([torch.where(bounded, some, scale * some) for scale in (1.0 / WIDER, 1.0, WIDER)], dim=1)
     low, near, far = _push(problem, z).unflatten(1, (3, -1)).amax(-1).unbind(1)
     near = torch.maximum(low, near)  # where drag grows with the speed, the slowest accelerate the most
-    if not bool((torch.isfinite(near) & (near > 0) & (far <= (1.0 + GROWN) * near)).all()):
-        return None
-    if climbs == 0:
-        return near
-    z = z[:, : 2 * some.shape[1]]
-    return torch.maximum(near, _climbed(lambda z: _push(problem, z), z, box.least, box.most, climbs).amax(-1))
+    limited = torch.isfinite(near) & (near > 0) & (far <= (1.0 + GROWN) * near) & ~box.depends[:, problem.n :].any(-1)
+    if climbs > 0 and bool(limited.any()):
+        z = z[:, : 2 * some.shape[1]]
+        near = torch.maximum(near, _climbed(lambda z: _push(problem, z), z, box.least, box.most, climbs).amax(-1))
+    return torch.where(limited, near, torch.inf)
 
 
 def _push(problem: Problem, z: Tensor) -> Tensor:

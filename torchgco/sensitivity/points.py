@@ -20,11 +20,10 @@ from torchgco.base.tree import copied, put, take
 from torchgco.kernels import chord_clearance, cost_unit, interior_of, measured
 from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.lagrangian.quality import leaves_goal
-from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.ending import STATIONARY
+from torchgco.solvers.ending import STATIONARY, judged_between, touches
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.session import Session
 
@@ -80,7 +79,7 @@ def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> P
     result = copied(replace(solution, trace=None, search=None, account=None))
     solved = (solution.status == Status.CONVERGED) | (solution.status == Status.FEASIBLE)
     # What only touches an obstacle between two knots is stationary for the rows at them all the same.
-    solved |= (solution.status == Status.INFEASIBLE) & (solution.violation <= ADMITTED)
+    solved |= touches(problem, solution)
     reason = torch.full_like(solution.status, int(Why.NOT_SOLVED))
     growth = torch.zeros_like(solution.cost)
     _polish(problem, solved.nonzero().flatten(), growth, result, reason, smoothing)
@@ -124,7 +123,8 @@ def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, re
         worst, more = measured(part.take(kept), best.X, best.U), old.iterations[kept] + end.iterations[kept]
         parts = {"X": best.X, "U": best.U, "multipliers": best.multipliers, "cost": best.cost}
         if smoothing > 0:  # constraints hold, but it is another cost that can't be improved
-            parts["status"] = torch.full_like(more, int(Status.FEASIBLE))
+            status = torch.full_like(more, int(Status.FEASIBLE))
+            parts["status"] = judged_between(part.take(kept), best.X, best.U, status)
         put(result, rows[kept], replace(old.take(kept), **parts, violation=worst, iterations=more))
 
 

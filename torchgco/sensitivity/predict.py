@@ -22,6 +22,7 @@ from torchgco.sensitivity.function import System
 from torchgco.sensitivity.points import Points, gains_of, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
+from torchgco.solvers.ending import judged_between
 
 CROSSED = 1e-6  # by more than this a row that didn't hold is violated (the interior point's violation_tolerance)
 
@@ -89,6 +90,7 @@ def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:
     reason = torch.where(_rows_change(problem, at, X, U, lam) & holds, int(Why.ROWS_CHANGE), at.reason)
     worst = measured(problem, X, U)
     status = torch.where(worst <= ADMITTED, int(Status.FEASIBLE), int(Status.INFEASIBLE))
+    status = judged_between(problem, X, U, status)
     sizes = [part[0].numel() for part in old.multipliers.lam]
     parts = zip(lam.split(sizes, dim=1), old.multipliers.lam, strict=True)
     none = torch.zeros_like(old.iterations)

@@ -18,7 +18,10 @@ from torchgco.ilqr.riccati import BackwardPass
 from torchgco.judging.gates import passes
 from torchgco.kernels import cost_scale, cost_unit, kernels_of, path_clearance
 from torchgco.lagrangian.lagrangian import Lagrangian, binding
+from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
@@ -130,6 +133,16 @@ def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Te
     status = status.clone()
     status[rows[bad]] = int(Status.INFEASIBLE)
     return status
+
+
+def touches(problem: Problem, found: Solution) -> Tensor:
+    """Which trajectories (B,) are INFEASIBLE only because they touch an obstacle between two knots."""
+    touching = (found.status == Status.INFEASIBLE) & (found.violation <= ADMITTED)
+    rows = touching.nonzero().flatten()
+    if rows.numel() > 0:
+        times = None if found.times is None else found.times[rows]
+        touching[rows] = path_clearance(*at_times(problem.take(rows), found.X[rows], found.U[rows], times)) < 0
+    return touching
 
 
 def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:

@@ -211,7 +211,9 @@ def _radius(usual: float, _root_: Any) -> float:
 def _pace(usual: float | None, _root_: Any) -> float | None:
     """The mean speed that horizons have room for, m/s, lower for vehicles that are slower than 1 m/s."""
     speed = OmegaConf.select(_root_, "model.vehicle.speed")
-    return usual if speed is None else (usual or DRAWN_PACES[2]) * min(1.0, float(speed))
+    if not isinstance(speed, int | float):  # none, or what the vehicle will refuse by its own name
+        return usual
+    return (usual or DRAWN_PACES[2]) * min(1.0, float(speed))
 
 
 def _help(_root_: Any) -> str:
