@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from tests.baselines.test_casadi import PLUGINS, three_problems
+from tests.slow import mostly
 from torchgco import Field, InputError, Problem, Status, solve
 from torchgco.baselines import CasADiSolver
 from torchgco.baselines.limited import limited
@@ -45,7 +46,7 @@ class HangsAt:
         return self.function.stats()
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", mostly([False, True], False))
 @pytest.mark.parametrize(("plugin", "place"), [("ipopt", 2), ("fatrop", 0)])
 def test_a_problem_that_hangs_ends_alone(plugin: str, place: int, own: bool) -> None:
     """By the limit of the whole solve, and by that of each problem; the others have the same bits as without one."""
@@ -118,7 +119,7 @@ limited(work, 600.0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a child of a killed process ends with its time")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", mostly([signal.SIGINT, signal.SIGTERM, signal.SIGKILL], signal.SIGTERM))
 def test_no_process_outlives_its_parent(number: signal.Signals) -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as parent:
         assert parent.stdout is not None
