@@ -25,8 +25,8 @@ def contacts(
 ) -> np.ndarray:
     """Places (C, d) where a path (K, d), m, touches obstacles of a batch of one: the deepest of each contact.
 
-    Bodies touch where the judge has it; between the knots, `dt` seconds apart, the path
-    is straight, and the states (K, n) change evenly, which the attitude of a `Body` depends on.
+    Bodies touch where the judge has it; between the knots, `dt` seconds apart, the path is straight, and the states
+    (K, n) change evenly, which the attitude of a `Body` depends on.
 
     Raises:
         InputError: a body without states.
