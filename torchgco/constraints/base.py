@@ -99,6 +99,55 @@ class Constraint(PerElement):
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)
 
 
+class Distance(Constraint):
+    """A constraint that keeps bodies apart: obstacles, and positions that keep a distance from each other.
+
+    P places of a state, points (B, K, P, d) or vectors between two of them, keep distances from M surfaces each.
+    """
+
+    contact_depths: Any  # (B, P M): how deep beneath the full surfaces bodies touch, m
+
+    def places(self, X: Tensor) -> Tensor:
+        """The places (B, K, P, d), m, of states X (B, K, n)."""
+        raise undefined(self, "places")
+
+    def even_bulge(self, X: Tensor) -> Tensor:
+        """How far places leave their straight lines, m, (B|1, K-1|1, P), where states X (B, K, n) change evenly."""
+        return X.new_zeros(1, 1, 1)
+
+    def measured(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances of states X (B, K, n), k dt apart, as the judge and the certificate take them, m.
+
+        At each state, (B, K, P M), and lower bounds along the straight ways of places between them, (B, K - 1, P M),
+        from the full surfaces: see `obstacles/measured.py`.
+        """
+        raise undefined(self, "measured")
+
+    def clearances(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        """The smallest of these (B,) to where bodies touch: at the states, and there and between; infinite without."""
+        at, between = (least(part + self.contact_depths.unsqueeze(1)) for part in self.measured(X))
+        return at, torch.minimum(at, between)
+
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
+        """Smallest distance (B,) of the straight lines between knots from where bodies touch, m; negative in contact.
+
+        As solvers measure it. Counted from a `share` of the margin beneath the full surface, by default from where
+        bodies touch; infinite where there is no obstacle.
+        """
+        raise undefined(self, "chord_clearance")
+
+    def in_pieces(self, count: int) -> Self:
+        """The same for states at the ends of `count` pieces of each stage."""
+        return self
+
+
+def least(distances: Tensor) -> Tensor:
+    """The smallest of distances (B, K, M) per problem, (B,); infinite where there is none."""
+    if distances.shape[1] == 0 or distances.shape[2] == 0:
+        return distances.new_full(distances.shape[:1], torch.inf)
+    return distances.flatten(1).amin(-1)
+
+
 @dataclass(frozen=True)
 class WrappedConstraint(Constraint):
     """A constraint with kind and knots of another one, in a form of the problem with other rows."""

@@ -16,7 +16,8 @@ from torchgco.base.shapes import MISTAKES, Dimensions
 from torchgco.constraints.base import ADMITTED as ADMITTED
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
-from torchgco.constraints.base import Constraint, add_at, count_of
+from torchgco.constraints.base import Distance, add_at, count_of
+from torchgco.constraints.base import least as least
 
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
 TINY = 1e-12  # what is divided by is at least this: lengths and their squares in the search for paths
@@ -67,7 +68,7 @@ class Solids:
         return (reduce(torch.add, axes) < limit).any(-1)
 
 
-class Obstacles(Constraint):
+class Obstacles(Distance):
     """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.
 
     Distances count from the full surface, the obstacle's own grown by the vehicle's radius: positive outside, negative
@@ -79,6 +80,7 @@ class Obstacles(Constraint):
         bind, value, at, accumulate           as any constraint; `grown` too, or its chords can't be repaired
         absent, margins                       which obstacles there are, and their lengths
         signed_distance, segment_clearance    distances of points and of segments
+        measured                              the same by separate code, for the judge and the certificate
 
     and it may define
 
@@ -88,8 +90,7 @@ class Obstacles(Constraint):
         chosen                                some of its obstacles: without it none is left out of a search
         sizes, start_is_clear                 where the margins don't say enough
 
-    The judge and the certificate measure distances by separate code, to which a kind is added in `judge.CLEARANCES` and
-    `certificate.CHORDS`. Kernels in C are optional.
+    Kernels in C are optional.
     """
 
     geometric: ClassVar[bool] = True
@@ -162,6 +163,9 @@ class Obstacles(Constraint):
         """
         raise undefined(self, "segment_clearance")
 
+    def places(self, X: Tensor) -> Tensor:
+        return X[..., self.position].unsqueeze(-2)
+
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
@@ -175,11 +179,7 @@ class Obstacles(Constraint):
         return self.contact_depths if share is None else share * self.margins
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
-        """Smallest distance (B,) from the straight lines between knots to obstacles, m; negative inside of them.
-
-        Counted from a `share` of the margin beneath the full surface, by default from where bodies touch; infinite
-        where there is no obstacle. Obstacles that move override this.
-        """
+        """As of `Distance`; obstacles that move override this."""
         p = X[..., self.position]
         return least(self.segment_clearance(p[:, :-1], p[:, 1:]) + self.beneath(share).unsqueeze(1))
 
@@ -204,7 +204,6 @@ class Obstacles(Constraint):
         return replace(self, dt=dt)  # type: ignore[type-var]
 
     def in_pieces(self, count: int) -> Self:
-        """The same obstacles for states at the ends of `count` pieces of each stage."""
         part = self if self.stops is None else self.stopping_at(count * self.stops)
         return part.with_step(part.dt / count) if part.moving else part
 
@@ -263,13 +262,6 @@ def warn_of_small(obstacles: Obstacles, field: str) -> None:
         text = f"an obstacle of {float(sizes.min()):.3g} m is too small for violations of up to {ADMITTED:g} m"
         text += ", which count as feasible: scale the problem, or are its lengths not in metres?"
         warnings.warn(f"{field}: {text}", ScaleWarning, stacklevel=6)
-
-
-def least(distances: Tensor) -> Tensor:
-    """The smallest of distances (B, K, M) per problem, (B,); infinite where there is none."""
-    if distances.shape[1] == 0 or distances.shape[2] == 0:
-        return distances.new_full(distances.shape[:1], torch.inf)
-    return distances.flatten(1).amin(-1)
 
 
 def picked(values: Tensor, at: Tensor) -> Tensor:

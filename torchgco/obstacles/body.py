@@ -17,6 +17,7 @@ from torchgco.base.tree import PerElement, passed_on
 from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.obstacles.attitude import Attitude, attitude_of
 from torchgco.obstacles.base import Obstacles, Solids, places_of
+from torchgco.obstacles.measured import Distances
 
 if TYPE_CHECKING:
     from torchgco.constraints.base import Constraint
@@ -293,6 +294,24 @@ class BoundBody(Obstacles):
         part, X = (self if near is None else self.chosen(near)).finer(X)
         found = [ball.chord_clearance(P, share) for ball, P in part.each(X)]
         return (torch.stack(found, dim=-1) - part.points.bulge(X).amax(1)).amin(-1)
+
+    def places(self, X: Tensor) -> Tensor:
+        return self.points.at(X)
+
+    def even_bulge(self, X: Tensor) -> Tensor:
+        return self.points.bulge(X)
+
+    def measured(self, X: Tensor) -> Distances:
+        at, ways = zip(*(ball.measured(P) for ball, P in self.each(X)), strict=True)
+        return torch.cat(at, dim=-1), torch.cat(ways, dim=-1)
+
+    def clearances(self, X: Tensor) -> Distances:
+        """As of all obstacles, between the knots from states a part of a step apart, which change evenly."""
+        fine, states = self.finer(X)
+        bulge = fine.points.bulge(states).amax(1)
+        at = torch.stack([ball.clearances(P)[0] for ball, P in self.each(X)]).amin(0)
+        ways = [ball.clearances(P)[1] - bulge[:, i] for i, (ball, P) in enumerate(fine.each(states))]
+        return at, torch.minimum(at, torch.stack(ways).amin(0))
 
     def _nearest(self, X: Tensor, share: float | None) -> Tensor | None:
         """Places (B, M') of those that may be the nearest to a ball on its way along X; None of a kind that can't say.

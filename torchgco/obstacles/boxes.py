@@ -17,6 +17,7 @@ from torchgco.obstacles.base import ABSENT, OwnKind, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, points, rows, vehicle_radii
+from torchgco.obstacles.measured import Distances, box_distances
 
 BOX_GAPS_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
@@ -153,6 +154,9 @@ class BoundBoxes(OwnKind):
         k, e, j = ((apart <= most.view(-1, 1, 1)) & here).nonzero(as_tuple=True)
         apart[k, e, j] = boxes.segment_distance((k, e, j), a, b)
         return apart
+
+    def measured(self, X: Tensor) -> Distances:
+        return box_distances(self, X[:, :, None, self.position] - self.centers.unsqueeze(1))
 
     def grown(self, by: Tensor) -> Self:
         more = torch.where(self.absent, 0.0, by.unsqueeze(-1))

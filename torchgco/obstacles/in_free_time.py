@@ -16,6 +16,7 @@ from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import passed_on
 from torchgco.constraints.norms import NO_ROW
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.measured import Distances
 from torchgco.obstacles.spheres import BoundSpheres
 
 
@@ -82,6 +83,9 @@ class SpheresInFreeTime(Obstacles):
 
     def distances(self, X: Tensor) -> Tensor:
         return self.along(X).distances(X)
+
+    def measured(self, X: Tensor) -> Distances:
+        return self.along(X).measured(X)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         return self.along(X).chord_clearance(X, share)

@@ -19,6 +19,7 @@ from torchgco.constraints.base import Constraint, add_at, resolve_knots
 from torchgco.obstacles.base import TOUCH, OwnKind, Solids, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, points, vehicle_radii
+from torchgco.obstacles.measured import Distances, sphere_distances
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,13 @@ class BoundSpheres(OwnKind):
         o = self.centers.unsqueeze(1)
         gap = _from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.inflated_radii.unsqueeze(1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
+
+    def measured(self, X: Tensor) -> Distances:
+        away = X[:, :, None, self.position] - self.centers.unsqueeze(1)
+        if self.velocities is not None:
+            t = self.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1, 1)
+            away = away - t * self.velocities.unsqueeze(1)
+        return sphere_distances(away, self.inflated_radii, self.absent)
 
     def grown(self, by: Tensor) -> Self:
         radii = torch.where(self.absent, self.inflated_radii, self.inflated_radii + by.unsqueeze(-1))
