@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown, undefined
+from torchgco.base.numbers import Number, numbers_of_fields
 from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
@@ -85,6 +86,14 @@ class Constraint(PerElement):
         if isinstance(self.knots, slice):
             return self.knots.start <= k < self.knots.stop
         return bool((self.knots == k).any())
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        """Its numbers, which a compiled problem writes; `where` it is in the problem, such as "constraints[1]"."""
+        return numbers_of_fields(self, where, place)
+
+    def remade(self) -> Constraint:
+        """The same with what is computed from its numbers as they are now."""
+        return self
 
     def grown(self, by: Tensor) -> Self:
         """The same constraint with more distance from its obstacles by `by` (B,), m; itself where it keeps none."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.numbers import Floats, Number, Wrong, crossed, numbers, numbers_of_fields
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, check_shape, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots
 
@@ -55,6 +57,26 @@ class _Bounds(Constraint):
         if count_of(above, size) + count_of(below, size) == 0:
             raise InputError(name, "at least one finite bound", "none")
         return replace(self, lower=lower, upper=upper, knots=knots, above=above, below=below)
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        fields = {side: (getattr(self, side), partial(self._check_new, side=side)) for side in ("lower", "upper")}
+        joint = crossed(self, where, np.greater, "lower bounds of at most the upper ones")
+        found = numbers(where, fields, place, joint=joint)
+        for number, none in zip(found, (-np.inf, np.inf), strict=True):
+            number.none = none
+        return found
+
+    def _check_new(self, new: Floats, side: str) -> Wrong:
+        sign = 1.0 if side == "lower" else -1.0
+        bounded = np.zeros(self.lower.shape[-1], dtype=bool)
+        bounded[self.below if side == "lower" else self.above] = True
+        free = new[..., ~bounded]
+        if np.isnan(new).any() or (new == sign * np.inf).any():
+            return f"numbers or {-sign * np.inf}", new.tolist()
+        if np.isfinite(free).any():
+            expected = "infinity in components that were infinite when the problem was compiled; give them 1e9 then"
+            return expected, float(free[np.isfinite(free)][0])
+        return None
 
     @property
     def _first_knot(self) -> int:
@@ -260,6 +282,9 @@ class RateBounds(_Bounds):
             return (U - X[:, :-1, self.states])[:, self.knots]
         first = U[:, :1] if self.previous is None else self.previous.unsqueeze(1).expand(U.shape[0], 1, -1)
         return (U - torch.cat((first, U[:, :-1]), dim=1))[:, self.knots]
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        return numbers_of_fields(self, where, place)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         if self.states is None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Number, above_zero, directions, finite, numbers
 from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
 from torchgco.constraints.base import ADMITTED, Constraint, whole
 from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
@@ -103,6 +104,12 @@ class GateBalls(NormBounds):
         """Their radii (B, G), m."""
         return self.upper.gather(1, self.places - 1)
 
+    def numbers(self, where: str, place: int) -> list[Number]:
+        """Of gates, which keep their knots."""
+        centers, radii = self.centers, self.sizes
+        fields = {"centers": (centers, finite), "radius": (radii, above_zero)}
+        return numbers("gates", fields, place, after=lambda: self.write(centers, radii))
+
     def write(self, centers: Tensor, sizes: Tensor) -> None:
         """Put other gates (B, G, d) of other radii (B, G) in the places of these, in this memory."""
         self.center.scatter_(1, (self.places - 1).unsqueeze(-1).expand_as(centers), centers)
@@ -136,6 +143,12 @@ class GateSquares(Vectors):
         bound = replace(self, slopes=slopes, limits=limits, knots=slice(1, dims.N + 1))
         bound.write()
         return bound
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        normals = self.axes[:, :, 0].clone()
+        fields = {"centers": (self.centers, finite), "half_widths": (self.half_widths, above_zero)}
+        found = numbers("gates", fields, place, after=self.write)
+        return found + numbers("gates", {"normals": (normals, directions)}, place, after=lambda: self.write(normals))
 
     def write(self, normals: Tensor | None = None) -> None:
         """Make the rows of the centres and half widths as they are, and of other normals (B, G, d), in this memory."""

@@ -7,11 +7,23 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import (
+    Check,
+    Number,
+    above_zero_or_infinite,
+    angles,
+    crossed,
+    directions,
+    finite,
+    lengths,
+    numbers,
+)
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, tensor
 from torchgco.constraints.base import Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
@@ -43,6 +55,17 @@ class Vectors(Constraint):
         x, u = ((gradient, curvature), (None, None)) if self.of == "x" else ((None, None), (gradient, curvature))  # type: ignore[attr-defined]
         add_blocks(add, X.shape[-1], x[0], u[0], x[1], u[1])
         H[:, self.knots] += add
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        checks: dict[str, Check] = {
+            "lower": lengths, "upper": above_zero_or_infinite, "center": finite, "apex": finite, "angle": angles,
+            "axis": directions,
+        }  # fmt: skip
+        both = all(getattr(self, side, None) is not None for side in ("lower", "upper"))
+        joint = crossed(self, where, np.greater_equal, "lower bounds below the upper ones") if both else None
+        given = {field: getattr(self, field) for field in self.per_element if field in checks}
+        fields = {field: (tensor, checks[field]) for field, tensor in given.items() if tensor is not None}
+        return numbers(where, fields, place, joint=joint)
 
     def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
         """The derivatives (B, K, p, c) of the rows by the components."""

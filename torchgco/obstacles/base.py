@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.base.brief import brief
 from torchgco.base.errors import ScaleWarning, undefined
+from torchgco.base.numbers import Number
 from torchgco.base.shapes import MISTAKES, Dimensions
 from torchgco.constraints.base import ADMITTED as ADMITTED
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
@@ -166,6 +168,16 @@ class Obstacles(Distance):
     def places(self, X: Tensor) -> Tensor:
         return X[..., self.position].unsqueeze(-2)
 
+    def numbers(self, where: str, place: int) -> list[Number]:
+        return self.numbers_of(where, place, ())
+
+    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+        """The same where `others`, the same obstacles of other balls of a body, have the numbers, too; by default none.
+
+        Absent obstacles are padding: where there are any, which are there isn't a number, and none can be written.
+        """
+        return []
+
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
@@ -262,6 +274,16 @@ def warn_of_small(obstacles: Obstacles, field: str) -> None:
         text = f"an obstacle of {float(sizes.min()):.3g} m is too small for violations of up to {ADMITTED:g} m"
         text += ", which count as feasible: scale the problem, or are its lengths not in metres?"
         warnings.warn(f"{field}: {text}", ScaleWarning, stacklevel=6)
+
+
+def copied(whole: Tensor, others: Sequence[Tensor]) -> Callable[[], None] | None:
+    """What copies a number into the memory of others; None where there are none."""
+
+    def copy() -> None:
+        for other in others:
+            other.copy_(whole)
+
+    return copy if others else None
 
 
 def picked(values: Tensor, at: Tensor) -> Tensor:

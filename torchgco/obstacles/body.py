@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Number
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement, passed_on
 from torchgco.constraints.base import CONTACT_FACTOR
@@ -359,6 +360,12 @@ class BoundBody(Obstacles):
     def chosen(self, at: Tensor) -> Self:
         """With the obstacles at places (B, M') alone, of all balls."""
         return self._of_each(lambda part: part.chosen(at))
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        return self.inner.numbers_of(where, place, self.balls)
+
+    def remade(self) -> Self:
+        return self._of_each(lambda part: part.remade())
 
     def grown(self, by: Tensor) -> Self:
         return self._of_each(lambda part: part.grown(by))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -9,11 +10,12 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.numbers import Number, numbers, present
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.obstacles.attitude import in_plane
-from torchgco.obstacles.base import ABSENT, OwnKind, picked
+from torchgco.obstacles.base import ABSENT, OwnKind, copied, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, points, rows, vehicle_radii
@@ -170,6 +172,12 @@ class BoundBoxes(OwnKind):
         for name in ("centers", "half_sizes", "inflated_radii", "depths"):
             parts[name] = parts[name].masked_fill(absent.view(*absent.shape, *([1] * (parts[name].dim() - 2))), 0.0)
         return replace(self, absent=absent, **parts)
+
+    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+        if bool(self.absent.any()):
+            return []
+        after = copied(self.centers, [other.centers for other in others])
+        return numbers(where, {"centers": (self.centers, present)}, place, after=after)
 
     def inflated(self) -> Cuboids:
         return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)

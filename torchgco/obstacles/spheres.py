@@ -7,6 +7,7 @@ Gauss-Newton Hessian are products of the weights with moments of o and v in the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -14,9 +15,10 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.numbers import Number, lengths, numbers, present
 from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of
 from torchgco.constraints.base import Constraint, add_at, resolve_knots
-from torchgco.obstacles.base import TOUCH, OwnKind, Solids, least, picked
+from torchgco.obstacles.base import TOUCH, OwnKind, Solids, copied, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, points, vehicle_radii
 from torchgco.obstacles.measured import Distances, sphere_distances
@@ -197,6 +199,23 @@ class BoundSpheres(OwnKind):
         names = "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "knots", "position", "dt"
         numbers: dict[str, Any] = {name: getattr(self, name) for name in names} | changes
         return replace(self.prepare(**numbers), stops=self.stops)
+
+    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+        if bool(self.absent.any()):
+            return []
+        found = []
+        for name in ("centers",) if self.velocities is None else ("centers", "velocities"):
+            whole = getattr(self, name)
+            after = copied(whole, [getattr(other, name) for other in others])
+            found += numbers(where, {name: (whole, present)}, place, bool(others), after)
+        radii = self.inflated_radii - self.vehicle_radius.unsqueeze(-1)
+
+        def inflate() -> None:
+            for part in (self, *others):
+                torch.add(radii, part.vehicle_radius.unsqueeze(-1), out=part.inflated_radii)
+
+        sizes = {"radii": (radii, lengths)} | ({} if others else {"vehicle_radius": (self.vehicle_radius, lengths)})
+        return found + numbers(where, sizes, place, after=inflate)
 
     def inflated(self) -> Solids | None:
         return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
