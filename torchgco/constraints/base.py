@@ -23,6 +23,8 @@ CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners k
 TOUCH = 1.0 - CONTACT_FACTOR  # the same, as a share beneath the full surface
 ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
 
+NO_ROW = -1.0  # the row of a bound that one problem of a batch doesn't have
+
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor
 
@@ -91,9 +93,50 @@ class Constraint(PerElement):
         """Its numbers, which a compiled problem writes; `where` it is in the problem, such as "constraints[1]"."""
         return numbers_of_fields(self, where, place)
 
+    @property
+    def in_metres(self) -> bool:
+        """Whether violations are lengths."""
+        return self.geometric
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        """A row at a knot in words."""
+        return f"row {row}"
+
+    def by_obstacle(self, rows: Tensor) -> Tensor:
+        """Of each obstacle whether any of its rows (..., p) is marked; of each row, where every row is one's own."""
+        return rows
+
     def remade(self) -> Constraint:
         """The same with what is computed from its numbers as they are now."""
         return self
+
+    def with_more(self, n: int, m: int) -> Constraint:
+        """The same rows in a form of the problem with further states and controls after the first n and m."""
+        return FirstRows(self, n, m)
+
+    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
+        """The same where state n is the factor of time, followed by controls, and `later` factors are to be chosen."""
+        return FirstRowsInTime(self, n, m)
+
+    def paced(self, factor: Tensor) -> Constraint:
+        """The same for obstacles that move `factor` (B,) times as far from knot to knot."""
+        return self
+
+    def at_factor(self, factor: Tensor) -> Constraint:
+        """The same of a form `in_free_time` whose factor (B,) is held."""
+        return self
+
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Constraint:
+        """The same in a form where states are held after each problem's last knot, `horizon` (B,).
+
+        Args:
+            counts: at which of its knots rows count, (B, K), 1 or 0; those of knot N may stand for the last knot.
+            where: the constraint's name in errors.
+
+        Raises:
+            InputError: a constraint that can't end early.
+        """
+        return CountedRows(self, counts)
 
     def grown(self, by: Tensor) -> Self:
         """The same constraint with more distance from its obstacles by `by` (B,), m; itself where it keeps none."""
@@ -171,6 +214,73 @@ class WrappedConstraint(Constraint):
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, constraint=self.constraint.grown(by))
+
+
+@dataclass(frozen=True)
+class FirstRows(WrappedConstraint):
+    """A constraint on the first n states and m controls."""
+
+    n: int
+    m: int
+
+    batched: ClassVar[tuple[str, ...]] = ("constraint",)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.value(X[..., : self.n], U[..., : self.m])
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.violation(X[..., : self.n], U[..., : self.m])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self.constraint.at(x[..., : self.n], k)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        X_own, U_own = X[..., : self.n], U[..., : self.m]
+        add_first(H, X, self.n, self.m, lambda blocks: self.constraint.accumulate(X_own, U_own, g, h, blocks))
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        return self.constraint.start_is_clear(x0[:, : self.n])
+
+
+class FirstRowsInTime(FirstRows):
+    """Rows of the first states and controls that kernels in C measure, too."""
+
+    keeps_rows: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class CountedRows(WrappedConstraint):
+    """A constraint whose rows count at some of its knots."""
+
+    counts: Tensor  # (B, K): 1 where they count, else 0
+
+    batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else NO_ROW)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._where(self.constraint.violation(X, U), 0.0)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        rows, knots = self.constraint.at(x, k), self.knots
+        place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
+        return torch.where(self.counts[:, place, None, None] > 0, rows, NO_ROW)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)
+
+    def _where(self, rows: Tensor, other: float) -> Tensor:
+        return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
+
+
+def add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
+    """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
+    blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
+    write(blocks)
+    one = X.shape[-1]
+    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
+    H[..., own.unsqueeze(-1), own] += blocks
 
 
 def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
@@ -258,6 +368,16 @@ class FunctionConstraint(Constraint):
             raise InputError(f"{self.name}.function", f"a function of {' and '.join(self.of)}", shown(self.function))
         values = bound_values(self.values, self.knot_values, (self.function,), dims, self.name)
         return replace(self, knots=knots, values=values)
+
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Constraint:
+        knots = torch.arange(N + 1, device=horizon.device)[self.knots]
+        stands = (counts > 0) & (knots == N) & (horizon < N).unsqueeze(-1)
+        if not bool(stands.any()):
+            return CountedRows(self, counts)
+        if asks_for_knot(self.function):
+            expected = "a function without an argument k at the last knots: `knot_values` serve"
+            raise InputError("horizon", expected, f"one with it in {where}")
+        return CountedRows(replace(self, values=self.values.ending_at(horizon)), counts)
 
     @property
     def reads_knots(self) -> bool:

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Number, above_zero, directions, finite, numbers
 from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
-from torchgco.constraints.base import ADMITTED, Constraint, whole
-from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
+from torchgco.constraints.base import ADMITTED, NO_ROW, Constraint, whole
+from torchgco.constraints.norms import NormBounds, Vectors
 
 # How far, m, a square's plane lies behind and ahead of the knots between which it is crossed: a trajectory that is
 # feasible within the tolerance is still that tolerance away on each side, so that none can stand in the plane.
@@ -93,6 +93,7 @@ class GateBalls(NormBounds):
     per_element: ClassVar[tuple[str, ...]] = ()
     name: ClassVar[str] = "gates"
     label: ClassVar[str] = "gates"
+    in_metres: ClassVar[bool] = True  # type: ignore[misc]
 
     @property
     def centers(self) -> Tensor:
@@ -103,6 +104,9 @@ class GateBalls(NormBounds):
     def sizes(self) -> Tensor:
         """Their radii (B, G), m."""
         return self.upper.gather(1, self.places - 1)
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"the radius of gate {int((self.places[0] == knot).nonzero()[0]) + 1}"
 
     def numbers(self, where: str, place: int) -> list[Number]:
         """Of gates, which keep their knots."""
@@ -131,6 +135,7 @@ class GateSquares(Vectors):
     batched: ClassVar[tuple[str, ...]] = ("centers", "axes", "half_widths", "places", "slopes", "limits")
     of: ClassVar[str] = "x"
     name: ClassVar[str] = "gates"
+    in_metres: ClassVar[bool] = True  # type: ignore[misc]
 
     @property
     def sizes(self) -> Tensor:
@@ -143,6 +148,13 @@ class GateSquares(Vectors):
         bound = replace(self, slopes=slopes, limits=limits, knots=slice(1, dims.N + 1))
         bound.write()
         return bound
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        off = knot - self.places[0]
+        at = (off == 0) | (off == 1)
+        what = "side" if row > 0 and bool(at.any()) else "plane"
+        at = at if bool(at.any()) else off == (2 if row > 0 else -1)
+        return f"the {what} of gate {int(at.nonzero()[0]) + 1}"
 
     def numbers(self, where: str, place: int) -> list[Number]:
         normals = self.axes[:, :, 0].clone()

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from torchgco.base.brief import brief
-from torchgco.base.errors import ScaleWarning, undefined
+from torchgco.base.errors import InputError, ScaleWarning, undefined
 from torchgco.base.numbers import Number
 from torchgco.base.shapes import MISTAKES, Dimensions
+from torchgco.base.tree import field_names
 from torchgco.constraints.base import ADMITTED as ADMITTED
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
@@ -178,6 +179,9 @@ class Obstacles(Distance):
         """
         return []
 
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"obstacle {row}"
+
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
@@ -206,6 +210,24 @@ class Obstacles(Distance):
             return rows
         knots = torch.arange(count, device=rows.device)[self.knots]
         return rows.masked_fill((knots > self.stops.unsqueeze(-1)).unsqueeze(-1), other)
+
+    def with_more(self, n: int, m: int) -> Self:
+        return self
+
+    def in_free_time(self, n: int, m: int, later: int) -> Obstacles:
+        return self
+
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Self:
+        """Obstacles that don't count after the last knots; those of knot N alone meet the state of the last knot."""
+        late = torch.arange(N + 1, device=horizon.device)[self.knots].tolist()
+        if late == [N] and not self.moving:
+            return self
+        if N in late and not all(self.holds_at(int(h)) for h in horizon.unique()):
+            raise InputError("horizon", f"last knots at which {where} holds", horizon.unique().tolist())
+        if "stops" not in field_names(type(self.inscribed)):
+            got = type(self.inscribed).__name__
+            raise InputError("horizon", "obstacles that are Spheres, Boxes, Capsules or a Field", got)
+        return self.stopping_at(horizon)
 
     def stopping_at(self, knots: Tensor) -> Self:
         """The same obstacles, which don't count, and don't move, after each problem's knot (B,)."""

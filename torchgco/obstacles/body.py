@@ -361,6 +361,12 @@ class BoundBody(Obstacles):
         """With the obstacles at places (B, M') alone, of all balls."""
         return self._of_each(lambda part: part.chosen(at))
 
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return "ball {}, obstacle {}".format(*divmod(row, self.inner.absent.shape[1]))
+
+    def by_obstacle(self, rows: Tensor) -> Tensor:
+        return rows.unflatten(-1, (len(self.balls), -1)).any(-2)
+
     def numbers(self, where: str, place: int) -> list[Number]:
         return self.inner.numbers_of(where, place, self.balls)
 

@@ -126,6 +126,10 @@ class GoalBall(NormBounds):
 
     name: ClassVar[str] = "goal"
     label: ClassVar[str] = "goal"
+    in_metres: ClassVar[bool] = True  # type: ignore[misc]
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return "its radius"
 
     def numbers(self, where: str, place: int) -> list[Number]:
         centre, radius = self.center[:, 0], self.upper[:, 0]
@@ -152,6 +156,9 @@ class GoalState(Constraint):
     def bind(self, dims: Dimensions) -> Self:
         components = (~torch.isnan(self.state[0])).nonzero().flatten()
         return replace(self, components=components, knots=slice(dims.N, dims.N + 1))
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"state {self.components.tolist()[row]}"  # type: ignore[union-attr]
 
     def numbers(self, where: str, place: int) -> list[Number]:
         return numbers("goal", {"state": (self.state, self._check_new)}, place)
