@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers
-from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.kernels import cost_unit, current, interior_of
@@ -41,7 +40,7 @@ class KeptInTime(Kept):
         super().__init__(kernels, whole.in_cost_units(), **options)
         self._given = user.x0.numpy()
         pairs = zip(user.constraints, whole.constraints, strict=False)
-        self._copied_parts = {i for i, (a, b) in enumerate(pairs) if isinstance(a, RateBounds) or _differ(a, b)}
+        self._copied_parts = {i for i, (a, b) in enumerate(pairs) if a.joins_knots or _differ(a, b)}
 
     @property
     def times(self) -> Tensor:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -29,6 +29,15 @@ Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor
 
 
+@dataclass(frozen=True)
+class Lowered:
+    """The numbers of a constraint's rows as kernels in C read them, by the names of `native/structures.py`."""
+
+    by_knot: Mapping[str, Tensor]  # (B|1, K|1, ...)
+    by_problem: Mapping[str, Tensor] = field(default_factory=dict)  # (B, ...)
+    plain: Mapping[str, Any] = field(default_factory=dict)  # numbers, and tensors that aren't copied
+
+
 class Constraint(PerElement):
     """Rows c (B, K, p) at K knots of a trajectory.
 
@@ -39,6 +48,9 @@ class Constraint(PerElement):
     sense: Sense = "inequality"
     geometric: bool = False
     knots: Any  # a slice, or an int64 tensor (K,), once bound
+    is_goal: ClassVar[bool] = False  # whether it is the row of a required goal
+    says_where: ClassVar[bool] = False  # whether it says where to be, not how fast
+    joins_knots: ClassVar[bool] = False  # whether its rows are of two knots
 
     @property
     def bare(self) -> Constraint:
@@ -94,9 +106,26 @@ class Constraint(PerElement):
         return numbers_of_fields(self, where, place)
 
     @property
+    def kernel(self) -> str:
+        """Which code in C computes the rows: "bounds", "spheres", ...; "function": that of a trace."""
+        return "function"
+
+    def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
+        """The numbers for that code, of a problem with n states.
+
+        Args:
+            others: the same obstacles of a body's other balls, whose rows follow these.
+        """
+        raise undefined(self, "lowered")
+
+    @property
     def in_metres(self) -> bool:
         """Whether violations are lengths."""
         return self.geometric
+
+    def of_both_sides(self, sizes: Tensor) -> Tensor:
+        """Sizes (B, 1, p) of rows, of the two sides of a bound the larger one."""
+        return sizes
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         """A row at a knot in words."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.native.packing import KIND_OF
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Facts, Traced, Unseen
 
@@ -32,7 +31,7 @@ def signature(problem: Problem) -> Signature | None:
     cost = problem.cost
     form = problem.N, problem.n, problem.m, str(problem.x0.dtype), str(problem.x0.device)
     quadratic = cost.diagonal if type(cost) is BoundQuadratic else None
-    kinds = tuple(type(part) if type(part) in KIND_OF else None for part in problem.constraints)
+    kinds = tuple(None if part.kernel in ("function", "body") else part.kernel for part in problem.constraints)
     parts: list[Any] = [problem.dynamics, *([] if quadratic is not None else [cost])]
     parts += [part for part, kind in zip(problem.constraints, kinds, strict=True) if kind is None]
     try:

@@ -53,7 +53,7 @@ def world_of(problem: Problem, b: int) -> World:
     others, maps = [], []
     for whole in one.obstacles:
         part = whole.inscribed
-        vehicle = 0.0 if isinstance(whole, BoundBody) else float(part.vehicle_radius[0])  # its balls are drawn instead
+        vehicle = 0.0 if whole.body is not None else float(part.vehicle_radius[0])  # its balls are drawn instead
         if isinstance(part, BoundSpheres | BoundBoxes | BoundOscillatingBoxes):
             by_radius.setdefault(vehicle, []).extend(_bodies(part))
         elif isinstance(part, BoundField):

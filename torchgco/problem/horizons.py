@@ -19,7 +19,7 @@ from torchgco.base.shapes import lead
 from torchgco.base.tree import passed_on
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.bounds import bounds_of
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -72,12 +72,11 @@ def at_rest_after(problem: Problem, U: Tensor) -> Tensor:
 def _resting(problem: Problem) -> Tensor:
     """Controls (B, N, m) at rest; the middle of their bounds where they aren't inside of these."""
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-    for bounds in problem.constraints:
-        if isinstance(bounds, ControlBounds):
-            held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
-            inside = (held > lower) & (held < upper)
-            rest = rest.clone()
-            rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
+    for bounds in bounds_of(problem.constraints, "u"):
+        held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+        inside = (held > lower) & (held < upper)
+        rest = rest.clone()
+        rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
     return rest
 
 
