@@ -17,7 +17,7 @@ from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import asks_for_knot, bound_values
-from torchgco.costs.base import add_blocks
+from torchgco.costs.base import add_blocks, add_first
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 TOUCH = 1.0 - CONTACT_FACTOR  # the same, as a share beneath the full surface
@@ -301,15 +301,6 @@ class CountedRows(WrappedConstraint):
 
     def _where(self, rows: Tensor, other: float) -> Tensor:
         return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
-
-
-def add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
-    """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
-    blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
-    write(blocks)
-    one = X.shape[-1]
-    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
-    H[..., own.unsqueeze(-1), own] += blocks
 
 
 def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:

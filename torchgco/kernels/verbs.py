@@ -10,7 +10,6 @@ from torch import Tensor
 from torchgco.constraints.base import Distance
 from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics import rollout
 from torchgco.kernels.choice import kernels_of
 from torchgco.kernels.in_pytorch import InteriorKernels, clearance_of
@@ -80,7 +79,7 @@ def is_convex(problem: Problem) -> bool:
     """Whether a problem is known to be convex: affine dynamics, a quadratic cost, and bounds."""
     cost = problem.cost.cost if isinstance(problem.cost, ShiftedCost) else problem.cost
     bounded = all(isinstance(part, Bounds) for part in problem.constraints)
-    return bounded and isinstance(cost, BoundQuadratic) and kernels_of(problem).affine
+    return bounded and cost.kernel == "quadratic" and kernels_of(problem).affine
 
 
 def chord_clearance(problem: Problem, X: Tensor, share: float | None = None) -> Tensor:

@@ -176,7 +176,7 @@ class Problem:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
         X, U = self.at_rest
         stages = None if self.horizon is None else self.stages
-        if type(self.cost) is BoundQuadratic:
+        if isinstance(self.cost, BoundQuadratic) and self.cost.kernel == "quadratic":
             curvatures = self.cost.control_curvatures.expand(self.B, self.N, self.m)
             return cost_scale(self.cost.total(X, U), curvatures, None, stages, self.control_bounds)
         s = self.n + 1 + self.m
