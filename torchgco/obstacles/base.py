@@ -21,6 +21,7 @@ from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
 from torchgco.constraints.base import Distance, add_at, count_of
 from torchgco.constraints.base import least as least
+from torchgco.obstacles.shapes import RoundedBoxes
 
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
 BOUND_SLACK = 1.0 + 1e-4  # so that rounding, in single precision too, can't make a row active beyond its box's bounds
@@ -89,6 +90,7 @@ class Obstacles(Distance):
     and it may define
 
         inflated                              its form as spheres or boxes: without it no path is sought
+        shapes                                how it looks, where `inflated` doesn't say
         moving, chord_clearance, later        where its obstacles move
         stops                                 the last knot at which they count, where horizons differ
         chosen                                some of its obstacles: without it none is left out of a search
@@ -197,6 +199,11 @@ class Obstacles(Distance):
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
+
+    def shapes(self, b: int) -> RoundedBoxes | None:
+        """How those of problem b look; None where nobody says: no page or sensor shows them then."""
+        solids = self.inflated()
+        return None if solids is None else RoundedBoxes.of(solids, self.vehicle_radius, b)
 
     def chosen(self, at: Tensor) -> Obstacles:
         """The same kind with the obstacles at places (B, M') alone; -1 stands for an absent one."""

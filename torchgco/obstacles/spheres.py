@@ -24,6 +24,7 @@ from torchgco.obstacles.base import TOUCH, Obstacles, OwnKind, Solids, copied, l
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, points, vehicle_radii
 from torchgco.obstacles.measured import Distances, sphere_distances
+from torchgco.obstacles.shapes import RoundedBoxes, array
 
 
 @dataclass(frozen=True)
@@ -241,6 +242,11 @@ class BoundSpheres(OwnKind):
 
     def inflated(self) -> Solids | None:
         return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
+
+    def shapes(self, b: int) -> RoundedBoxes:
+        velocity = None if self.velocities is None or not bool(self.velocities[b].any()) else array(self.velocities[b])
+        solids = Solids(self.centers, self.inflated_radii, self.absent)
+        return RoundedBoxes.of(solids, self.vehicle_radius, b, velocity=velocity)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         o = self.centers.unsqueeze(1)
