@@ -37,7 +37,7 @@ from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
 from torchgco.kernels import EagerWarning
-from torchgco.problem.rates import with_controls_before
+from torchgco.problem.carried import with_carried
 
 D = torch.float64
 B, N = 3, 30
@@ -141,13 +141,11 @@ def wide() -> dict[str, Problem]:
     discs = Spheres([[1.0, 1.0]], [0.3], 0.1)
 
     def made(cost: Cost, *more: Any) -> Problem:
-        return with_controls_before(Problem(base.dynamics, cost, [*more, rates], base.x0, 12))
+        return with_carried(Problem(base.dynamics, cost, [*more, rates], base.x0, 12))
 
     shared = torch.tensor([[1.0, 2.0, 0.5, 0.1]], dtype=D)
     return {
-        "quadratic": with_controls_before(
-            Problem(base.dynamics, base.cost, [*base.constraints, rates], base.x0, base.N)
-        ),
+        "quadratic": with_carried(Problem(base.dynamics, base.cost, [*base.constraints, rates], base.x0, base.N)),
         "diagonal": made(QuadraticCost([1.0, 1, 0, 0], [0.1, 0.1], [9.0] * 4, q=[0.1, 0, 0, 0], qf=0.2), discs),
         "per problem": made(Each(target, weight, shared), tube),
         "own expansion": made(GaussNewton(), StateBounds(-1.0, [1.0, inf, inf, inf])),
@@ -213,7 +211,7 @@ class Sharp(Smooth):
 def test_a_cost_keeps_its_own_sum() -> None:
     base = user_problem(5, 12)
     problem = Problem(base.dynamics, Sharp(), [RateBounds(-0.2, 0.2)], base.x0, 12)
-    lifted = with_controls_before(problem)
+    lifted = with_carried(problem)
     X, U = torch.randn(5, 13, 6, dtype=D), torch.randn(5, 12, 2, dtype=D)
     torch.testing.assert_close(lifted.cost.total(X, U), problem.cost.total(X[..., :4], U))
     assert torch.equal(lifted.cost.stage(X[:, :12], U, torch.arange(12)), problem.cost.stage(X[:, :12, :4], U, 0))
@@ -245,7 +243,7 @@ def test_obstacles_are_searched_as_without_rates() -> None:
 def test_new_limits_and_new_controls_before_need_no_new_kernel() -> None:
     problem = carts(RateBounds(-0.3, 0.3, previous=[0.0, 0.0]))
     moved = problem.started_at(problem.x0 + 0.1, [RateBounds(-0.2, 0.4, previous=[1.0, 0.5])])
-    engines = [engine_of(with_controls_before(each)) for each in (problem, moved)]
+    engines = [engine_of(with_carried(each)) for each in (problem, moved)]
     assert engines[0] is not None and engines[1] is not None and engines[0].library is engines[1].library
     solution = torchgco.solve(moved)
     moves = changes(solution.U, torch.tensor([[1.0, 0.5]] * B, dtype=D))
@@ -284,7 +282,7 @@ def test_only_bounded_controls_become_states() -> None:
 
 
 def test_samples_are_drawn_in_the_wider_problem() -> None:
-    problem = with_controls_before(carts(RateBounds(-0.3, 0.3), ControlBounds(-1, 1)))
+    problem = with_carried(carts(RateBounds(-0.3, 0.3), ControlBounds(-1, 1)))
     key = DrawKey(0, torch.arange(B), torch.zeros(B, dtype=torch.int64))
     X, V = torchgco.MPPI(samples=64, covariance=1.0).improve(problem, torch.zeros(B, N, 2, dtype=D), key)
     assert X.shape == (B, N + 1, 6) and torch.equal(X[:, 1:, 4:], V)

@@ -30,7 +30,7 @@ from torchgco import (
 )
 from torchgco.kernels import interior_of
 from torchgco.maps import OccupancyGrid
-from torchgco.problem.rates import with_controls_before
+from torchgco.problem.carried import with_carried
 from torchgco.solvers.interior import FILTER
 
 pytestmark = [
@@ -116,7 +116,7 @@ def rates(seed: int) -> Problem:
     problem = curved(seed)
     limits = RateBounds(-0.4, 0.5, previous=0.1 * draw(seed + 1)(B, 2))
     parts = [*problem.constraints[:3], limits]
-    return with_controls_before(Problem(problem.dynamics, problem.cost, parts, problem.x0, problem.N))
+    return with_carried(Problem(problem.dynamics, problem.cost, parts, problem.x0, problem.N))
 
 
 def apart(seed: int) -> Problem:

@@ -12,13 +12,13 @@ from torchgco.compiled.plan import Plan
 from torchgco.compiled.stages import moved, stages_between
 from torchgco.compiled.stopping import clamped, limits, stopping
 from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import rates_of
 from torchgco.constraints.norms import within_norms
 from torchgco.kernels import current, followed, measured, open_loop, path_clearance
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival, violation
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
-from torchgco.problem.rates import rates_of
 
 
 class Held(NamedTuple):
@@ -41,7 +41,7 @@ def held(problem: Problem, plan: Plan | None, now: float) -> Held:
     whole, before, found = current(for_solvers(problem)), None, None
     if plan is not None:
         X, before, K = _moved_on(plan, now)
-        lifted = rates_of(problem) is not None  # feedback could break the bounds of rates
+        lifted = rates_of(problem.constraints) is not None  # feedback could break the bounds of rates
         ways = [before] if lifted else [followed(whole, X, before, K)[1], before]
         found = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
     if found is None:
@@ -70,7 +70,7 @@ def better(problem: Problem, kept: Held, U: Tensor) -> Held:
 
 def within(problem: Problem, U: Tensor) -> Tensor:
     """Controls (B, N, m) within the bounds of controls, of their rates, norms and cones."""
-    if rates_of(problem) is None:
+    if rates_of(problem.constraints) is None:
         bounds = problem.control_bounds
         U = U.nan_to_num() if bounds is None else clamped(U, *bounds.over(problem.N))
     else:

@@ -12,13 +12,13 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bounds import rates_of
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.kernels import current, open_loop
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
-from torchgco.problem.rates import rates_of
 
 SHARES = -1.0, -0.5, 0.5, 1.0  # of the way from a control at rest to its lower and its upper bound
 MOST_TOGETHER = 4  # controls, of which all ends of the bounds are combined: 16 candidates
@@ -55,9 +55,9 @@ def stopping(problem: Problem, before: Tensor | None) -> Tensor:
 def limits(problem: Problem) -> Limits:
     """The bounds of controls (B, m) at stages (B,), those of rates among them."""
     B, N, m = problem.B, problem.N, problem.m
-    inf, bounds, rates = problem.x0.new_full((1, 1, m), torch.inf), problem.control_bounds, rates_of(problem)
+    inf, bounds = problem.x0.new_full((1, 1, m), torch.inf), problem.control_bounds
     low, high = (part.expand(B, N, m) for part in ((-inf, inf) if bounds is None else bounds.over(N)))
-    rows = torch.arange(B)
+    rows, rates = torch.arange(B), rates_of(problem.constraints)
     if rates is None:
         return lambda k, before: (low[rows, k], high[rows, k])
     fall, rise = (part.expand(B, N, m) for part in rates.over(N))

@@ -17,6 +17,7 @@ from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import asks_for_knot, bound_values
+from torchgco.constraints.carried import Carried
 from torchgco.costs.base import add_blocks, add_first
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
@@ -138,6 +139,14 @@ class Constraint(PerElement):
     def remade(self) -> Constraint:
         """The same with what is computed from its numbers as they are now."""
         return self
+
+    def carries(self, x0: Tensor, N: int) -> Carried:
+        """What rows of two knots need of the earlier one, in problems of N stages that start at x0 (B, n)."""
+        raise undefined(self, "carries")
+
+    def with_carried(self, first: int) -> Constraint:
+        """The same rows as those of one knot, where what is carried are the states from `first` on."""
+        raise undefined(self, "with_carried")
 
     def with_more(self, n: int, m: int) -> Constraint:
         """The same rows in a form of the problem with further states and controls after the first n and m."""

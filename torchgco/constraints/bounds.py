@@ -17,6 +17,7 @@ from torchgco.base.numbers import Floats, Number, Wrong, crossed, numbers, numbe
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, check_shape, tensor
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FirstRowsInTime, Lowered, count_of, resolve_knots
+from torchgco.constraints.carried import Carried, Taken
 from torchgco.dynamics.names import controls_of, states_of
 
 LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
@@ -251,6 +252,11 @@ class ControlBounds(Bounds):
         return self  # controls at rest are within them
 
 
+def rates_of(parts: Iterable[Constraint]) -> RateBounds | None:
+    """The bounds on rates, of which a problem has one at most; None where there are none."""
+    return next((part for part in parts if isinstance(part, RateBounds)), None)
+
+
 def joined_bounds(parts: Sequence[Bounds], N: int) -> Bounds | None:
     """The bounds of several parts, once bound, as one; the only part as it is, and None of none.
 
@@ -332,13 +338,16 @@ class RateBounds(_Bounds):
         return every[:, self.controls]
 
     def with_more(self, n: int, m: int) -> Constraint:
-        return self.with_states_from(n)
+        return self
 
     def in_free_time(self, n: int, m: int, later: int) -> Constraint:
-        return RatesInTime(self.with_states_from(n + 1), n, m)
+        return RatesInTime(self, n, m)
 
-    def with_states_from(self, first: int) -> Self:
-        """The same rows for a solver's states, of which those from `first` on are the bounded controls of k - 1."""
+    def carries(self, x0: Tensor, N: int) -> Carried:
+        """The bounded controls of the stage before."""
+        return Carried(self.before, Taken(x0.shape[-1] + self.controls))
+
+    def with_carried(self, first: int) -> Self:
         states = torch.zeros(self.upper.shape[-1], dtype=torch.int64, device=self.upper.device)
         states[self.controls] = first + torch.arange(len(self.controls), device=states.device)
         return replace(self, states=states)
@@ -354,7 +363,7 @@ class RateBounds(_Bounds):
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         if self.states is None:
-            raise NotImplementedError("rows of two knots have no block; solvers take `with_states_from`")
+            raise NotImplementedError("rows of two knots have no block; solvers take `with_carried`")
         one, controls = X.shape[-1], self.controls
         x, u = self.states[controls], one + 1 + controls
         gradient, diagonal = self._by_component(g, h)[..., controls]

@@ -24,15 +24,15 @@ from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
+from torchgco.problem.carried import with_carried
 from torchgco.problem.in_time import in_time
 from torchgco.problem.problem import Problem
-from torchgco.problem.rates import with_controls_before
 
 HORIZONS_FORM = "within horizons"  # what is kept with the form of the problem for this one
 
 
 def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
-    """The problem in the form that solvers work on; itself without horizons, bounded rates and a free time.
+    """The problem in the form that solvers work on; itself without horizons, rows of two knots and a free time.
 
     Args:
         joins_knots: rows of two knots stay as they are.
@@ -40,7 +40,7 @@ def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
     if problem.time is not None:
         return in_time(problem)
     held = within_horizons(problem)
-    return held if joins_knots else with_controls_before(held)
+    return held if joins_knots else with_carried(held)
 
 
 def within_horizons(problem: Problem) -> Problem:

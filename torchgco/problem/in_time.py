@@ -1,9 +1,9 @@
 """Problems with a free time in the form that solvers work on, and the way back.
 
-The states are [x, tau, controls of the stage before], the controls [u, next tau]: the first segment's factor tau is a
+The states are [x, tau, carried ones], the controls [u, next tau]: the first segment's factor tau is a
 free component of the start, the next one a control of the last stage before its segment, and everywhere else tau stays
 as it is. A control that would change the length at every stage takes several times the iterations. Only where there
-are several segments is there a next tau, and only where rates are bounded are there controls of the stage before.
+are several segments is there a next tau, and only where rows are of two knots are there carried states.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, lead
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.carried import Taken
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.problem.carried import carried_of, rows_of_one_knot
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.problem import Problem
-from torchgco.problem.rates import rates_of
 
 FREE_TIME_FORM = "in free time"  # what is kept with the form of the problem for this one
 HELD_FORM = "at held times"  # the same, where obstacles move
@@ -47,21 +48,19 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
         return problem
     guess = time.guess if guess is None else guess
     guess = torch.clamp(torch.ones_like(time.least), time.least, time.most) if guess is None else guess
-    rates = rates_of(problem)
-    controls = None if rates is None else rates.controls
-    before = [] if rates is None else [rates.before.expand(problem.B, -1)]
-    x0 = torch.cat((problem.x0, guess[:, :1], *before), dim=-1)
+    carried = carried_of(problem)
+    x0 = torch.cat((problem.x0, guess[:, :1], *([] if carried is None else [carried.start])), dim=-1)
     free = problem.free_start
     free = torch.zeros_like(problem.x0, dtype=torch.bool) if free is None else free
     parts: dict[str, object] = {
-        "dynamics": _Dynamics(problem.dynamics, controls, _switches(time, problem.N)),
+        "dynamics": _Dynamics(problem.dynamics, carried and carried.taken, _switches(time, problem.N)),
         "cost": _cost(problem, time),
         "x0": x0,
         "free_start": pad(pad(free, (0, 1), value=True), (0, x0.shape[1] - problem.n - 1)),
         "time": None,
     }
     whole = problem._with(parts, known=problem.known.of_lifted(f"{FREE_TIME_FORM} {time.segments}"))
-    rows = tuple(c.in_free_time(problem.n, problem.m, time.count - 1) for c in problem.constraints)
+    rows = [c.in_free_time(problem.n, problem.m, time.count - 1) for c in rows_of_one_knot(problem, problem.n + 1)]
     object.__setattr__(whole, "constraints", (*rows, *_bounds(whole, time, problem.n)))
     return whole
 
@@ -72,9 +71,8 @@ def states_in_time(problem: Problem, X: Tensor, U: Tensor, factors: Tensor) -> t
     assert time is not None
     along = factors[:, time.of_stages(N)]
     parts = [X, torch.cat((along, along[:, -1:]), dim=1).unsqueeze(-1)]
-    if (rates := rates_of(problem)) is not None:
-        first = rates.before.expand(len(X), -1)
-        parts.append(torch.cat((first.unsqueeze(1), U[..., rates.controls]), dim=1))
+    if (carried := carried_of(problem)) is not None:
+        parts.append(carried.along(X, U))
     if time.count == 1:
         return torch.cat(parts, dim=-1), U
     later = torch.cat((along[:, 1:], torch.ones_like(along[:, :1])), dim=1)
@@ -209,19 +207,20 @@ def _switches(time: FreeTime, N: int) -> Tensor | None:
 class _Dynamics(WrappedDynamics):
     """A model whose stages last tau dt, with tau among its states."""
 
-    controls: Tensor | None  # (r,) int64: which controls of the stage before are states, too
+    taken: Taken | None  # the further states
     switches: Tensor | None  # (N,): 1 at stages whose last control is the next tau
-    k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at` where there are switches
+    k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at` where they differ
 
     batched: ClassVar[tuple[str, ...]] = ("model",)
     stretches: ClassVar[bool] = True  # type: ignore[misc]
 
-    n = property(lambda self: self.model.n + 1 + (0 if self.controls is None else len(self.controls)))  # type: ignore[assignment]
+    n = property(lambda self: self.model.n + 1 + len(self.taken or ()))  # type: ignore[assignment]
     m = property(lambda self: self.model.m + (self.switches is not None))  # type: ignore[assignment]
     integrator = property(lambda self: self.model.integrator)  # type: ignore[assignment]
 
     def at(self, k: int | Tensor) -> Self:
-        return self if self.switches is None else replace(self, k=k)
+        same = self.switches is None and (self.taken is None or self.taken.stages is None)
+        return self if same else replace(self, k=k)
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         """The derivative by the time that runs evenly from knot to knot, dt a stage."""
@@ -235,7 +234,9 @@ class _Dynamics(WrappedDynamics):
         rates = lambda z: tau * model.field(model.settled(z), v)
         ahead = model.settled(INTEGRATORS[model.integrator](rates, x[..., :n], model.dt))
         parts = [ahead, tau if self.switches is None else self._next(tau, u[..., m : m + 1])]
-        return torch.cat(parts if self.controls is None else [*parts, v[..., self.controls]], dim=-1)
+        if self.taken is not None:
+            parts.append(self.taken.after(x[..., :n], v, x[..., n + 1 :], self.k))
+        return torch.cat(parts, dim=-1)
 
     def _next(self, tau: Tensor, chosen: Tensor) -> Tensor:
         if self.k is None:

@@ -20,7 +20,7 @@ class Known:
         warned: reasons for PyTorch's kernels that a warning has named.
         packed: of "dynamics", "cost" and constraints by their place: the part that was packed for C last, of how many
             problems, and what was made of it.
-        lifted: what is known of problems with further states, by their kind: see `horizons` and `rates`.
+        lifted: what is known of problems with further states, by their kind: see `horizons` and `carried`.
     """
 
     current: bool = False

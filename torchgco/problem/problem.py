@@ -15,7 +15,7 @@ from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
 from torchgco.base.tree import Rows, cast, field_names, is_users, take
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
+from torchgco.constraints.bounds import Bounds, RateBounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
@@ -434,7 +434,7 @@ def _check_constraints(constraints: Any) -> None:
     for constraint in constraints:
         if not isinstance(constraint, Constraint):
             raise InputError("constraints", "a list of Constraint", _named(constraint))
-    if (rates := sum(constraint.joins_knots for constraint in constraints)) > 1:
+    if (rates := sum(isinstance(constraint, RateBounds) for constraint in constraints)) > 1:
         raise InputError("constraints", "one RateBounds at most", rates)
 
 

@@ -1,4 +1,4 @@
-"""Solutions in the form that solvers work on, where a free time or controls before are states, and the way back."""
+"""Solutions in the form that solvers work on, where a free time or carried numbers are states, and the way back."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchgco.kernels import current, open_loop
+from torchgco.kernels import current
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.problem.carried import carried_of
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import factors_in, factors_of, states_in_time, times_of
 from torchgco.problem.problem import Problem
@@ -26,7 +27,8 @@ def for_systems(problem: Problem, solution: Solution) -> tuple[Problem, Solution
         X, U = states_in_time(problem, solution.X, solution.U, factors_of(problem, solution.times))
         multipliers = lifted_multipliers(problem, whole, multipliers)
     else:
-        X, U = torch.cat((solution.X, open_loop(whole, solution.U)[..., problem.n :]), dim=-1), solution.U
+        carried, X, U = carried_of(problem), solution.X, solution.U
+        X = X if carried is None else torch.cat((X, carried.along(X, U)), dim=-1)
     return whole, replace(solution, X=X.contiguous(), U=U.contiguous(), multipliers=multipliers)
 
 

@@ -20,10 +20,11 @@ from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
-from torchgco.kernels import cost_unit, current, interior_of, kernels_of, open_loop, used
+from torchgco.kernels import cost_unit, current, interior_of, kernels_of, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.alone import check_rows
+from torchgco.problem.carried import carried_of
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
@@ -153,8 +154,8 @@ class Solver(Brief):
     """A solver for batches of problems. Its fields are its options; it keeps no state between calls.
 
     Attributes:
-        joins_knots: whether `run` takes rows of two knots (`RateBounds`) as they are; else the controls of the stage
-            before are further states of `call.problem`.
+        joins_knots: whether `run` takes rows of two knots as they are; else what they need of the earlier knot are
+            further states of `call.problem`.
         kernels: another library that solves; None: ours, native or PyTorch's.
     """
 
@@ -273,8 +274,8 @@ class Solver(Brief):
         if not self.take_states(call.problem):
             able = "interior_point or, without obstacles, gco; or ipopt"
             raise InputError("X0", f"None, or a solver that can begin with states: {able}", type(self).__name__)
-        if call.problem is not problem:  # controls before, where their change is bounded
-            X0 = torch.cat((X0, open_loop(call.problem, call.U0)[..., problem.n :]), dim=-1)
+        if call.problem is not problem and (carried := carried_of(problem)) is not None:
+            X0 = torch.cat((X0, carried.along(X0, call.U0)), dim=-1)
         return replace(call, X0=X0)
 
     def frees_start(self, problem: Problem) -> bool:
