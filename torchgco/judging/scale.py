@@ -27,7 +27,7 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     The size of a row is its largest value at rest, and of inequalities along the trajectory, too, where equalities are
     met; the two sides of a bound have one size. Rows that have the value at rest still, such as those of a given start,
-    say nothing; obstacles have sizes of their own.
+    say nothing, nor do rows of two knots that are 0 there, as differences are; obstacles have sizes of their own.
 
     Args:
         X, U: trajectories, (B, N+1, n) and (B, N, m).
@@ -47,7 +47,8 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         rows = constraint.of_both_sides(sizes.amax(1, keepdim=True))
         size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))
         known = size > torch.maximum(least, free)
-        admitted = torch.where(known, torch.maximum(SHARE * size, least), LARGE_VIOLATION)
+        unknown = torch.inf if constraint.joins_knots else LARGE_VIOLATION
+        admitted = torch.where(known, torch.maximum(SHARE * size, least), unknown)
         large = (constraint.violation(X, U) > admitted) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place
