@@ -46,8 +46,8 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
         the solution itself, where the controls are those of before.
 
     Raises:
-        InputError: a problem of another form, one in float32 or with horizons per problem, a free time or RateBounds,
-            or a solution that no longer knows its problem.
+        InputError: a problem of another form, one in float32 or with horizons per problem, a free time or rows of two
+            knots, or a solution that no longer knows its problem.
     """
     changed = current_problem(changed)
     before = problem if problem is not None else solution.account and solution.account.problem
@@ -61,8 +61,8 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
     for one in (before, changed):
         refuse_forms(one, "a prediction")
         if for_solvers(one) is not one:
-            expected = "a problem with one horizon, a fixed time and no RateBounds, for a prediction"
-            got = "RateBounds" if one.time is None else "a free time"
+            expected = "a problem with one horizon, a fixed time and no rows of two knots, for a prediction"
+            got = "rows of two knots" if one.time is None else "a free time"
             raise InputError("problem", expected, got if one.horizon is None else "horizons per problem")
     was, now = ((one.B, one.N, one.n, one.m, one.row_shapes) for one in (before, changed))
     if was != now:
