@@ -40,6 +40,7 @@ from torchgco.constraints import (
     ControlBounds,
     FunctionConstraint,
     Gates,
+    Link,
     NormBounds,
     RateBounds,
     Separation,
@@ -84,7 +85,7 @@ __all__ = [  # noqa: RUF022
     "QuadrotorPlanning", "QuadrotorPlant", "QuadrotorThrusts",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
     "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates", "Separation",
-    "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "Link", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it

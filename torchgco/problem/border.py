@@ -39,8 +39,8 @@ ANY_AXES = (
     "whether k is a number or a tensor (K,)"
 )
 ONE_KNOT = (
-    "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; numbers per knot: "
-    "`knot_values`, or an argument k)"
+    "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; two knots: Link; "
+    "numbers per knot: `knot_values`, or an argument k)"
 )
 
 Given: TypeAlias = tuple[Any, Any]  # a part as the user gave it, and bound to a problem
