@@ -132,7 +132,7 @@ class Constraint(PerElement):
         return f"row {row}"
 
     def by_obstacle(self, rows: Tensor) -> Tensor:
-        """Of each obstacle whether any of its rows (..., p) is marked; of each row, where every row is one's own."""
+        """Of each obstacle whether any of its rows (..., p) is marked; of each row, where each has its own."""
         return rows
 
     def remade(self) -> Constraint:

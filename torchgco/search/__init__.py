@@ -1,7 +1,7 @@
 """Search above the local solver: a table of rows, along paths and from samples; or restarts from random guesses.
 
 `table` says which passes a solver makes, `rows` and `steps` what each does, `proposals` follow the roadmap's paths,
-`restarts` begin anew from drawn guesses; `search.Search` is what they share, the best trajectory so far above all. It
+`restarts` begin again from drawn guesses; `search.Search` is what they share, the best trajectory so far above all. It
 imports `roadmap`, `guidance` and `solvers`. Begin with `table.py`.
 """
 
