@@ -19,7 +19,7 @@ from torchgco.constraints.base import CONTACT_FACTOR, Constraint
 from torchgco.constraints.gates import has_gates
 from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances, segment_distance
-from torchgco.judging.gates import passes
+from torchgco.judging.gates import passages
 from torchgco.judging.maps import segment_distances
 from torchgco.judging.steps import StepErrors, step_errors
 from torchgco.maps.field import BoundField
@@ -220,9 +220,8 @@ def _verdict(
         else:
             others = torch.maximum(others, worst)
     passed, gates = torch.zeros_like(problem.stages), 0
-    for way in (passes(part, X) for part in problem.constraints):
-        if way is not None:
-            passed, gates = passed + way.passed.sum(-1), gates + way.passed.shape[-1]
+    for way in passages(problem, X, U, along).values():
+        passed, gates = passed + way.passed.sum(-1), gates + way.passed.shape[-1]
     finite = torch.isfinite(X).flatten(1).all(-1) & (moved == 0)
     clear_95 = finite & (clearance_knots >= 0) & (others <= ADMITTED)
     feasible = finite & (violation <= ADMITTED) & (clearance >= 0) & (passed == gates)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.constraints.separation import Separation
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import INTEGRATORS
@@ -14,6 +15,7 @@ from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
+MEASURED = Obstacles | Separation | GateBalls | GateSquares  # between the knots, too
 PIECES_AT_MOST = 16  # of a stage: their chords are 256 times as close to a path as the stage's own
 
 
@@ -54,7 +56,7 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Of a body that is where its balls are, of pairs that keep a distance the vector between them.
     """
     off = torch.zeros_like(X[:, 0, 0])
-    parts = [one.bare for one in problem.constraints if isinstance(one.bare, Obstacles | Separation)]
+    parts = [one.bare for one in problem.constraints if isinstance(one.bare, MEASURED)]
     if not parts or len(X) == 0:
         return off
     middle, even = _within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
@@ -107,4 +109,6 @@ def _places(part: Any, X: Tensor) -> Tensor:
         return part.points.at(X)
     if isinstance(part, Separation):
         return part.away(X)
+    if isinstance(part, GateBalls | GateSquares):
+        return X[..., part.components].unsqueeze(-2)
     return X[..., part.position].unsqueeze(-2)
