@@ -81,6 +81,7 @@ def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: p
     np.savez(tmp_path / "solutions.npz", U=U.numpy()[None], solver=np.array(["gco"]))
     shown = []
     for name, draw in (("layout_grid", layout_grid), ("study_figure", study_figure)):
+
         def keep(arrays: Any, *words: Any, draw: Any = draw, **more: Any) -> Any:
             shown.append((scene_of(arrays, position=more["position"]), draw(arrays, *words, **more)))
             return shown[-1][1]

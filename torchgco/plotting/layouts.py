@@ -73,8 +73,8 @@ def layout_grid(
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
     that this cut misses are dotted where they are near. A moving obstacle is drawn where it comes closest to the first
-    solver's trajectory, if it comes near, outlined in that solver's colour. Crosses mark contact of what isn't feasible,
-    at the knots and between them, with the map too.
+    solver's trajectory, if it comes near, outlined in that solver's colour. Crosses mark contact, at the knots and
+    between them, with the map too, of flights that aren't feasible.
 
     Raises:
         InputError: the trajectories don't fit the layouts, or one has no row in `trials`.

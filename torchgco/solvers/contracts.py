@@ -148,6 +148,7 @@ def check_states(X0: Any, problem: Problem) -> None:
     check_tensor(X0, "X0", problem.x0)
     check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
 
+
 CHOOSING_TIME = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
 
 

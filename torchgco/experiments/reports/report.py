@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -38,7 +39,7 @@ from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
-SHOWN = 12  # layouts in a picture, at most
+SHOWN_LAYOUTS = 12  # layouts in a picture, at most
 FACETS = 6  # most tasks that have panels of their own; more are pooled over the swept variables
 Arrays = Mapping[str, np.ndarray]
 
@@ -72,14 +73,16 @@ def write_report(
     held = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
         stored = Layouts.load(folder / LAYOUTS)
-        layouts, how = _posed(stored.take(range(min(stored.count, SHOWN))), vehicle)
+        layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), vehicle)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
-            states = {name: X[:SHOWN] for name, X in trajectories(solutions).items()}
+            states = {name: X[:SHOWN_LAYOUTS] for name, X in trajectories(solutions).items()}
         if figures:
             held["layouts"] = lambda: layout_grid(layouts, states, trials, **how)
         if printed:
             for ending in ("png", "pdf"):
-                held[f"study.{ending}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed, **how)
+                held[f"study.{ending}"] = lambda: study_figure(
+                    layouts, states, trials, parts[0].summary, printed, **how
+                )
     draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
     return format_report(parts, form)
 
