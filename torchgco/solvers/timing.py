@@ -120,8 +120,8 @@ class Timed:
         if legs is None:
             return estimate
         each = legs.stage_factors(torch.where(estimate.isnan(), 1.0, estimate), N)
-        of_stages = torch.nn.functional.one_hot(time.of_stages(N), time.count).to(each)
-        return each @ of_stages / of_stages.sum(0)
+        at = time.of_stages(N)
+        return each.new_zeros(len(each), time.count).index_add(1, at, each) / torch.bincount(at)
 
     @cached_property
     def own(self) -> Tensor:
