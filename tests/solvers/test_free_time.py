@@ -463,12 +463,8 @@ def test_what_looks_convex_at_a_held_time_is_solved_once() -> None:
     once, found = (torchgco.solve(problem, solver=name) for name in ("interior_point", "gco"))
     assert torch.equal(found.iterations, once.iterations) and torch.equal(found.U, once.U)
     X, U = found.X, found.U
-    rows = {
-        True: [FunctionConstraint(lambda x: x[..., :1].square() - 50.0), StateBounds([-9.0, -9.0], [9.0, 9.0])],
-        False: [FunctionConstraint(lambda x: 0.01 - x[..., :1].square()), FunctionConstraint(lambda x: x[..., :1].sin())],
-    }  # fmt: skip
-    for convex, parts in rows.items():
-        for part in parts:
-            one = replace(problem, constraints=[*problem.constraints, part])
-            assert looks_convex(one, X, U).tolist() == [convex] * 3
+    rows = [lambda x: x[..., :1].square() - 50.0, lambda x: 0.01 - x[..., :1].square(), lambda x: x[..., :1].sin()]
+    for row, convex in zip(rows, (True, False, False), strict=True):
+        one = replace(problem, constraints=[*problem.constraints, FunctionConstraint(row)])
+        assert looks_convex(one, X, U).tolist() == [convex] * 3
     assert not bool(looks_convex(braking(3, 1), torch.zeros(3, 41, 4, dtype=D), torch.zeros(3, 40, 1, dtype=D)).any())

@@ -222,7 +222,6 @@ class _Calls:
 
     def inside(self, rows: Any) -> list[Call]:
         """The calls that rows depend on, be it through other calls, in order."""
-        import casadi as ca
 
         if not self._owners:
             self._owners = {name: i for i, call in enumerate(self.all) for name in _names(call.outputs)}
