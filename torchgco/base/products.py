@@ -7,7 +7,7 @@ from torch import Tensor
 
 TAYLOR = 14  # terms of an exponential: of a matrix of norm 0.5 the next one is 2e-17
 HALVINGS = 64  # of a matrix before its series: what is larger has no finite exponential, or a nilpotent one
-DEPENDENT = 1e-12  # share of a row that is left of it beside the others where it depends on these
+REPEATS = 1e-12  # share of a row that is left of it beside the others where it depends on these
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
@@ -40,7 +40,7 @@ def least_squares(rows: Tensor, values: Tensor) -> Tensor:
             shares = (known * row.unsqueeze(1)).sum(-1)
             row, value = row - (shares.unsqueeze(-1) * known).sum(1), value - (shares * found).sum(-1)
         left = row.square().sum(-1, keepdim=True).sqrt()
-        kept = left > DEPENDENT * size
+        kept = left > REPEATS * size
         row = torch.where(kept, row / left, 0.0)
         known = torch.cat((known, row.unsqueeze(1)), dim=1)
         found = torch.cat((found, torch.where(kept, value.unsqueeze(-1) / left, 0.0)), dim=1)

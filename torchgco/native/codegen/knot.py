@@ -167,7 +167,8 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
     ).reshape(len(span.knots), -1)
     x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
     at = {number.element_hash(): i for i, number in enumerate(each)}
-    reads, places, forms, first, common = [], [], {}, None, None
+    reads, places, forms, common = [], [], {}, None
+    first: Any = None
     columns, width = ca.densify(ca.vertcat(ca.SX(0, 1), *found.ravel())), found.shape[1]
     for k, column in zip(span.knots, ca.vertsplit(columns, width) if width else [columns] * len(found), strict=True):
         inside = calls.inside(column)
