@@ -114,7 +114,7 @@ def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[l
         t, unit = times(problem) if solution.times is None else solution.times, "t [s]"
     except InputError:
         t, unit = torch.arange(problem.N + 1, device=problem.x0.device), "knot"
-    found, touching = [], _touching(problem.take(places), solution.take(places))
+    found, touching = [], _touching(problem.take(torch.tensor(places, device=problem.x0.device)), solution.take(places))
     for i, b in enumerate(places):
         last = int(problem.stages[b])
         X, U = (part[b].detach().cpu().double().numpy() for part in (solution.X, solution.U))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -52,7 +52,7 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Of a body that is where its balls are, of pairs that keep a distance the vector between them.
     """
     off = torch.zeros_like(X[:, 0, 0])
-    parts = [one.bare for one in problem.constraints if one.bare.on_the_way(X) is not None]
+    parts: list[Any] = [one.bare for one in problem.constraints if one.bare.on_the_way(X) is not None]
     if not parts or len(X) == 0:
         return off
     middle, even = _within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
