@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from dataclasses import field as hidden
 from typing import Any, ClassVar, Literal, Self
 
+import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
@@ -105,7 +106,13 @@ class WrappedDynamics(Dynamics):
     model: Dynamics
 
     n, m, dt, position = passed_on("model", "n", "m", "dt", "position")
+    integrator, stretches = passed_on("model", "integrator", "stretches")
     calls_function = property(lambda self: is_users(self.model))
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        """The model's, between two knots; 0 of states that follow its own."""
+        n = self.model.n
+        return torch.cat((self.model.field(x[..., :n], u[..., : self.model.m]), torch.zeros_like(x[..., n:])), dim=-1)
 
 
 @dataclass(frozen=True)
