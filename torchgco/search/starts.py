@@ -82,7 +82,7 @@ class Starts(Row):
                     return
                 self._solve(search, some, number * self.count)
         best = search.best
-        new = (best.end.best.X != held).flatten(1).any(-1) & ~is_over(best.end.status)
+        new = (held != best.end.best.X).flatten(1).any(-1) & ~is_over(best.end.status)
         if (some := new.nonzero().flatten()).numel() > 0:  # found, but not to the end
             call = replace(search.call.take(some), callback=None)
             keep_clear(search, some, continued(search.interior, call, best.of(some).best))
