@@ -101,18 +101,21 @@ class Dynamics(PerElement):
 
 @dataclass(frozen=True)
 class WrappedDynamics(Dynamics):
-    """A model with sizes, time step and position of another one, in a form of the problem with other steps."""
+    """A model with sizes, time step and position of another one, in a form of the problem with other steps.
+
+    Its `field` is that of the other one's states between two knots, which come first, and 0 of the further ones.
+    """
 
     model: Dynamics
 
-    n, m, dt, position = passed_on("model", "n", "m", "dt", "position")
-    integrator, stretches = passed_on("model", "integrator", "stretches")
+    n, m, dt, position, integrator, stretches = passed_on(
+        "model", "n", "m", "dt", "position", "integrator", "stretches"
+    )
     calls_function = property(lambda self: is_users(self.model))
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
-        """The model's, between two knots; 0 of states that follow its own."""
-        n = self.model.n
-        return torch.cat((self.model.field(x[..., :n], u[..., : self.model.m]), torch.zeros_like(x[..., n:])), dim=-1)
+        rates = self.model.field(x[..., : self.model.n], u)
+        return torch.nn.functional.pad(rates, (0, self.n - self.model.n))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from torchgco.search.search import Search
 from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import STATIONARY
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import InteriorPoint, guessed
 
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
@@ -50,7 +50,9 @@ class Converge(Row):
         if self.among == "all":
             self._tighten(search)
         elif self.begins(problem) and not search.begun:
-            search.begin(search.interior.solved(search.call, escapes=True))
+            guess = guessed(search.call)
+            found = search.interior.solved(search.call, guess=guess, escapes=True)
+            search.begin(search.interior.no_worse(search.call, guess, found))
             self._from_rest(search)
             rows = _unsolved(search)
             search.best.improve(rows, search.call.take(rows))
