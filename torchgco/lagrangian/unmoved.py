@@ -49,14 +49,17 @@ def without_slope(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> T
     A comparison, a sign or a rounding has none: no step by derivatives lowers such a row.
     """
     s = problem.n + 1 + problem.m
-    H, broken, sloped = X.new_zeros(*X.shape[:2], s, s), *torch.zeros(2, len(X), dtype=torch.bool, device=X.device)
+    H = X.new_zeros(*X.shape[:2], s, s)
+    broken = sloped = torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
     for part in problem.constraints:
         bad = part.violation(X, U) > tolerance
-        push = bad.to(X.dtype) * part.value(X, U)
+        some = bad.flatten(1).any(-1)
+        if not bool(some.any()):
+            continue
+        broken, push = broken | some, bad.to(X.dtype) * part.value(X, U)
         if part.joins_knots:  # no block of a knot has its slopes
             along = gradients(lambda x, u, part=part, push=push: push * part.value(x, u), X, U)
-            sloped |= torch.cat([slope.flatten(1) for slope in along], dim=-1).ne(0).any(-1)
+            sloped = sloped | torch.cat([slope.flatten(1) for slope in along], dim=-1).ne(0).any(-1)
         else:
             part.accumulate(X, U, push, bad.to(X.dtype), H)
-        broken |= bad.flatten(1).any(-1)
     return broken & ~sloped & (H == 0).flatten(1).all(-1)

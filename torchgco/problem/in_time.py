@@ -213,7 +213,6 @@ class _Dynamics(WrappedDynamics):
     k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at` where they differ
 
     batched: ClassVar[tuple[str, ...]] = ("model",)
-    stretches: ClassVar[bool] = True  # type: ignore[misc]
 
     n = property(lambda self: self.model.n + 1 + len(self.taken or ()))  # type: ignore[assignment]
     m = property(lambda self: self.model.m + (self.switches is not None))  # type: ignore[assignment]
