@@ -250,12 +250,6 @@ def test_new_limits_and_new_controls_before_need_no_new_kernel() -> None:
     assert float(moves.min()) > -0.201 and float(moves.max()) < 0.401
 
 
-def test_an_infeasible_solve_is_explained() -> None:
-    problem = carts(RateBounds(-0.1, 0.1, previous=[2.0, 0.0]), ControlBounds(-1.0, 1.0), rows=slice(0, 1))
-    text = torchgco.solve(problem, solver="hold", verbose=False).explain(0)
-    assert "constraints[0] (RateBounds), lower bound of control 0" in text
-
-
 def test_changed_numbers_are_seen() -> None:
     """Nothing of the wider problem is kept between solves."""
     problem = carts(RateBounds(-0.3, 0.3))
