@@ -319,13 +319,6 @@ class CountedRows(WrappedConstraint):
         return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
 
 
-def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
-    """Add gradients (B, K, c) and Hessians (B, K, c, c) of components `at` to homogeneous blocks H of n states."""
-    H[:, knots, at, n] += gradient
-    H[:, knots, n, at] += gradient
-    H[:, knots, at, at] += hessian
-
-
 def count_of(index: slice | Tensor, of: int) -> int:
     """How many of `of` things a slice or indices take."""
     return len(range(of)[index]) if isinstance(index, slice) else len(index)

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, check_tensor
-from torchgco.constraints.base import Constraint, add_at
+from torchgco.constraints.base import Constraint
+from torchgco.costs.base import add_at
 
 
 @dataclass(frozen=True)

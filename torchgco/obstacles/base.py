@@ -19,8 +19,9 @@ from torchgco.base.tree import field_names, is_users
 from torchgco.constraints.base import ADMITTED as ADMITTED
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
-from torchgco.constraints.base import Distance, add_at, count_of
+from torchgco.constraints.base import Distance, count_of
 from torchgco.constraints.base import least as least
+from torchgco.costs.base import add_at
 from torchgco.obstacles.shapes import RoundedBoxes
 
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative

@@ -18,7 +18,8 @@ from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number, lengths, numbers, present
 from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of
 from torchgco.base.tree import passed_on
-from torchgco.constraints.base import Constraint, Lowered, add_at, resolve_knots
+from torchgco.constraints.base import Constraint, Lowered, resolve_knots
+from torchgco.costs.base import add_at
 from torchgco.constraints.norms import NO_ROW
 from torchgco.obstacles.base import TOUCH, Obstacles, OwnKind, Solids, copied, least, marked, picked
 from torchgco.obstacles.body import Body
