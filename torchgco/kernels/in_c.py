@@ -21,7 +21,7 @@ from torchgco.kernels.in_pytorch import InteriorKernels, Kernels, clearance_of
 from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.state import InnerState, PassEnd, State
-from torchgco.native.engine import Engine, replicas_of
+from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
@@ -40,15 +40,14 @@ class NativeKernels(Kernels):
 
     Args:
         engine: the library of the problems' form.
-        B: problems of a solve, all in all; see `InteriorEngine`.
         warn: is called with the reason why something is left to PyTorch's kernels.
     """
 
     name = "native"
     compiled = True
 
-    def __init__(self, engine: Engine, B: int, warn: Callable[[Exception], None]) -> None:
-        self.engine, self.B, self._warn, self.affine = engine, B, warn, engine.model.affine
+    def __init__(self, engine: Engine, warn: Callable[[Exception], None]) -> None:
+        self.engine, self._warn, self.affine = engine, warn, engine.model.affine
         self._samplers: dict[Hashable, Sampler] = {}
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
@@ -139,8 +138,9 @@ class NativeKernels(Kernels):
         out = {name: _flags(B) for name in END_FLAGS} | {name: s.merit.new_zeros(B) for name in END_NUMBERS}
         state = {name: getattr(s, name) for name in ITERATED}
         packed = self.engine.terms(
-            lagrangian, None, **state, **out, options=native_options(how), limit=limit, replicas=replicas_of(B)
-        )
+            lagrangian, None, **state, **out, options=native_options(how), limit=limit,
+            replicas=self.engine.replicas_of(B),
+        )  # fmt: skip
         self.engine.run("tgco_ilqr", B, packed)
         end = pass_end(out)
         if out["lost"].any():
@@ -170,7 +170,7 @@ class NativeKernels(Kernels):
 
     def interior(self, problem: Problem) -> InteriorKernels:
         try:
-            return InteriorEngine(self.engine, self.B)
+            return InteriorEngine(self.engine)
         except InputError as error:  # second derivatives whose code would be too long
             self._warn(error)
             return super().interior(problem)

@@ -23,7 +23,7 @@ from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
-from torchgco.native.codegen.source import LANES, Form
+from torchgco.native.codegen.source import Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.compiler import Unit
 from torchgco.native.declarations import load
@@ -43,6 +43,7 @@ from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
 NO_MEMORY = "native kernels: no memory"
+LANES_OF_ONE = 4  # that a problem alone makes use of: for steps of a line search, and candidates along several paths
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -50,7 +51,7 @@ class Engine:
     """The library of a form of problems.
 
     Args:
-        ahead: is called when the form is known, before the library is compiled.
+        ahead: see `serve`.
         compiles: without it there is the form alone.
 
     Raises:
@@ -81,11 +82,16 @@ class Engine:
         self.shared = first
         lifted = frozenset(i for i in self.functions if is_lifted(parts[i]))
         self.form = Form(self.model, at, self.cost, dense, functions, lifted)
-        if ahead is not None:
-            ahead(self)
         self._libraries: dict[Hashable, ctypes.CDLL] = {}
         if compiles:
-            self.library = load(self.form.units(), STRUCTURES)
+            self.serve(problem.B, ahead)
+
+    def serve(self, B: int, ahead: Callable[[Engine], None] | None = None) -> None:
+        """Have the library that suits solves of B problems, all in all; `ahead` is called before it is compiled."""
+        self.B, self.lanes = B, lanes_for(B, LANES_OF_ONE)
+        if ahead is not None and self.lanes not in self._libraries:
+            ahead(self)
+        self.library = self.further(self.lanes, lambda: self.form.units(lanes=self.lanes))
 
     def further(self, name: Hashable, units: Callable[[], Sequence[Unit]]) -> ctypes.CDLL:
         """A further library of this form, which this engine and those with other shared numbers keep."""
@@ -119,9 +125,13 @@ class Engine:
         functions = self.functions.items()
         return found + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
 
+    def replicas_of(self, B: int) -> int:
+        """How many lanes share the line search of each of B problems."""
+        return self.lanes // 2 ** (B - 1).bit_length() if B <= self.lanes else 1
+
     def run(self, name: str, B: int, packed: c.Problem) -> None:
         """Call a function of the library on B problems."""
-        run(getattr(self.library, name), B, LANES, packed)
+        run(getattr(self.library, name), B, self.lanes, packed)
 
     def packed(self, problem: Problem, **values: Any) -> c.Problem:
         """A problem without multipliers or a guide, and further fields, in the form that the library reads."""
@@ -229,11 +239,6 @@ def _of_last(problem: Problem, name: str | int, part: Any, make: Callable[[], An
         made = make()
         problem.known.packed[name] = part, problem.B, made
     return made
-
-
-def replicas_of(B: int) -> int:
-    """How many lanes share the line search of each of B problems."""
-    return LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:
