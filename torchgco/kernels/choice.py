@@ -9,19 +9,18 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import is_forward
+from torchgco.base.memory import trim
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import begin_interior
-from torchgco.native.store import trim
 from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
-from torchgco.tracing import Facts
+from torchgco.tracing import CAPTURED, Facts
 
 ENGINES_KEPT = 64  # engines, the most recent ones
-CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
 
 
 _uses_native = True

@@ -127,7 +127,7 @@ class Engine:
 
     def replicas_of(self, B: int) -> int:
         """How many lanes share the line search of each of B problems."""
-        return self.lanes // 2 ** (B - 1).bit_length() if B <= self.lanes else 1
+        return self.lanes // 2 ** (B - 1).bit_length() if self.lanes >= B else 1
 
     def run(self, name: str, B: int, packed: c.Problem) -> None:
         """Call a function of the library on B problems."""

@@ -1,5 +1,6 @@
 """Functions of PyTorch tensors, recorded once and replayed with CasADi expressions."""
 
+from torchgco.tracing.facts import CAPTURED as CAPTURED
 from torchgco.tracing.facts import Facts as Facts
 from torchgco.tracing.facts import Unseen as Unseen
 from torchgco.tracing.traced import Traced as Traced

@@ -42,6 +42,7 @@ from torchgco.tracing.trust import (
     tells_settings,
 )
 
+CAPTURED = 1 << 26  # bytes of tensors and arrays, at most, that are held for what was found with them
 MOST_FACTS = 50_000  # facts of a problem: with more of them a trace is as quick
 COMPARED_NUMBERS = 10_000  # numbers of a tensor of torchgco's own parts that are compared by content
 PLAIN = {bool, int, str, bytes, torch.dtype, torch.device, *map(type, (None, ..., NotImplemented))}
@@ -105,6 +106,12 @@ class Facts:
     def hold(self) -> bool:
         """Whether the tensors that the key has by content have it still: a trace reads those that it has met."""
         return all(_bytes(tensor) == content for tensor, content in self._contents.values())
+
+    @property
+    def nbytes(self) -> int:
+        """The size of the tensors and arrays that are held, of sparse ones as if they were dense."""
+        held = (thing for thing in self.alive if isinstance(thing, (Tensor, np.ndarray)))
+        return sum(int(np.prod(thing.shape)) * thing.dtype.itemsize for thing in held)
 
     def walk(self, thing: Any) -> None:
         kind = type(thing)
@@ -352,6 +359,9 @@ class Facts:
             self.note(len(value))
             for part in value:
                 self._form(part)
+        elif type(value) is dict:
+            self._all(value)
+            self._form(tuple(value.values()))
         elif isinstance(value, Tensor):
             self.note(value.dtype, value.dim(), value.shape[1:], value.shape[:1] == (1,))
         else:
