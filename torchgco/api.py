@@ -23,6 +23,7 @@ from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
 from torchgco.kernels import current, open_loop
+from torchgco.lagrangian.quality import has_arrived
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -99,8 +100,6 @@ def solve(
     solver = _solver(solver, problem, check_value(record, bool, "record"))
     (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
-    if warm is None and (told := short_horizons(problem)) is not None:
-        warnings.warn(told, HorizonWarning, stacklevel=2)
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
     more: dict[str, Any] = {"callback": watcher} if watcher.shows else {}
     try:
@@ -109,6 +108,8 @@ def solve(
     finally:
         watcher.close()
     found = replace(found, account=found.account and found.account.asked(asked, name))
+    if warm is None:
+        _warn_of_horizon(problem, found)
     _warn_of_contact(problem, found)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
@@ -227,6 +228,19 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
     return problem, _guess(problem, traced)
 
 
+def _warn_of_horizon(problem: Problem, solution: Solution) -> None:
+    """A HorizonWarning at the caller's caller where no feasible trajectory arrives, as none can."""
+    if problem.goal is None or bool((_claims(solution) & has_arrived(problem, solution.X)).all()):
+        return
+    if (told := short_horizons(problem)) is not None:
+        warnings.warn(told, HorizonWarning, stacklevel=3)
+
+
+def _claims(solution: Solution) -> Tensor:
+    """Which statuses claim that the constraints hold, (B,) bool."""
+    return torch.stack([solution.status == status for status in CLAIMS]).any(0)
+
+
 def _warn_of_contact(problem: Problem, solution: Solution) -> None:
     """A ContactWarning at the caller's caller where trajectories keep all rows and are INFEASIBLE between the knots."""
     _warn_of_scale(problem, solution)
@@ -245,8 +259,7 @@ def _warn_of_contact(problem: Problem, solution: Solution) -> None:
 
 def _warn_of_scale(problem: Problem, solution: Solution) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
-    claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    rows = (claims & (solution.violation > noise(solution.X, solution.U))).nonzero().flatten()
+    rows = (_claims(solution) & (solution.violation > noise(solution.X, solution.U))).nonzero().flatten()
     if rows.numel() == 0:
         return
     some, X, U = at_times(
@@ -268,7 +281,7 @@ def _warn_of_scale(problem: Problem, solution: Solution) -> None:
 
 def _warn_of_steps(problem: Problem, solution: Solution) -> None:
     """A StepWarning where a trajectory that counts as feasible takes steps that are too long for the model."""
-    rows = torch.stack([solution.status == status for status in CLAIMS]).any(0).nonzero().flatten()
+    rows = _claims(solution).nonzero().flatten()
     if rows.numel() == 0:
         return
     part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]

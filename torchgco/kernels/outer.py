@@ -72,7 +72,7 @@ class NativeOuter:
         self._run(passes=passes, solves=1, updates=1)
 
     def run_half(self, at_once: int) -> None:
-        """Passes until half of the problems have an outcome, of no more than lanes all; at most `at_once` of them a call."""
+        """Passes until half of the problems have an outcome, or all if lanes suffice; at most `at_once` in a call."""
         while True:
             running = int((self.outcome.numpy() == Status.RUNNING).sum())
             if running == 0 or (self.b > self.engine.lanes and 2 * running <= self.b):

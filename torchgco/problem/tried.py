@@ -32,8 +32,9 @@ def check_code(
     makes a problem per period, of the same objects or of new ones over the same functions, would spend most of its time
     here. What an object's code reads may have changed since, such as captured tensors, attributes, the mode of a
     module, or x0: a mistake that arises so is found later, where the part is traced again (operations that draw at
-    random or leave PyTorch, other shapes) or by its result (`certify` compares derivatives). All parts are tried again for another number of problems, stages, states or controls, time step,
-    position, dtype or device. Parts without weak references are always tried.
+    random or leave PyTorch, other shapes) or by its result (`certify` compares derivatives). All parts are tried again
+    for another number of problems, stages, states or controls, time step, position, dtype or device. Parts without weak
+    references are always tried.
 
     Args:
         x0: the starts (B, n).
