@@ -108,9 +108,7 @@ def solve(
     finally:
         watcher.close()
     found = replace(found, account=found.account and found.account.asked(asked, name))
-    if warm is None:
-        _warn_of_horizon(problem, found)
-    _warn_of_contact(problem, found)
+    _warn(problem, found, warm is None)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
@@ -228,23 +226,26 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
     return problem, _guess(problem, traced)
 
 
-def _warn_of_horizon(problem: Problem, solution: Solution) -> None:
-    """A HorizonWarning at the caller's caller where no feasible trajectory arrives, as none can."""
-    if problem.goal is None or bool((_claims(solution) & has_arrived(problem, solution.X)).all()):
+def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
+    """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it."""
+    claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    if cold:
+        _warn_of_horizon(problem, solution, claims)
+    _warn_of_scale(problem, solution, claims)
+    _warn_of_steps(problem, solution, claims)
+    _warn_of_contact(problem, solution)
+
+
+def _warn_of_horizon(problem: Problem, solution: Solution, claims: Tensor) -> None:
+    """A HorizonWarning where no feasible trajectory arrives, as none can."""
+    if problem.goal is None or bool((claims & has_arrived(problem, solution.X)).all()):
         return
     if (told := short_horizons(problem)) is not None:
-        warnings.warn(told, HorizonWarning, stacklevel=3)
-
-
-def _claims(solution: Solution) -> Tensor:
-    """Which statuses claim that the constraints hold, (B,) bool."""
-    return torch.stack([solution.status == status for status in CLAIMS]).any(0)
+        warnings.warn(told, HorizonWarning, stacklevel=4)
 
 
 def _warn_of_contact(problem: Problem, solution: Solution) -> None:
-    """A ContactWarning at the caller's caller where trajectories keep all rows and are INFEASIBLE between the knots."""
-    _warn_of_scale(problem, solution)
-    _warn_of_steps(problem, solution)
+    """A ContactWarning where trajectories keep all rows and are INFEASIBLE between the knots."""
     touching = touches(problem, solution).nonzero().flatten().tolist()
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
@@ -253,13 +254,13 @@ def _warn_of_contact(problem: Problem, solution: Solution) -> None:
             f"while all constraints hold at them: problem {named} (to_frame(problem) has their clearance; "
             "shorter time steps help)",
             ContactWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
-def _warn_of_scale(problem: Problem, solution: Solution) -> None:
+def _warn_of_scale(problem: Problem, solution: Solution, claims: Tensor) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
-    rows = (_claims(solution) & (solution.violation > noise(solution.X, solution.U))).nonzero().flatten()
+    rows = (claims & (solution.violation > noise(solution.X, solution.U))).nonzero().flatten()
     if rows.numel() == 0:
         return
     some, X, U = at_times(
@@ -279,9 +280,9 @@ def _warn_of_scale(problem: Problem, solution: Solution) -> None:
         )
 
 
-def _warn_of_steps(problem: Problem, solution: Solution) -> None:
+def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None:
     """A StepWarning where a trajectory that counts as feasible takes steps that are too long for the model."""
-    rows = _claims(solution).nonzero().flatten()
+    rows = claims.nonzero().flatten()
     if rows.numel() == 0:
         return
     part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]

@@ -298,16 +298,17 @@ class Facts:
         """A class by identity, with what stands in it: a program may put other methods there, by names or from afar."""
         if not self._first(cls):
             return
-        self.same(cls)
-        if "_abc_impl" in vars(cls):  # classes that were registered for an abstract one
-            self.note(len(abc._get_dump(cls)[0]))  # type: ignore[attr-defined]
+        self.alive.append(cls)
+        # Classes that were registered for an abstract one.
+        others = len(abc._get_dump(cls)[0]) if "_abc_impl" in vars(cls) else 0  # type: ignore[attr-defined]
         if is_library(cls):
-            if cls.__flags__ & HEAP:
-                held = [value for name, value in vars(cls).items() if name not in BESIDES]
-                self.alive += held
-                self.note(*map(id, held))
-                self._all(cls.__mro__[1:])
+            held = [value for name, value in vars(cls).items() if name not in BESIDES] if cls.__flags__ & HEAP else []
+            self.alive += held
+            self.note(id(cls), others, *map(id, held))
+            for base in cls.__bases__:
+                self._class(base)
             return
+        self.note(id(cls), others)
         if not is_library(type(cls)) or not is_made(cls):
             raise Unseen(cls.__name__)
         self._all(cls.__mro__[1:])
