@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from torchgco.kernels import chord_clearance
@@ -205,7 +205,7 @@ class Rest:
             return None
         blocks = found[0].blocks
         ways = np.append(found[0].costs[end], np.inf)[blocks.block].reshape(blocks.counts)[..., 0]
-        ways = np.where(np.isfinite(ways), ways, minimum_filter(ways, 3, mode="nearest"))
+        ways = np.where(np.isfinite(ways), ways, scipy.ndimage.minimum_filter(ways, 3, mode="nearest"))
         return cls(blocks.lattice, blocks.side, ways)
 
     def __call__(self, poses: Array) -> Array:
