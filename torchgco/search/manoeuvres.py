@@ -25,7 +25,7 @@ from torchgco.search.chords import EXTRA
 from torchgco.search.poses import ARC_LENGTH, TIGHTEST, Poses, clear_at
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solved
-from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
+from torchgco.search.steering import SAME_MODEL, alike, sampled
 
 GROWTH_ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
 SPOT_TURN = 0.125  # rad that a vehicle turns on the spot from one pose to the next
@@ -60,11 +60,9 @@ def car(problem: Problem) -> Car | None:
     seen = sampled(problem)
     if seen is None:
         return None
-    z, n, at = seen.z, problem.n, problem.position
-    places = heading_and_speed(z[0, :, :n], seen.rates[:, at], seen.slopes[:, at])
-    if places is None or any(part.points.attitude.of != places[0] for part in bodies):
+    z, n, (heading, speed) = seen.z, problem.n, seen.places
+    if any(part.points.attitude.of != heading for part in bodies):
         return None
-    heading, speed = places
     radius = max(float(part.vehicle_radius.max()) for part in bodies)
     if not alike(seen.rates[:, heading], z[0, :, speed] * seen.slopes[:, heading, speed]):
         arc = TIGHTEST * ARC_LENGTH * radius
