@@ -96,7 +96,7 @@ class NativeKernels(Kernels):
         if not self.engine.measures:
             return super().violation(problem, X, U, obstacles)
         worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
-        self.engine.run(name, problem.B, self.engine.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
+        self.engine.run(name, problem.B, self.engine.placed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
         return worst
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
@@ -106,7 +106,7 @@ class NativeKernels(Kernels):
             return clearance_of(others, X, share)
         U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
         contact = 1.0 - (TOUCH if share is None else share)
-        packed = self.engine.packed(problem, X=X.contiguous(), U=U, merit=least, gain=contact)
+        packed = self.engine.placed(problem, X=X.contiguous(), U=U, merit=least, gain=contact)
         self.engine.run("tgco_chords", problem.B, packed)
         return clearance_of(others, X, share, least)
 

@@ -95,7 +95,7 @@ class InteriorEngine:
         out = {"status": torch.zeros(problem.B, dtype=torch.int32)}
         out["iterations"] = torch.zeros(problem.B, dtype=torch.int64)
         out["gains"] = X.new_zeros(problem.B, problem.N, problem.m, problem.n + 1)
-        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
+        rows = [constraint.copy() for constraint in self.engine._rows(problem)[1]]
         for row, lam in zip(rows, multipliers, strict=True):
             row.lam = lam
         return self.engine.packed(problem, X=X, U=U, constraint=rows, **out), out

@@ -79,7 +79,7 @@ class Sampled(NamedTuple):
 
 
 def sampled(problem: Problem) -> Sampled | None:
-    """None for vehicles that don't drive in a plane along their heading, by equations that are the same at all times."""
+    """None for vehicles that don't drive in a plane along their heading, by the same equations at all times."""
     model, at = problem.dynamics, problem.dynamics.position
     if at is None or at.stop - at.start != 2 or model.at(0) is not model or problem.m < 2 or not model.is_integrated:
         return None
