@@ -208,8 +208,8 @@ def _checked(warm: Any) -> Solution | None:
 
 def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor | None) -> tuple[Problem, Tensor]:
     """Controls (B, N, m) to begin with, where none are given, and the problem with the guess of its free starts."""
-    if U0 is not None:  # traced once, for the solve and for the warnings after it
-        return (current(problem) if for_solvers(problem) is problem else problem), U0
+    if U0 is not None:
+        return current(problem), U0  # traced once, for the solve and for the warnings after it
     if warm is not None:
         if problem.time is not None:
             problem = guessing_times(problem, warm.t)
@@ -219,11 +219,10 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
         return problem, warm.U
     if problem.B == 0:
         return problem, problem.x0.new_zeros(0, problem.N, problem.m)
+    problem = current(problem)  # traced once, for the guess too
     whole = for_solvers(problem)
-    traced = current(whole)
-    solver.announce(traced)
-    problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
-    return problem, _guess(problem, traced)
+    solver.announce(whole)
+    return problem, _guess(problem, whole)
 
 
 def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
