@@ -23,7 +23,7 @@ from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
 from torchgco.kernels import current, open_loop
-from torchgco.lagrangian.quality import has_arrived
+from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -237,7 +237,7 @@ def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
 
 def _warn_of_horizon(problem: Problem, solution: Solution, claims: Tensor) -> None:
     """A HorizonWarning where no feasible trajectory arrives, as none can."""
-    if problem.goal is None or bool((claims & has_arrived(problem, solution.X)).all()):
+    if not ranks_arrival(problem) or bool((claims & has_arrived(problem, solution.X)).all()):
         return
     if (told := short_horizons(problem)) is not None:
         warnings.warn(told, HorizonWarning, stacklevel=4)
