@@ -20,10 +20,10 @@ from hydra.core.utils import JobRuntime
 from omegaconf import DictConfig
 
 from torchgco import kernels
+from torchgco.base.memory import trim
 from torchgco.experiments.config import build, checks
 from torchgco.experiments.config.groups import config_dir
 from torchgco.native.compiler import find_compiler
-from torchgco.native.store import trim
 
 ROOT = Path(__file__).parents[1]
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start

@@ -122,7 +122,7 @@ def test_no_slow_module_is_loaded_before_it_is_needed() -> None:
         "import sys, torch; sys.modules['casadi'] = None  # whoever imports it gets an ImportError\n"
         "loaded = lambda *names: print([m for m in names if m in sys.modules])\n"
         "import torchgco, torchgco.baselines; from torchgco.tracing import Traced\n"
-        "loaded('hydra', 'matplotlib', 'pandas')\n"
+        "loaded('hydra', 'matplotlib', 'pandas', 'scipy.ndimage', 'scipy.optimize', 'scipy.spatial')\n"
         "for model in (torchgco.QuadrotorPlanning(), torchgco.QuadrotorPlant()):\n"
         "    x, u = torch.zeros(1, model.n), torch.zeros(1, model.m)\n"
         "    Traced('step', lambda i, x, u: model.step(x, u), x, u).fingerprint()\n"

@@ -64,6 +64,8 @@ def refuse_forms(problem: Problem, what: str) -> None:
 
 def _captures(problem: Problem) -> bool:
     """Whether values of users' functions lead to tensors that ask for gradients, as those of the first problem show."""
+    if not any(map(is_users, (problem.dynamics, problem.cost, *problem.constraints))):
+        return False
     one = problem.take(slice(0, 1))
     X, U = (part.detach() for part in one.at_rest)
     uses: list[tuple[object, Callable[[], Tensor]]] = [

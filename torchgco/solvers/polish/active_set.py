@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 BLOCK_TRIES = 10  # exchanges of whole blocks without progress before rows are exchanged one at a time
@@ -61,7 +61,7 @@ def projected(V: Tensor, b: Tensor, free: Tensor) -> Tensor | None:
     target = np.zeros(len(E))
     target[-1] = 1.0
     try:
-        pushes = nnls(E, target, maxiter=10 * E.shape[1])[0]
+        pushes = scipy.optimize.nnls(E, target, maxiter=10 * E.shape[1])[0]
     except RuntimeError:
         return None
     distance = 1.0 - float(E[-1] @ pushes)
