@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, NonNegative, Share, check_options
+from torchgco.base.options import Count, NonNegative, Share
 from torchgco.base.status import STALLED, Status
 from torchgco.base.tree import put, take
 from torchgco.ilqr.descent import Descent
@@ -23,7 +23,7 @@ from torchgco.solvers.session import Session
 
 
 @dataclass(frozen=True)
-class ILQR(Solver):
+class ILQR(Solver, named="ilqr"):
     """Iterative LQR: expansions, backward pass, line search, until L_M no longer falls.
 
     Used alone, it makes one inner solve; constraints count only through the multipliers and penalties of a warm start,
@@ -50,9 +50,6 @@ class ILQR(Solver):
     max_iterations: Count = 50
     line_search: LineSearch = LineSearch()
     damp_below: Share = 0.0
-
-    def __post_init__(self) -> None:
-        check_options(self, "ilqr")
 
     @property
     def descent(self) -> Descent:
