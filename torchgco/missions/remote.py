@@ -37,7 +37,7 @@ from torchgco.base.tree import Rows
 HEAD = struct.Struct("<4sHHQd")
 LETTERS, PROTOCOL = b"TGCO", 1
 AT_ONCE = 32  # vehicles in a datagram: 6.4 kB, which every system sends in one piece
-SENT, ANSWERED = 25, 17  # numbers of a row
+ANSWERED = 17  # numbers of a row
 LARGEST = 65_536  # bytes of a datagram
 _numbers = count(1)
 

@@ -20,10 +20,9 @@ from torchgco.lagrangian.lagrangian import Multipliers, shifted, update_and_rais
 from torchgco.missions.constraints import RotorLimits, ThrustSum
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
-from torchgco.solvers.ilqr import ILQR
-from torchgco.solvers.repeated import RepeatedDescent
+from torchgco.solvers.ilqr import ILQR, RepeatedDescent
 
-RATES, THRUST = slice(10, 13), 13  # in the planning model's state: w and a
+RATES = slice(10, 13)  # in the planning model's state
 FIRST_ROUNDS = 3  # inner solves of the first call
 
 

@@ -15,8 +15,8 @@ from torchgco.maps.grid import OccupancyGrid
 
 PLY = "a ply file of points with x, y and z"
 PLY_HEADER = 2**20  # bytes of a header
-FORMAT = re.compile(rb"(?m)^format[ \t]+(?:ascii|binary_little_endian|binary_big_endian)[ \t]+1\.0[ \t\r]*$")
-ELEMENT = re.compile(rb"(?m)^element[ \t]+(\S+)[ \t]+(\d{1,18})[ \t\r]*$")
+PLY_FORMAT = re.compile(rb"(?m)^format[ \t]+(?:ascii|binary_little_endian|binary_big_endian)[ \t]+1\.0[ \t\r]*$")
+PLY_ELEMENT = re.compile(rb"(?m)^element[ \t]+(\S+)[ \t]+(\d{1,18})[ \t\r]*$")
 
 
 def read_ply(source: Source, resolution: float | None, solid: bool | None) -> np.ndarray | OccupancyGrid:
@@ -30,9 +30,9 @@ def read_ply(source: Source, resolution: float | None, solid: bool | None) -> np
     header, _, _ = raw[:PLY_HEADER].partition(b"end_header")
     if not header.startswith(b"ply") or len(header) == min(len(raw), PLY_HEADER):
         source.refuse(f"{PLY} with a header that ends with end_header", f"{raw[:20]!r} at its beginning")
-    if FORMAT.search(header) is None:
+    if PLY_FORMAT.search(header) is None:
         source.refuse(f"{PLY} in format ascii or binary, 1.0", "another one")
-    counts = {name: int(count) for name, count in ELEMENT.findall(header)}
+    counts = {name: int(count) for name, count in PLY_ELEMENT.findall(header)}
     count = counts.get(b"vertex", 0)
     if counts.get(b"face") or counts.get(b"tristrips"):
         return read_mesh(source, resolution, solid)
