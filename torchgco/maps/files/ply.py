@@ -9,12 +9,14 @@ from io import BytesIO
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.memory import limited
 from torchgco.maps.files.meshes import library_of_meshes, read_mesh
-from torchgco.maps.files.source import MOST_POINTS, MOST_TEXT, Source, finite_points
+from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, MOST_TEXT, Source, finite_points
 from torchgco.maps.grid import OccupancyGrid
 
 PLY = "a ply file of points with x, y and z"
 PLY_HEADER = 2**20  # bytes of a header
+PLY_MEMORY = 4 * MOST_BYTES  # bytes while it is read: text takes a multiple of its own
 PLY_FORMAT = re.compile(rb"(?m)^format[ \t]+(?:ascii|binary_little_endian|binary_big_endian)[ \t]+1\.0[ \t\r]*$")
 PLY_ELEMENT = re.compile(rb"(?m)^element[ \t]+(\S+)[ \t]+(\d{1,18})[ \t\r]*$")
 
@@ -47,7 +49,7 @@ def read_ply(source: Source, resolution: float | None, solid: bool | None) -> np
     if b"ascii" in header:
         source.limit(len(raw), MOST_TEXT, "bytes of text")
     trimesh = library_of_meshes(source)
-    with source.library(PLY), warnings.catch_warnings():
+    with source.library(PLY), limited(PLY_MEMORY), warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy's, of text that holds no numbers
         held = trimesh.exchange.ply.load_ply(BytesIO(raw), skip_materials=True)
         points = np.asarray(held.get("vertices", np.empty((0, 3))), np.float64)
