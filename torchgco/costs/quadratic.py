@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -11,9 +12,12 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks
+from torchgco.base.numbers import Floats, Number, Wrong, at_least_zero, finite, numbers
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, lead, tensor
 from torchgco.costs.base import Cost, add_blocks
 from torchgco.costs.in_free_time import QuadraticInFreeTime
+
+WEIGHTS = "Q", "R", "Qf"
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,67 @@ class BoundQuadratic(Cost):
     def precision(self, dtype: torch.dtype) -> AbstractContextManager[None]:
         # No number is made of a knot's; a user's subclass may.
         return nullcontext() if type(self) is BoundQuadratic else super().precision(dtype)
+
+    def numbers(self, where: str, after: Callable[[], object] | None = None) -> list[Number]:
+        if type(self) is not BoundQuadratic:  # of which kernels read what its code computes
+            return super().numbers(where)
+        found = [Number(f"{where}.x_ref", (self.x_ref.numpy(), self.xf_ref.numpy()), where, False, finite, after)]
+        for name in ("u_ref", *WEIGHTS, "q", "r", "qf", "H"):
+            tensor = getattr(self, name)
+            if tensor is not None:
+                check = finite if name not in WEIGHTS else at_least_zero if self.diagonal else _matrices
+                joint = self._check_new if name in ("Q", "R", "H") and self.H is not None else None
+                found += numbers(where, {name: (tensor, check)}, where, False, joint=joint)
+        return found
+
+    def _check_new(self, new: Mapping[str, Floats]) -> None:
+        """Check Q, R and H together: each alone may be fine, and the stage cost still fall without end."""
+        own = {name: new.get(f"cost.{name}", getattr(self, name).numpy()) for name in (*WEIGHTS, "H")}
+        check_semidefinite(**{name: torch.tensor(weights) for name, weights in own.items()})
+
+    def by_knot(self, N: int) -> BoundQuadratic:
+        """The same with references of its own memory for each stage."""
+        refs = {name: getattr(self, name) for name in ("x_ref", "u_ref")}
+        return replace(self, **{name: ref.expand(-1, N, -1).clone() for name, ref in refs.items()})
+
+    @property
+    def kernel(self) -> str:
+        return "quadratic" if type(self) is BoundQuadratic else "function"
+
+    def names_by_stage(self) -> set[str]:
+        names = "x_ref", "u_ref", "Q", "R", "q", "r", "H"
+        return {name for name in names if (part := getattr(self, name)) is not None and part.shape[1] > 1}
+
+    def with_more(self, n: int, r: int) -> Cost:
+        if type(self) is not BoundQuadratic:
+            return super().with_more(n, r)
+        parts = {}
+        for name in ("Q", "Qf", "x_ref", "xf_ref", "q", "qf", "H"):
+            value, more = getattr(self, name), r if name in ("Q", "Qf") and not self.diagonal else 0
+            parts[name] = None if value is None else torch.nn.functional.pad(value, (0, r, 0, more))
+        return replace(self, **parts)
+
+    def ending(self, stages: Tensor, running: Tensor, resting: Tensor) -> BoundQuadratic:
+        """The same with the weights of the controls alone, a diagonal above 0, after each problem's last stage.
+
+        Args:
+            stages: numbers of stages (B,), whose knots' references are the terminal ones.
+            running: stages of each problem, (B, N) bool.
+            resting: references (B, N, m) of the controls after these.
+        """
+        runs = running.unsqueeze(-1) if self.diagonal else running[..., None, None]
+        parts: dict[str, Tensor | None] = {"u_ref": torch.where(running.unsqueeze(-1), self.u_ref, resting)}
+        for name in ("Q", "H", "q", "r"):
+            value = getattr(self, name)
+            own = running.unsqueeze(-1) if name in ("q", "r") else runs
+            parts[name] = None if value is None else torch.where(own, value, 0.0)
+        weights = torch.where(self.control_curvatures > 0, self.control_curvatures, 1.0)
+        parts["R"] = torch.where(runs, self.R, weights if self.diagonal else torch.diag_embed(weights))
+        if self.x_ref.shape[1] > 1:
+            B = len(stages)
+            every = torch.cat((self.x_ref.expand(B, -1, -1), self.xf_ref.expand(B, -1).unsqueeze(1)), dim=1)
+            parts["xf_ref"] = every[torch.arange(B, device=stages.device), stages]
+        return replace(self, **parts)
 
     @property
     def control_curvatures(self) -> Tensor:
@@ -237,3 +302,7 @@ def unfit(W: Tensor, what: str = "a weight") -> tuple[str, str] | None:
         return "a symmetric matrix", "an unsymmetric one"
     lowest = float(torch.linalg.eigvalsh(W).min())
     return (f"{what} that is positive semidefinite", f"an eigenvalue of {lowest:.3g}") if lowest < -rounding else None
+
+
+def _matrices(new: Floats) -> Wrong:
+    return finite(new) or unfit(torch.from_numpy(new))

@@ -7,14 +7,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.base import Distance
+from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics import rollout
 from torchgco.kernels.choice import kernels_of
 from torchgco.kernels.in_pytorch import InteriorKernels, clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.obstacles.base import Obstacles
 from torchgco.problem.between import bends, bulge, paths
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
@@ -79,8 +78,8 @@ def cost_scale(problem: Problem) -> CostScale:
 def is_convex(problem: Problem) -> bool:
     """Whether a problem is known to be convex: affine dynamics, a quadratic cost, and bounds."""
     cost = problem.cost.cost if isinstance(problem.cost, ShiftedCost) else problem.cost
-    bounded = all(isinstance(part, ControlBounds | StateBounds) for part in problem.constraints)
-    return bounded and isinstance(cost, BoundQuadratic) and kernels_of(problem).affine
+    bounded = all(isinstance(part, Bounds) for part in problem.constraints)
+    return bounded and cost.kernel == "quadratic" and kernels_of(problem).affine
 
 
 def chord_clearance(problem: Problem, X: Tensor, share: float | None = None) -> Tensor:
@@ -106,7 +105,7 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         if path.pieces > 1:
             rows = near[path.rows]
             parts = (constraint.bare for constraint in problem.take(rows).constraints)
-            fine = [part.in_pieces(path.pieces) if isinstance(part, Obstacles) else part for part in parts]
+            fine = [part.in_pieces(path.pieces) for part in parts if isinstance(part, Distance)]
             found[rows] = clearance_of(fine, path.X, None)
     return found
 

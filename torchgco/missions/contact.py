@@ -11,14 +11,11 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, undefined
 from torchgco.base.tree import PerElement
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.judging.judge import CLEARANCES, by_kind
-from torchgco.maps.field import BoundField
 from torchgco.missions.planning_problem import airframe_of, planning_state
 from torchgco.obstacles.base import ADMITTED, TOUCH, Obstacles
-from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
 
@@ -44,11 +41,12 @@ class Contact(PerElement):
         """
         found = tuple(part for part in problem.constraints if isinstance(part, Obstacles))
         for part in found:
-            by_kind(CLEARANCES, part)
-        maps = [isinstance(part.inscribed, BoundField) for part in found]  # flown at 0.95 of the radius, too
+            if type(part).measured is Obstacles.measured:
+                raise undefined(part, "measured")
+        maps = [part.map is not None for part in found]  # flown at 0.95 of the radius, too
         shrunk = (part.grown(ADMITTED - TOUCH * part.vehicle_radius) for part in found)
         found = tuple(less if is_map else part for less, is_map, part in zip(shrunk, maps, found, strict=True))
-        return cls(found, airframe_of(problem.dynamics) if any(isinstance(part, BoundBody) for part in found) else None)
+        return cls(found, airframe_of(problem.dynamics) if any(part.body is not None for part in found) else None)
 
     @property
     def moving(self) -> bool:
@@ -70,7 +68,7 @@ class Contact(PerElement):
     def along(self, x: Tensor, dt: float) -> Tensor:
         """Smallest distances (B,) on the ways between x (B, K, 17), K above 0, at times k dt, s.
 
-        Positions move straight from one to the next; a body turns evenly, see `body_clearance`.
+        Positions move straight from one to the next; a body turns evenly, see `BoundBody.clearances`.
         """
         return self._nearest(x, 0.0, dt) if x.shape[1] > 1 else self.distance(x[:, 0], 0.0)
 
@@ -82,8 +80,8 @@ class Contact(PerElement):
         """How far (B,), m, the part of the vehicle that moved farthest is from where it was: of x (B, 17) each."""
         found = (now[..., :3] - before[..., :3]).norm(dim=-1)
         for part in self.obstacles:
-            if isinstance(part, BoundBody):
-                a, b = (part.points.at(self._planning(x)) for x in (before, now))
+            if part.body is not None:
+                a, b = (part.places(self._planning(x)) for x in (before, now))
                 found = torch.maximum(found, (b - a).norm(dim=-1).amax(-1))
         return found
 
@@ -91,8 +89,8 @@ class Contact(PerElement):
         p, nearest = x[..., :3].contiguous(), torch.full_like(x[:, 0, 0], torch.inf)
         for part in self.obstacles:
             now = part.later(t).with_step(dt) if part.moving else part
-            X = self._planning(x) if isinstance(part, BoundBody) else p
-            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(now, X)[1])
+            X = p if part.body is None else self._planning(x)
+            nearest = torch.minimum(nearest, now.clearances(X)[1])
         return nearest
 
     def _planning(self, x: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +20,8 @@ from torchgco.obstacles.base import ABSENT, OwnKind, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, segment_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
+from torchgco.obstacles.measured import Distances, box_distances
+from torchgco.obstacles.shapes import RoundedBoxes, array
 
 
 @dataclass(frozen=True)
@@ -103,11 +106,30 @@ class BoundOscillatingBoxes(OwnKind):
         gap = gap + (self.beneath(share) - self.boxes.inflated_radii).unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
+    def measured(self, X: Tensor) -> Distances:
+        t = self.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1)
+        away, strongest = [], []
+        for i, p in enumerate(X[..., self.position].unbind(-1)):
+            sines = (part[..., i].unbind(-1) for part in (self.amplitudes, self.rates, self.phases))
+            place, most = self.boxes.centers[..., i].unsqueeze(1), torch.zeros_like(self.boxes.centers[..., i])
+            for amplitude, rate, phase in zip(*sines, strict=True):
+                angle = rate.unsqueeze(1) * t + phase.unsqueeze(1)
+                place, most = place + amplitude.unsqueeze(1) * angle.sin(), most + amplitude.abs() * rate**2
+            away.append(p.unsqueeze(2) - place)
+            strongest.append(most)
+        # Seen from a box, the way between two knots leaves its chord by dt^2 / 8 of the box's acceleration at most.
+        bulge = self.dt**2 / 8.0 * torch.stack(strongest, dim=-1).norm(dim=-1)
+        return box_distances(self.boxes, torch.stack(away, dim=-1), bulge)
+
     @property
     def bulge(self) -> Tensor:
         """How far a centre's path may leave its chord between two knots, (B, M), m: dt^2 / 8 of its acceleration."""
         most = (self.amplitudes.abs() * self.rates.square()).sum(-2).square().sum(-1).sqrt()
         return self.dt**2 / 8.0 * most
+
+    def shapes(self, b: int) -> RoundedBoxes:
+        sines = np.stack([array(part[b]) for part in (self.amplitudes, self.rates, self.phases)])
+        return RoundedBoxes.of(self._solids, self.vehicle_radius, b, sines=sines)
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, boxes=self.boxes.grown(by))

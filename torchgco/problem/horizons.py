@@ -18,17 +18,12 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import lead
 from torchgco.base.tree import passed_on
 from torchgco.base.values import asks_for_knot
-from torchgco.constraints.base import Constraint, FunctionConstraint, WrappedConstraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
-from torchgco.constraints.norms import NO_ROW
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import bounds_of
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
-from torchgco.maps.field import BoundField
-from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.in_time import in_time
 from torchgco.problem.problem import Problem
 from torchgco.problem.rates import with_controls_before
@@ -77,12 +72,11 @@ def at_rest_after(problem: Problem, U: Tensor) -> Tensor:
 def _resting(problem: Problem) -> Tensor:
     """Controls (B, N, m) at rest; the middle of their bounds where they aren't inside of these."""
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-    for bounds in problem.constraints:
-        if isinstance(bounds, ControlBounds):
-            held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
-            inside = (held > lower) & (held < upper)
-            rest = rest.clone()
-            rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
+    for bounds in bounds_of(problem.constraints, "u"):
+        held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+        inside = (held > lower) & (held < upper)
+        rest = rest.clone()
+        rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
     return rest
 
 
@@ -126,8 +120,8 @@ def _of_stages(values: Tensor, k: int | Tensor, like: Tensor) -> Tensor:
 
 def _cost(problem: Problem, running: Tensor) -> Cost:
     cost, resting = problem.cost, _resting(problem)
-    if type(cost) is BoundQuadratic:
-        return _quadratic(_with_last_reference(cost, problem.stages), running, resting)
+    if isinstance(cost, BoundQuadratic) and cost.kernel == "quadratic":
+        return cost.ending(problem.stages, running, resting)
     if isinstance(cost, FunctionCost):
         if cost.terminal_function is not None and asks_for_knot(cost.terminal_function):
             raise InputError("horizon", "a terminal function without an argument k: `knot_values` serve", "one with it")
@@ -142,28 +136,6 @@ def _cost(problem: Problem, running: Tensor) -> Cost:
     weight = torch.where(torch.isfinite(weight) & (weight > 0), weight, 1.0)
     kind = _Stages if type(cost).expand is Cost.expand else _OwnExpansion
     return kind(cost, running.to(X.dtype), resting, weight)
-
-
-def _with_last_reference(cost: BoundQuadratic, last: Tensor) -> BoundQuadratic:
-    """The same cost, whose terminal references are those of the knots `last` (B,), each problem's own."""
-    if cost.x_ref.shape[1] == 1:
-        return cost
-    every = torch.cat((cost.x_ref.expand(len(last), -1, -1), cost.xf_ref.expand(len(last), -1).unsqueeze(1)), dim=1)
-    return replace(cost, xf_ref=every[torch.arange(len(last), device=last.device), last])
-
-
-def _quadratic(cost: BoundQuadratic, running: Tensor, resting: Tensor) -> BoundQuadratic:
-    """The same cost with the weights of the controls alone after the last stages: a diagonal above 0."""
-    runs = running.unsqueeze(-1) if cost.diagonal else running[..., None, None]
-    parts: dict[str, Tensor | None] = {"u_ref": torch.where(running.unsqueeze(-1), cost.u_ref, resting)}
-    for name in ("Q", "H", "q", "r"):
-        value = getattr(cost, name)
-        own = running.unsqueeze(-1) if name in ("q", "r") else runs
-        parts[name] = None if value is None else torch.where(own, value, 0.0)
-    weights = cost.R if cost.diagonal else cost.R.diagonal(dim1=-2, dim2=-1)
-    weights = torch.where(weights > 0, weights, 1.0)
-    parts["R"] = torch.where(runs, cost.R, weights if cost.diagonal else torch.diag_embed(weights))
-    return replace(cost, **parts)
 
 
 @dataclass(frozen=True)
@@ -223,62 +195,4 @@ def _constraint(problem: Problem, i: int) -> Constraint:
     if counts.shape[1] > 0 and bool(missing.any()):
         b = int(missing.nonzero()[0, 0])
         raise InputError("horizon", f"a knot of constraints[{i}] within each", f"{int(horizon[b])} of problem {b}")
-    if isinstance(constraint, Obstacles):
-        return _obstacles(constraint, problem, i)
-    if isinstance(constraint, ControlBounds):
-        return constraint  # controls at rest are within them
-    if isinstance(constraint, StateBounds | RateBounds):
-        lower, upper = constraint.by_knot
-        each = counts.unsqueeze(-1)
-        return replace(
-            constraint, lower=torch.where(each, lower, -torch.inf), upper=torch.where(each, upper, torch.inf)
-        )
-    knots = torch.arange(problem.N + 1, device=horizon.device)[constraint.knots]
-    stands = counts & (knots == problem.N) & (horizon < problem.N).unsqueeze(-1)
-    if isinstance(constraint, FunctionConstraint) and bool(stands.any()):
-        if asks_for_knot(constraint.function):
-            expected = "a function without an argument k at the last knots: `knot_values` serve"
-            raise InputError("horizon", expected, f"one with it in constraints[{i}]")
-        constraint = replace(constraint, values=constraint.values.ending_at(horizon))
-    return _Rows(constraint, counts.to(problem.x0.dtype))
-
-
-def _obstacles(obstacles: Obstacles, problem: Problem, i: int) -> Obstacles:
-    """Obstacles that don't count after the last knots; those of knot N alone meet the state of the last knot there."""
-    horizon = problem.horizon
-    assert horizon is not None
-    late = torch.arange(problem.N + 1, device=horizon.device)[obstacles.knots].tolist()
-    if late == [problem.N] and not obstacles.moving:
-        return obstacles
-    if problem.N in late and not all(obstacles.holds_at(int(h)) for h in horizon.unique()):
-        raise InputError("horizon", f"last knots at which constraints[{i}] holds", horizon.unique().tolist())
-    if not isinstance(obstacles.inscribed, BoundSpheres | BoundBoxes | BoundField):
-        got = type(obstacles.inscribed).__name__
-        raise InputError("horizon", "obstacles that are Spheres, Boxes, Capsules or a Field", got)
-    return obstacles.stopping_at(horizon)
-
-
-@dataclass(frozen=True)
-class _Rows(WrappedConstraint):
-    """A constraint whose rows count at some of its knots."""
-
-    counts: Tensor  # (B, K): 1 where they count, else 0
-
-    batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else NO_ROW)
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._where(self.constraint.violation(X, U), 0.0)
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        rows, knots = self.constraint.at(x, k), self.knots
-        place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
-        return torch.where(self.counts[:, place, None, None] > 0, rows, NO_ROW)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)
-
-    def _where(self, rows: Tensor, other: float) -> Tensor:
-        return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
+    return constraint.ending(horizon, problem.N, counts.to(problem.x0.dtype), f"constraints[{i}]")
