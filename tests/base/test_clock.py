@@ -1,4 +1,4 @@
-"""By the clock of solves, compiling takes no time: every library that is loaded takes an hour of the clock here."""
+"""By the clock of solves, compiling takes no time: every library that is loaded takes an hour of the clocks here."""
 
 import threading
 from collections.abc import Callable
@@ -21,7 +21,7 @@ HOUR = 3600.0
 
 @pytest.fixture
 def loads(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The clock, which moves by loads alone, one entry a load; no library is loaded yet."""
+    """The clocks, which move by loads alone, one entry a load; no library is loaded yet."""
     found, load = list[float](), compiler._load
 
     def slow(*words: object) -> object:
@@ -29,7 +29,7 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         return load(*words)  # type: ignore[arg-type]
 
     monkeypatch.setattr(clock, "_left", clock._Left())
-    monkeypatch.setattr(clock, "_now", lambda: sum(found))
+    monkeypatch.setattr(clock, "_now", lambda: (sum(found), sum(found)))
     monkeypatch.setattr(compiler, "_load", slow)
     monkeypatch.setattr(compiler, "_loaded", {})
     monkeypatch.setattr(choice, "_engines", {})
@@ -41,9 +41,9 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 def test_solves_and_their_limits(B: int, loads: list[float]) -> None:
     """Few problems have libraries of their own."""
     problem, U0 = planar_batch(B=B, N=30, obstacles=9, seed=B)
-    began = clock.seconds()
+    began = clock.seconds(), clock.processor_seconds()
     solution = quick_gco(problem).solve(problem, U0, max_seconds=HOUR / 2)
-    assert len(loads) >= 2 and clock.seconds() == began
+    assert len(loads) >= 2 and (clock.seconds(), clock.processor_seconds()) == began
     assert Status.TIME_LIMIT not in solution.statuses
 
 

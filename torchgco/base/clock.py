@@ -9,10 +9,10 @@ from contextlib import contextmanager
 
 
 class _Left(threading.local):
-    """What a thread's clock leaves out, s, and since when it has stood still."""
+    """What a thread's clocks leave out: by wall and by processor, s, and since when they have stood still."""
 
-    out: float = 0.0
-    since: float | None = None
+    out: tuple[float, float] = 0.0, 0.0
+    since: tuple[float, float] | None = None
 
 
 _left = _Left()
@@ -20,7 +20,7 @@ _left = _Left()
 
 @contextmanager
 def setting_up() -> Iterator[None]:
-    """Code is traced, compiled, or loaded in this block: the clock of its thread stands still, those of others run."""
+    """Code is traced, compiled, or loaded in this block: the clocks of its thread stand still, those of others run."""
     if _left.since is not None:
         yield
         return
@@ -28,13 +28,19 @@ def setting_up() -> Iterator[None]:
     try:
         yield
     finally:
-        _left.out, _left.since = _left.out + _now() - began, None
+        wall, processor = (at - before for at, before in zip(_now(), began, strict=True))
+        _left.out, _left.since = (_left.out[0] + wall, _left.out[1] + processor), None
 
 
 def seconds() -> float:
     """Seconds since some moment without what this thread has spent on `setting_up`; only differences mean something."""
-    return (_now() if _left.since is None else _left.since) - _left.out
+    return (_left.since or _now())[0] - _left.out[0]
 
 
-def _now() -> float:
-    return time.perf_counter()
+def processor_seconds() -> float:
+    """The same of all processors that this process uses, its children apart."""
+    return (_left.since or _now())[1] - _left.out[1]
+
+
+def _now() -> tuple[float, float]:
+    return time.perf_counter(), time.process_time()

@@ -22,7 +22,7 @@ from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
 from torchgco.solvers.ilqr import ILQR, RepeatedDescent
 
-RATES = slice(10, 13)  # in the planning model's state
+RATES, THRUST = slice(10, 13), 13  # in the planning model's state: w and a
 FIRST_ROUNDS = 3  # inner solves of the first call
 
 

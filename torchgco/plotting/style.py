@@ -39,7 +39,7 @@ KNOWN: dict[str, tuple[str, Dash]] = {
     "gco_max": ("#332288", DASHES[2]), "multistart": ("#999933", DASHES[5]), "fatrop_guided": ("#117733", DASHES[2]),
     "path_pursuit": ("#CC6677", DASHES[3]),
 }  # fmt: skip
-INK = "#333333"
+INK, FAINT = "#333333", "#BBBBBB"
 EDGE = "#A39B8B"  # of obstacles
 DPI = 80  # of animations
 SMALL, TEXT, TITLE = 8, 9, 10  # points

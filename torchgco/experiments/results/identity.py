@@ -179,7 +179,7 @@ def layout_digests(
     moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
     codes = {}
     for i, number in enumerate(layouts.ids.tolist()):
-        own = _there(layouts, SPHERES if moves else REQUIRED, i)
+        own: dict[str, Any] = {**_there(layouts, SPHERES if moves else REQUIRED, i)}
         boxes = _there(layouts, (*BOXES, *SINES), i)
         if "box_radii" in boxes and not boxes["box_radii"].any():
             del boxes["box_radii"]  # sharp boxes, as without the array
