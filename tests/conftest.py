@@ -17,7 +17,6 @@ import torch
 import yaml
 
 from torchgco import kernels
-from torchgco.base.memory import trim
 from torchgco.experiments.config import build, checks
 from torchgco.native.compiler import find_compiler
 
