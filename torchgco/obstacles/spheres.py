@@ -19,8 +19,8 @@ from torchgco.base.numbers import Number, lengths, numbers, present
 from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of
 from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint, Lowered, resolve_knots
-from torchgco.costs.base import add_at
 from torchgco.constraints.norms import NO_ROW
+from torchgco.costs.base import add_at
 from torchgco.obstacles.base import TOUCH, Obstacles, OwnKind, Solids, copied, least, marked, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, points, vehicle_radii

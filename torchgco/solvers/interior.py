@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.options import Count, Positive
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
@@ -66,7 +66,7 @@ FILTER: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class InteriorPoint(Solver):
+class InteriorPoint(Solver, named="solver"):
     """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
 
     States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
@@ -91,9 +91,6 @@ class InteriorPoint(Solver):
     max_iterations: Count = 500
     initial_barrier: Positive = 0.1
     warm_barrier: Positive = 1e-6
-
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
