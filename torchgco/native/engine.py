@@ -25,8 +25,7 @@ from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.codegen.stages import trace_model
-from torchgco.native.compiler import Unit
-from torchgco.native.declarations import load
+from torchgco.native.compiler import Unit, build
 from torchgco.native.packing import (
     constraint_of,
     guide_of,
@@ -38,7 +37,7 @@ from torchgco.native.packing import (
     shared_fields,
 )
 from torchgco.native.shared import Captured, Shared
-from torchgco.native.structures import STRUCTURES, Kind, array
+from torchgco.native.structures import Kind, array
 from torchgco.obstacles.in_free_time import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
@@ -85,13 +84,13 @@ class Engine:
             ahead(self)
         self._libraries: dict[Hashable, ctypes.CDLL] = {}
         if compiles:
-            self.library = load(self.form.units(), STRUCTURES)
+            self.library = build(self.form.units())
 
     def further(self, name: Hashable, units: Callable[[], Sequence[Unit]]) -> ctypes.CDLL:
         """A further library of this form, which this engine and those with other shared numbers keep."""
         if name not in self._libraries:
             with setting_up():
-                self._libraries[name] = load(units(), STRUCTURES)
+                self._libraries[name] = build(units())
         return self._libraries[name]
 
     def forget_values(self) -> None:

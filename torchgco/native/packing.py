@@ -129,7 +129,7 @@ def _spheres(parts: Sequence[BoundSpheres]) -> dict[str, Any]:
 
 
 def _box_numbers(boxes: BoundBoxes) -> Tensor:
-    """The numbers (B, ...) that boxes.c reads: bounds of all boxes, axis by axis, factors, all numbers of each."""
+    """The numbers (B, ...) that boxes.h reads: bounds of all boxes, axis by axis, factors, all numbers of each."""
     absent, radius = boxes.absent.unsqueeze(-1), boxes.inflated_radii.unsqueeze(-1)
     reach = marked(BOUND_SLACK * (boxes.inflated().extent + radius), absent)
     bounds = torch.stack((boxes.centers, reach), dim=-1).transpose(1, 2)
@@ -138,7 +138,7 @@ def _box_numbers(boxes: BoundBoxes) -> Tensor:
 
 
 def _field(parts: Sequence[BoundField]) -> dict[str, Any]:
-    """The numbers (B, ...) that field.c reads, and the map itself, which isn't copied."""
+    """The numbers (B, ...) that field.h reads, and the map itself, which isn't copied."""
     field = parts[0]
     nodes = field.field.nodes(field.origins.device)
     x, y, z = (*nodes.shape[1:], 1)[:3]

@@ -1,5 +1,8 @@
 /* The second unit of a model: the functions that curvature_code generates, under the names that the solver calls. */
 
+#include "model.h"
+#include "code.h"
+
 void model_expand(const V *x, const V *u, const V *parameters, const double *w, const V *y, V *f, V *H) {
 #ifdef TGCO_TOGETHER /* with networks: both need their values */
     tgco_together(x, u, parameters, w, y, f, H);

@@ -1,6 +1,11 @@
 /* A primal-dual interior point with a filter (Waechter and Biegler 2006) for problems side by side: states, controls
    and slacks move together, and the lanes are kept filled. solvers/interior says what it does. */
 
+#define _POSIX_C_SOURCE 199309L /* a clock that nobody sets */
+#include <time.h>
+#include "interior_fixed.h"
+#include "interior_search.h"
+
 /* Values and an empty filter of the lanes `of`; `anew`: slacks, too, and which rows have one. */
 static void settle(Barrier *t, Track *k, I of, int anew) {
     const Interior *how = t->how;
@@ -416,14 +421,6 @@ static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, 
     t->how->theta[e] = k->theta[lane];
     p->iterations[e] += (int64_t)k->made[lane];
     p->status[e] = status == CONVERGED && breaks_rows_left_out(t, lane) ? INFEASIBLE : status;
-}
-
-static void enter_barrier(Barrier *t, int lane, int64_t e) {
-    const Problem *p = t->lanes.of;
-    enter_problem(&t->lanes, lane, e);
-    for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->lanes.X[i][lane] = p->X[e * (p->N + 1) * NX + i];
-    for (int64_t i = 0; i < p->N * NU; i++) t->lanes.U[i][lane] = p->U[e * p->N * NU + i];
-    if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
 }
 
 static double seconds_now(void) {

@@ -10,6 +10,8 @@
    round closes what the last one has left open, of active rows all but a share of about 1 / sigma, as the method of
    multipliers does. */
 
+#include "interior_fixed.h"
+
 #define LEAST 1e-200 /* multiplier of an active row of an inequality, by which its stiffness is divided */
 
 /* What a solve needs beside the interior point's own memory. */

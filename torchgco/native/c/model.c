@@ -3,6 +3,9 @@
    They are tgco_step, tgco_jacobian (the model), tgco_gather, tgco_product, tgco_pull_back (its sparse Jacobian), tgco_rows,
    tgco_add_rows and tgco_slopes (traced constraints). */
 
+#include "model.h"
+#include "code.h"
+
 const int tgco_nx = NX, tgco_nu = NU, tgco_np = NP, tgco_nj = NJ, tgco_max_rows = MAX_ROWS;
 
 void model_step(const V *x, const V *u, const V *parameters, const double *w, V *next) {

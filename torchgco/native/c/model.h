@@ -2,6 +2,9 @@
    problems share.
 
    F = [fx fu] is sparse: f are the entries that are computed, the others constants of the model. H are upper triangles. */
+#pragma once
+
+#include "problem.h"
 
 #pragma GCC visibility push(hidden)
 extern const int tgco_nx, tgco_nu, tgco_np, tgco_nj; /* states, controls, the model's own numbers, entries f */

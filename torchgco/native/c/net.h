@@ -3,9 +3,11 @@
    The order of sums depends on the processor alone, not on the number of lanes. Matrices M (k, h) lie row by row, so that
    y = b + M' a, and there are their transposes T (h, k). Arrays over neurons have NET_SIZE(h) numbers, of which those
    from h on are of no account; tangents G are such arrays for each column. */
+#pragma once
 
 #include <stdint.h>
 #include <string.h>
+#include "functions.h"
 
 #ifdef __AVX512F__
 #define NET_WIDTH 8

@@ -1,6 +1,8 @@
 /* The outer loop of the augmented Lagrangian (Algorithm 1): inner solves of all problems, then multipliers, penalties
    and the tests of the end, until each has ended. solvers/augmented_lagrangian.py does the same in PyTorch. */
 
+#include "lifted.h"
+
 /* What a sweep over an iterate finds. */
 typedef struct {
     V violation, touched; /* touched: rows in contact at a knot */

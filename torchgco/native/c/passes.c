@@ -1,5 +1,10 @@
 /* Passes along a trajectory: rollouts with the gains, and the backward pass that computes them. */
 
+#include "model.h"
+#include "code.h"
+#include "cholesky.h"
+#include "passes.h"
+
 /* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. It ends
    early, with what has added up so far, where that is over `enough` in all lanes, or isn't a number. */
 void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {

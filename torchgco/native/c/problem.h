@@ -2,12 +2,15 @@
 
    The library of a form of problems is linked from units. Its own one, the model (model.c), knows all sizes; those that
    take them as constants (passes.c, riccati.c) are compiled for each NX and NU; all others read them from the model, and
-   differ in DIM, REAL and LANES alone. Python's part before this file declares the structures and enumerations of
-   native/structures.py. */
+   differ in DIM, REAL and LANES alone. A unit is some .c files with all that these include. Two files that are included
+   are Python's text (native/codegen/source.py): constants.h, and code.h with the functions of a model, its cost and its
+   traced constraints. `editor` has one of each, and compile_flags.txt the sizes, with which every file compiles alone. */
+#pragma once
 
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
+#include "functions.h"
+#include "structures.h"
 
 #define S (NX + NU)
 #define NZ (NX + 1)

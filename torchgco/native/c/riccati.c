@@ -1,5 +1,9 @@
 /* The Riccati recursion of the interior point: factors of all stages, and the step in states, controls and costates. */
 
+#include "interior.h"
+#include "code.h"
+#include "cholesky.h"
+
 /* The factor of the cost-to-go's curvature in the free components of the start, and the unit matrix in the others. */
 static I factor_start(Barrier *t) {
     V *L = t->L_start, one = SET(1.0);

@@ -1,4 +1,7 @@
-/* Functions that Python calls on given trajectories: values, expansions, gains, rollouts, and `lift`. */
+/* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions, gains,
+   rollouts, `lift`, and inner solves. They return 0 without memory. */
+
+#include "lifted.h"
 
 /* J_var and L_M of given trajectories. */
 int tgco_value(const Problem *p, int64_t first, int64_t last) {
@@ -104,43 +107,18 @@ int tgco_expand(const Problem *p, int64_t first, int64_t last) {
     return 1;
 }
 
-/* Up to `rounds` Gauss-Newton steps in states and controls together, where rollouts diverge (solvers/lifted.py). The
-   first rollout that lowers L_M by the share `gain` replaces the iterate; `converged` says whether there was one. */
-static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, double gain) {
-    const Problem *p = s->of;
-    int64_t N = p->N;
-    V *gap = aligned_alloc(sizeof(V), N * NX * sizeof(V));
-    if (!gap) return 0;
-    for (int64_t first = 0; first < count; first += LANES) {
-        int used = count - first < LANES ? (int)(count - first) : LANES;
-        for (int l = 0; l < LANES; l++) enter(s, l, number[first + (l < used ? l : 0)]);
-        s->mu_r = SET(0.0);
-        I open = SET(0.0) == SET(0.0);
-        for (int64_t round = 0; round < rounds && any(open); round++) {
-            V linear, squares, lowest, cost, merit, sum = SET(0.0);
-            gaps(s, gap);
-            backward(s, knot_expand, gap, &linear, &squares, &lowest);
-            if (round > 0) { /* the first gains are those that failed */
-                roll(s, knot_value, SET(1.0), SET(__builtin_inf()), &cost, &merit);
-                I low = open & finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
-                for (int l = 0; l < used; l++) if (low[l]) {
-                    int64_t e = s->element[l];
-                    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->Xn[i][l];
-                    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = s->Un[i][l];
-                    p->cost[e] = cost[l]; p->merit[e] = merit[l]; p->converged[e] = 1;
-                }
-                open &= ~low;
-            }
-            linear_step(s, gap);
-            for (int64_t i = 0; i < (N + 1) * NX; i++) sum += SET(0.0) * s->X[i];
-            open &= (lowest > SET(0.0)) & (sum == SET(0.0));
-        }
-    }
-    free(gap);
+/* Up to `limit` iterations of inner solves. */
+int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    int64_t *number = in_order(first, last);
+    if (!number || !start(s, p)) { free(number); return 0; }
+    inner_solves(s, number, last - first);
+    free(number);
+    finish(s);
     return 1;
 }
 
-/* The same of problems first, ..., last - 1. */
+/* `lift` of problems first, ..., last - 1. */
 int tgco_lift(const Problem *p, int64_t first, int64_t last) {
     Lanes lanes, *s = &lanes;
     int64_t *number = in_order(first, last);

@@ -1,10 +1,10 @@
-/* The cheapest ways over blocks of a lattice, and paths drawn taut through it (roadmap/blocks.py, roadmap/mapped.py). The
-   part before this file declares the structures and constants. Two dimensions are three, with one layer. */
+/* The cheapest ways over blocks of a lattice, and paths drawn taut through it (roadmap/blocks.py, roadmap/mapped.py).
+   Two dimensions are three, with one layer. */
 
 #include <math.h>
-#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#include "lattice.h"
 
 /* Clearances: roadmap/clearances.py has the same in NumPy. --------------------------------------------------------- */
 

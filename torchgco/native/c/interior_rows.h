@@ -1,4 +1,8 @@
 /* The rows of constraints in the interior point. */
+#pragma once
+
+#include "interior.h"
+#include "solids.h"
 
 /* Rows of constraint i at knot k begin here. */
 static inline int64_t row_of(const Barrier *t, int64_t i, int64_t k) {

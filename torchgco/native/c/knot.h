@@ -1,4 +1,8 @@
 /* The terms of one knot of the iterate beside its cost: constraints and guide. */
+#pragma once
+
+#include "penalty.h"
+#include "solids.h"
 
 #define SAFE 1.000001 /* more than rounding: of the distance up to which a ball may touch a sphere */
 

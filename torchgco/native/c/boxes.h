@@ -1,4 +1,8 @@
 /* Boxes that may be turned, as obstacles: the rows of a knot, for problems with boxes (obstacles/boxes.py). */
+#pragma once
+
+#include "box.h"
+#include "penalty.h"
 
 /* First come the bounds of all boxes along the first axis of space, middle and half length, then along the second, ...:
    most boxes are too far away for more. Then the factor of each box, which turns a distance into a squared length, and

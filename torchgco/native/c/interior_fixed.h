@@ -4,6 +4,10 @@
    A slack has no room in them, and their multipliers would explode. The first kind stays out of the solve, and is judged
    at its end: what is feasible there, with no multiplier, is optimal with the row, too. Of two bounds that coincide, the
    upper one becomes an equality, and the lower one stays out. */
+#pragma once
+
+#include <float.h>
+#include "interior_memory.h"
 
 /* NUDGE, GOLDEN and ROUNDINGS are those of eager/fixed.py, which says what they mean. */
 

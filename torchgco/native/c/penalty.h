@@ -1,4 +1,7 @@
 /* The terms that multipliers and penalty add to L_M for one row of a constraint. */
+#pragma once
+
+#include "problem.h"
 
 /* The term that a row adds to L_M. */
 static inline V worth(const Lanes *s, int equality, V c, V lam) {

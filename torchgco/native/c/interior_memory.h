@@ -1,6 +1,10 @@
 /* What the interior point remembers of each lane, its multipliers, and the test of its end. Names are those of the
    paper (Waechter and Biegler 2006): theta is the sum of all residuals, phi the cost less mu times the logarithms of
    the slacks. */
+#pragma once
+
+#include "interior_step.h"
+#include "memory.h"
 
 typedef struct { double theta, phi; } Pair;
 
@@ -56,6 +60,14 @@ static int start_barrier(Barrier *t, const Interior *how) {
     shape(t, t->memory);
     for (int64_t q = 0; q < t->rows; q++) t->gives[q] = SET(1.0);
     return 1;
+}
+
+static void enter_barrier(Barrier *t, int lane, int64_t e) {
+    const Problem *p = t->lanes.of;
+    enter_problem(&t->lanes, lane, e);
+    for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->lanes.X[i][lane] = p->X[e * (p->N + 1) * NX + i];
+    for (int64_t i = 0; i < p->N * NU; i++) t->lanes.U[i][lane] = p->U[e * p->N * NU + i];
+    if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
 }
 
 static inline V most(V a, V b) { return tgco_choose((a > b) | (a != a), a, b); } /* NaN stays */

@@ -1,5 +1,10 @@
 /* iLQR (Algorithm 2) for problems side by side: the line search, and the loop that keeps the lanes filled.
    A problem's results agree with PyTorch's kernels up to rounding (tests/native). */
+#pragma once
+
+#include "knot.h"
+#include "memory.h"
+#include "passes.h"
 
 #define ROUNDED 1e-6 /* share of a sum that rounding can't reach */
 
@@ -147,13 +152,3 @@ static void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
     }
 }
 
-/* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
-int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    int64_t *number = in_order(first, last);
-    if (!number || !start(s, p)) { free(number); return 0; }
-    inner_solves(s, number, last - first);
-    free(number);
-    finish(s);
-    return 1;
-}

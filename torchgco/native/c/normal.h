@@ -1,5 +1,10 @@
 /* Normal draws in single precision that are a function of a key and of their number, as `draws.standard_normal` makes
    them: a counter per sample and row is hashed by MurmurHash3's finaliser (Appleby), two words to a Box-Muller pair. */
+#pragma once
+
+#include <stdint.h>
+#include "constants.h"
+#include "lanes.h"
 
 typedef uint32_t W __attribute__((vector_size(LANES * 4)));
 typedef int32_t Z __attribute__((vector_size(LANES * 4)));

@@ -1,9 +1,12 @@
 /* Maps as obstacles: the row of a knot, from a distance field (maps/field.py). maps/lookup.py does the same, and explains
    it. Numbers of type V are per problem, and so is the map that a lane reads. */
+#pragma once
+
+#include "penalty.h"
 
 /* The numbers of a problem: its first node (DIM), 1 / h, h^2, R^2, the factor a, the core, what counts as distance 0, and
    the distance of a node from which no point near it is in contact. a is negative where the map is empty. */
-enum { INVERSE = DIM, STEP_SQUARE, RADIUS_SQUARE, FACTOR, CORE, LIMIT, REACH, FIELD_NUMBERS };
+enum { INVERSE = DIM, STEP_SQUARE, RADIUS_SQUARE, SLOPE_SCALE, CORE, LIMIT, REACH, FIELD_NUMBERS };
 
 #define TAPS 3
 
@@ -111,7 +114,7 @@ SUM_OVER(0, sum_of_all, sum_of_plane)
 
 /* Whether the map counts at knot k: not where it is empty, or time has stopped. */
 static inline I map_counts(const Constraint *con, const Rows *rows, int64_t k) {
-    I here = rows->bound[FACTOR] >= SET(0.0);
+    I here = rows->bound[SLOPE_SCALE] >= SET(0.0);
     return con->stops.data ? here & (SET(k) <= rows->stops[0]) : here;
 }
 
@@ -123,7 +126,7 @@ __attribute__((noinline)) static V field_row(
     const V *at[DIM], *number = rows->bound;
     for (int a = 0; a < DIM; a++) axes[a] = axis_at(con, rows, x, a);
     Sums sums = sum_of_all(con, rows, axes, at, curvature ? 2 : slopes ? 1 : 0);
-    V factor = number[FACTOR], inverse = number[INVERSE], square = number[STEP_SQUARE];
+    V factor = number[SLOPE_SCALE], inverse = number[INVERSE], square = number[STEP_SQUARE];
     I here = map_counts(con, rows, k);
     for (int a = 0; a < DIM; a++) {
         ADD(sums.value, square, axes[a].more);
@@ -160,7 +163,7 @@ static inline V length_of(V square, V core) {
 /* How deep beneath the full surface a row c > 0 is, m. */
 static inline V depth_of(const Rows *rows, V c) {
     const V *number = rows->bound;
-    return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[FACTOR], number[CORE]);
+    return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[SLOPE_SCALE], number[CORE]);
 }
 
 __attribute__((noinline)) static V field_value(

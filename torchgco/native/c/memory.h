@@ -1,4 +1,7 @@
 /* Lanes: their memory, and problems that enter and leave them. */
+#pragma once
+
+#include "model.h"
 
 static int64_t length(const Array *a, int64_t knots) { return a->data ? (a->knot ? knots : 1) * a->size : 0; }
 
