@@ -88,8 +88,8 @@ def test_a_structure_of_another_size_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("folder", "name", "header"),
-    [(C, "structures.h", structures.HEADER), (roadmap.C, "search.h", roadmap.HEADER),
-     (roadmap.C, "lattice.h", native_maps.HEADER)],
+    [(C, "structures.h", structures.HEADER), (roadmap.C, "search.h", roadmap.SEARCH_HEADER),
+     (roadmap.C, "lattice.h", native_maps.LATTICE_HEADER)],
 )  # fmt: skip
 def test_each_field_lies_where_python_writes_it(folder: Path, name: str, header: Header) -> None:
     fields = [(kind, field) for kind in header.made.values() for field in kind.declared]

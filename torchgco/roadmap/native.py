@@ -28,10 +28,10 @@ GROUP = 4  # of them, at least so many by each thread
 BLOCK, EDGES_AT_ONCE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
 C = Path(__file__).parent / "c"
-HEADER = Header((C / "search.h").read_text())
+SEARCH_HEADER = Header((C / "search.h").read_text())
 
 
-@HEADER.declares
+@SEARCH_HEADER.declares
 class Arguments(Structure):
     """What the library in C reads and writes."""
 
@@ -136,7 +136,7 @@ def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.C
         "LANES": EDGES_AT_ONCE,
     }  # fmt: skip
     try:
-        return build(joined(defines(constants) + included("search.c"), C) + HEADER.layout)
+        return build(joined(defines(constants) + included("search.c"), C) + SEARCH_HEADER.layout)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

@@ -19,25 +19,25 @@ from torchgco.native.includes import included, joined
 SURE_SPACINGS = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 WAY_PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at
 C = Path(__file__).parent / "c"
-HEADER = Header((C / "lattice.h").read_text())
+LATTICE_HEADER = Header((C / "lattice.h").read_text())
 
 
-@HEADER.declares
+@LATTICE_HEADER.declares
 class Map(Structure):
     """A map of distances."""
 
 
-@HEADER.declares
+@LATTICE_HEADER.declares
 class Graph(Structure):
     """Blocks of cells."""
 
 
-@HEADER.declares
+@LATTICE_HEADER.declares
 class Sweep(Structure):
     """The cheapest ways to all blocks."""
 
 
-@HEADER.declares
+@LATTICE_HEADER.declares
 class String(Structure):
     """A path that is drawn taut."""
 
@@ -52,7 +52,7 @@ def library_for(d: int) -> ctypes.CDLL | None:
 def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
     try:
         text = defines({"DIM": d, "PARTS": WAY_PARTS, "SURE": SURE_SPACINGS}) + included("lattice.c")
-        return build(joined(text, C) + HEADER.layout)
+        return build(joined(text, C) + LATTICE_HEADER.layout)
     except NativeError as error:
         warnings.warn(f"paths in maps are sought by SciPy: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)
         return None

@@ -79,7 +79,7 @@ static void find_moved(const Barrier *t, int64_t i, int64_t k, const Response *a
    moved inside of its bounds. */
 static I is_tight(const Barrier *t, I of, int64_t i, int64_t k, int j) {
     const Constraint *con = t->lanes.of->constraint + i;
-    V room = SET(t->how->push);
+    V room = SET(t->how->bound_push);
     if (con->kind == BOUNDS) {
         int v = con->variable[j];
         V at = v < NX ? t->lanes.X[k * NX + v] : t->lanes.U[k * NU + v - NX];
@@ -170,7 +170,7 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) 
     for (int j = 0; j < con->rows; j++) {
         I in = of & is_broken(t, q + j) & moves[j];
         t->out[q + j] &= ~in;
-        t->s[q + j] = tgco_choose(in, SET(t->how->push), t->s[q + j]);
+        t->s[q + j] = tgco_choose(in, SET(t->how->bound_push), t->s[q + j]);
     }
 }
 
@@ -179,7 +179,7 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) 
 static void loosen(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    V change[con->rows], most_room = SET(t->how->relaxes * t->how->violation);
+    V change[con->rows], most_room = SET(t->how->relaxes * t->how->constr_viol_tol);
     along(t, i, k, at->x, k < t->lanes.of->N ? at->x + NX : 0, at->z, change);
     for (int j = 0; j < con->rows; j++, q++) {
         V room = most_room * least(tgco_fabs(change[j]), t->room[q]);
@@ -309,7 +309,7 @@ static void soften_rows(Barrier *t, I of, V share, const V *active) {
 /* Whether rows that were left out of lane l are violated. */
 static int breaks_rows_left_out(const Barrier *t, int l) {
     int breaks = 0;
-    if (t->some_out) ROWS(t, 0, breaks |= t->out[q][l] && !t->fixes[q][l] && !(t->c[q][l] <= t->how->violation))
+    if (t->some_out) ROWS(t, 0, breaks |= t->out[q][l] && !t->fixes[q][l] && !(t->c[q][l] <= t->how->constr_viol_tol))
     return breaks;
 }
 

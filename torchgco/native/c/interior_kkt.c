@@ -185,7 +185,8 @@ static V *start_system(System *of, int64_t N, int64_t rows) {
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
-    Interior options = {.of = how->of, .free_start = how->free_start, .pivot = how->pivot, .largest_multiplier = INFINITY};
+    Interior options = {
+        .of = how->of, .free_start = how->free_start, .pivot = how->pivot, .constr_mult_init_max = INFINITY};
     Barrier barrier, *t = &barrier;
     System system, *of = &system;
     if (!start_barrier(t, &options)) return 0;

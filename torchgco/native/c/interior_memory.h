@@ -124,7 +124,7 @@ static void adjoin(Barrier *t, I of, const V *gains) {
             largest = most(tgco_fabs(y[i]), largest);
         }
     }
-    I sound = largest <= SET(t->how->largest_multiplier) * t->raised;
+    I sound = largest <= SET(t->how->constr_mult_init_max) * t->raised;
     for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->y[i] = tgco_choose(of, tgco_if(sound, t->yn[i]), t->y[i]);
 }
 
@@ -158,7 +158,7 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
         gap = most(tgco_fabs(t->r[q]), gap);
         sum_z += least(tgco_fabs(t->z[q]), SET(t->how->explodes) * t->raised); /* one that explodes says nothing of the others */
     }
-    V usual = SET(t->how->usual_multiplier), count = SET((double)(p->N * NX + t->rows));
+    V usual = SET(t->how->s_max), count = SET((double)(p->N * NX + t->rows));
     V mean = (sum_y + sum_z) / count, mean_z = sum_z / SET((double)(t->rows ? t->rows : 1));
     *dual = slope * usual / most(mean, usual);
     *primal = gap;

@@ -16,7 +16,7 @@ static int is_refused(const Track *k, int l, double theta, double phi) {
 
 static void remember(const Barrier *t, Track *k, int l) {
     const Interior *how = t->how;
-    Pair pair = {(1 - how->gain_theta) * k->theta[l], k->phi[l] - how->gain_phi * k->theta[l]};
+    Pair pair = {(1 - how->gamma_theta) * k->theta[l], k->phi[l] - how->gamma_phi * k->theta[l]};
     int count = 0;
     for (int i = 0; i < k->pairs[l]; i++) {
         Pair old = k->filter[l][i];
@@ -37,15 +37,15 @@ static int is_good(
     double old = k->theta[l], noise = how->noise * __DBL_EPSILON__ * __builtin_fabs(k->phi[l]);
     *descends = 0;
     if (!(theta - theta == 0) || !(phi - phi == 0)) return 0;
-    if (k->restoring[l]) return theta <= (1 - how->armijo * alpha) * old;
+    if (k->restoring[l]) return theta <= (1 - how->eta_phi * alpha) * old;
     if (is_refused(k, l, theta, phi)) return 0;
-    double gain = slope < 0 ? alpha * __builtin_pow(-slope, how->power_phi) : 0;
-    int switches = gain > how->switching * __builtin_pow(old, how->power_theta);
+    double gain = slope < 0 ? alpha * __builtin_pow(-slope, how->s_phi) : 0;
+    int switches = gain > how->delta * __builtin_pow(old, how->s_theta);
     if (old <= k->lowest[l] && switches) {
         *descends = 1;
-        return phi - k->phi[l] - noise <= how->armijo * alpha * slope;
+        return phi - k->phi[l] - noise <= how->eta_phi * alpha * slope;
     }
-    return theta <= (1 - how->gain_theta) * old || phi - noise <= k->phi[l] - how->gain_phi * old;
+    return theta <= (1 - how->gamma_theta) * old || phi - noise <= k->phi[l] - how->gamma_phi * old;
 }
 
 /* The line search ------------------------------------------------------------------------------------------------- */
@@ -121,7 +121,7 @@ static void uncorrect(Barrier *t) {
 static void accept(Barrier *t, I won, V alpha, V dual) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
-    V bound = SET(t->how->central), step = alpha;
+    V bound = SET(t->how->kappa_sigma), step = alpha;
     for (int64_t i = 0; i < (N + 1) * NX; i++) {
         s->X[i] = tgco_choose(won, s->Xn[i], s->X[i]);
         t->y[i] = tgco_choose(won, t->y[i] + step * (t->yn[i] - t->y[i]), t->y[i]);
@@ -157,7 +157,8 @@ static void keep(Barrier *t, I of, int back) {
 static void watch(Barrier *t, Track *k, I moving, V slope, V full) {
     I begins = moving & ~moving;
     for (int l = 0; l < LANES; l++) {
-        if (!moving[l] || k->watching[l] || k->restoring[l] || k->shortened[l] < t->how->patience) continue;
+        int rarely = k->shortened[l] < t->how->watchdog_shortened_iter_trigger;
+        if (!moving[l] || k->watching[l] || k->restoring[l] || rarely) continue;
         begins[l] = k->watching[l] = -1;
         k->slope[l] = slope[l]; k->alpha[l] = full[l];
         k->ahead[l] = 0;
@@ -189,7 +190,8 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
             int accepted = is_good(t, k, l, length, from, theta[l], phi[l], &descends);
             if (watching && !accepted) {
                 int sound = theta[l] <= k->highest[l] && phi[l] - phi[l] == 0;
-                if (sound && k->ahead[l]++ < how->trials) { good[l] = -1; k->crawls[l] = 0; } else back[l] = -1;
+                int goes_on = sound && k->ahead[l]++ < how->watchdog_trial_iter_max;
+                if (goes_on) { good[l] = -1; k->crawls[l] = 0; } else back[l] = -1;
                 continue;
             }
             if (accepted) {
@@ -199,12 +201,12 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
                 good[l] = -1;
                 k->crawls[l] = alpha[l] < how->crawl * full[l] && !watching ? -1 : 0;
                 k->shortened[l] = alpha[l] < full[l] && !watching ? k->shortened[l] + 1 : 0;
-            } else if (tries == 0 && how->corrects && !k->restoring[l] && theta[l] >= k->theta[l]) {
+            } else if (tries == 0 && how->max_soc && !k->restoring[l] && theta[l] >= k->theta[l]) {
                 again[l] = -1;
             } else {
                 undo[l] = corrected[l];
                 alpha[l] = 0.5 * (corrected[l] ? full[l] : alpha[l]);
-                if (alpha[l] < how->smallest) open[l] = 0;
+                if (alpha[l] < how->alpha_min) open[l] = 0;
             }
         }
         if (any(good)) accept(t, good, alpha, dual);

@@ -105,18 +105,18 @@ typedef struct {
     double *falls; /* (E): 1 where the cost falls to second order from where the conditions hold: of `minimum` */
     const double *constant, *least_cost; /* (E): what of the cost does not count, and its least size */
     const double *free_start; /* (E, NX): 1 where a component of the start is a variable; NULL: nowhere */
-    int64_t max_iterations, failures, patience, trials, idle;
-    int32_t corrects, warm, minimum;
-    double tolerance, violation, push, steepest, boundary, closest, central, smallest, restored;
-    double barrier_error, barrier_share, barrier_floor, barrier_least, counts, usual_multiplier;
-    double largest_multiplier;
-    double highest, lowest, gain_theta, gain_phi, armijo, switching, power_theta, power_phi;
-    double shift_first, shift_least, shift_decay, shift_growth, shift_growth_first, shift_max;
-    double shift_recovery, recovery_decay, recovery_growth, shift_crawl, crawl, soft, softest, slight;
-    double explodes, relaxes;
-    double held, pivot, noise, rounding, soft_growth, soft_decay, forced_growth;
-    double smoothing; /* mu in units of the cost, at which the barrier stays; 0: it falls */
-    double seconds; /* after which problems end with TIME_LIMIT; infinite: never */
+    int64_t max_iter, acceptable_iter, watchdog_shortened_iter_trigger, watchdog_trial_iter_max, failures;
+    int32_t warm, minimum, max_soc;
+    double tol, constr_viol_tol, acceptable_tol, bound_push, counts, smoothing, seconds;
+    double nlp_scaling_obj_target_gradient, constr_mult_init_max, held;
+    double barrier_tol_factor, mu_linear_decrease_factor, mu_floor, mu_min, s_max, rounding;
+    double tau_min, tau_max, kappa_sigma, theta_max_fact, theta_min_fact, gamma_theta, gamma_phi, eta_phi, delta;
+    double s_theta, s_phi, noise, alpha_min;
+    double first_hessian_perturbation, min_hessian_perturbation, max_hessian_perturbation;
+    double perturb_dec_fact, perturb_inc_fact, perturb_inc_fact_first;
+    double pivot, crawl, shift_crawl, recovery_growth, recovery_decay;
+    double jacobian_regularization_value, softest, explodes, soft_growth, soft_decay, slight, relaxes;
+    double shift_recovery, forced_growth, required_infeasibility_reduction;
 } Interior;
 
 /* Linear systems with the matrix of the KKT conditions (see lagrangian.kkt); R rows. */

@@ -62,11 +62,11 @@ class Library:
     shared: tuple[str, ...]
 
 
-PASSES = "model.c", "passes.c"
-SOLVER_LIBRARY = Library(PASSES, (), ("trajectories.c", "outer.c"))
+PASS_SOURCES = "model.c", "passes.c"
+SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c"))
 SAMPLER = Library(("model.c",), (), ("mppi.c",))
 # The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
-INTERIOR = Library(PASSES, ("curvature.c", "riccati.c"), ("interior.c", "interior_kkt.c"))
+INTERIOR = Library(PASS_SOURCES, ("curvature.c", "riccati.c"), ("interior.c", "interior_kkt.c"))
 SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
 
 
