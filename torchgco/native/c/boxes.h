@@ -73,7 +73,7 @@ static inline int may_matter(const Constraint *con, const Rows *rows, const V *l
     return some_matter(con, rows, lam, pushed, j, j + 1, x);
 }
 
-__attribute__((noinline)) static V boxes_value(
+TGCO_APART V boxes_value(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
@@ -89,7 +89,7 @@ __attribute__((noinline)) static V boxes_value(
     return total;
 }
 
-__attribute__((noinline)) static void boxes_expand(
+TGCO_APART void boxes_expand(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);

@@ -120,7 +120,7 @@ static inline I map_counts(const Constraint *con, const Rows *rows, int64_t k) {
 
 /* The row at knot k, with its derivatives by position, (DIM) and (DIM, DIM), where they aren't NULL; -1 where the map
    doesn't count. */
-__attribute__((noinline)) static V field_row(
+TGCO_APART V field_row(
     const Constraint *con, const Rows *rows, int64_t k, const V *x, V *slopes, V *curvature) {
     Axis axes[DIM];
     const V *at[DIM], *number = rows->bound;
@@ -166,14 +166,14 @@ static inline V depth_of(const Rows *rows, V c) {
     return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[SLOPE_SCALE], number[CORE]);
 }
 
-__attribute__((noinline)) static V field_value(
+TGCO_APART V field_value(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     V lam = rows->lam[con->place[k]];
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return total;
     return total + worth(s, 0, field_row(con, rows, k, x, 0, 0), lam);
 }
 
-__attribute__((noinline)) static void field_expand(
+TGCO_APART void field_expand(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
     V lam = rows->lam[con->place[k]], slopes[DIM], rho;
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return;

@@ -26,7 +26,7 @@
 
 /* `near`, and where `far` is true what the C library makes of x. */
 #define TGCO_FROM_LIBRARY(name) \
-    __attribute__((noinline)) static V tgco_distant_##name(V x, V near, I far) { \
+    TGCO_APART V tgco_distant_##name(V x, V near, I far) { \
         for (int i = 0; i < LANES; i++) if (far[i]) near[i] = TGCO_MATH(name)(x[i]); \
         return near; \
     }
@@ -88,6 +88,13 @@ static inline V tgco_logarithm(V x, V more) {
     p = tgco_fused(p, z, SET(2.0 / 3.0));
     V low = tgco_fused(power, SET(TGCO_LN2_2), more), bend = tgco_fused(-p, z, f);
     return tgco_fused(power, SET(TGCO_LN2_1), f + tgco_fused(-s, bend, low));
+}
+
+/* m in [1, 2) and e of a normal number m 2^e. */
+static inline V tgco_mantissa(V x) { return (V)(((I)x & ~(I)SET(-INFINITY)) | (I)SET(1.0)); }
+static inline V tgco_exponent(V x) {
+    I e = (((I)x >> TGCO_EXPONENT) & (2 * TGCO_BIAS + 1)) - TGCO_BIAS;
+    return (V)(e + (I)SET(TGCO_WHOLE)) - SET(TGCO_WHOLE);
 }
 
 TGCO_FROM_LIBRARY(log)

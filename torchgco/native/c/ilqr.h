@@ -35,13 +35,13 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
             int64_t rung = s->rung[l] + tried + l % replicas;
             int last = rung + 1 >= o->rungs; /* its L_M counts, whatever it is */
             alpha[l] = o->ladder[last ? o->rungs - 1 : rung];
-            enough[l] = !open[l] ? -__builtin_inf() : last || !s->of->bounded ? __builtin_inf() : most[l];
+            enough[l] = !open[l] ? -INFINITY : last || !s->of->bounded ? INFINITY : most[l];
         }
         roll(s, knot_value, alpha, enough, &cost, &merit);
         V ratio = (merit - s->merit) / (alpha * linear + SET(0.5) * alpha * alpha * quadratic);
         I good = (ratio >= SET(o->ratio_min)) & (ratio <= SET(o->ratio_max));
         if (o->accept_last) good |= alpha < SET(o->smallest);
-        good &= finite(merit) & open;
+        good &= tgco_finite(merit) & open;
         *shortest = tgco_choose(open, merit, *shortest);
         int from[LANES];
         I won;

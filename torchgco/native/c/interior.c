@@ -13,11 +13,11 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     V cost = values(t, s->X, s->U, t->c, t->gap);
     if (anew) {
         sort_rows(t, of);
-        ROWS(t, 0, {
+        EACH_ROW(t, 0, q) {
             V slack = most(-t->c[q], SET(how->bound_push) * t->room[q]);
             if (t->some_out) slack = tgco_choose(t->out[q], SET(1.0), slack);
             t->s[q] = tgco_choose(of, slack, t->s[q]);
-        })
+        }
     }
     residuals(t, t->c, t->s, t->r);
     V theta = size_of(t, t->gap, t->r), phi = cost - t->mu * logarithms(t, t->s);
@@ -38,7 +38,7 @@ static void measure_bounds(const Barrier *t, V *size) {
         for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
             V limit = tgco_fabs(at(s->rows[i].bound, &con->bound, con->place[k])[j]);
             int v = con->variable[j];
-            size[v] = most(tgco_if(finite(limit), limit), size[v]);
+            size[v] = most(tgco_if(tgco_finite(limit), limit), size[v]);
         }
     }
 }
@@ -61,7 +61,7 @@ static void infer_sizes(const Barrier *t, V *size) {
             V by = size[i] / tgco_fabs(moved[v * NX + i]);
             if (i != v) found = tgco_choose(by > SET(0.0), least(by, found), found);
         }
-        size[v] = tgco_choose((size[v] == SET(0.0)) & finite(found), found, size[v]);
+        size[v] = tgco_choose((size[v] == SET(0.0)) & tgco_finite(found), found, size[v]);
     }
 }
 
@@ -148,18 +148,18 @@ static void begin(Barrier *t, Track *k, I of) {
     }
     largest = steepest(t, &plain);
     V scale = SET(how->nlp_scaling_obj_target_gradient) / largest;
-    I scaled = of & finite(scale) & (largest > zero);
+    I scaled = of & tgco_finite(scale) & (largest > zero);
     t->scale = tgco_choose(scaled, scale, t->scale);
     t->raised = tgco_choose(scaled, plain / largest, t->raised);
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
     if (how->warm) {
         if (t->some_out) join_multipliers(t, of);
-        ROWS(t, 0, {
+        EACH_ROW(t, 0, q) {
             V z = t->scale * t->z[q], lowest = t->mu / (SET(how->kappa_sigma) * t->s[q]);
             t->z[q] = tgco_choose(of, by_role(t, q, most(z, lowest), z), t->z[q]);
-        })
-        ROWS(t, 1, t->z[q] = tgco_choose(of, t->scale * t->z[q], t->z[q]))
+        }
+        EACH_ROW(t, 1, q) t->z[q] = tgco_choose(of, t->scale * t->z[q], t->z[q]);
         expand(t);
         adjoin(t, of, 0);
     } else {
@@ -217,8 +217,8 @@ static I soften(Barrier *t, const Track *k, I moving) {
     const Interior *how = t->how;
     for (;;) {
         V largest = SET(0.0);
-        ROWS(t, 1, largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest))
-        if (t->some_out) ROWS(t, 0, largest = most(tgco_if(t->fixes[q], tgco_fabs(t->z[q] + t->dz[q])), largest))
+        EACH_ROW(t, 1, q) largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest);
+        if (t->some_out) EACH_ROW(t, 0, q) largest = most(tgco_if(t->fixes[q], tgco_fabs(t->z[q] + t->dz[q])), largest);
         I large = moving & (largest > SET(how->explodes) * t->raised) & (t->soft < SET(how->softest));
         if (!any(large)) return moving;
         t->soft = tgco_choose(large, SET(how->soft_growth) * t->soft, t->soft);
@@ -267,11 +267,11 @@ static I barrier_counts(Barrier *t, I of, V *left) {
     if (t->how->smoothing > 0) return of & ~of; /* it is to stay */
     if (!any(of)) return of;
     V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
-    ROWS(t, 0, *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]))
-    ROWS(t, 1, *left += tgco_fabs(t->z[q] * t->r[q]))
+    EACH_ROW(t, 0, q) *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]);
+    EACH_ROW(t, 1, q) *left += tgco_fabs(t->z[q] * t->r[q]);
     for (int l = 0; l < LANES; l++) {
         int64_t e = t->lanes.element[l];
-        size[l] = __builtin_fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
+        size[l] = fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
     }
     return of & (*left > SET(t->how->counts) * size);
 }
@@ -299,7 +299,7 @@ static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
 /* Where a multiplier of an inequality explodes, rows leave each other no room: they are relaxed, as IPOPT's bounds are. */
 static void relax(Barrier *t, Track *k, I running) {
     V largest = SET(0.0);
-    ROWS(t, 0, largest = most(t->z[q], largest))
+    EACH_ROW(t, 0, q) largest = most(t->z[q], largest);
     I lacks = running & (largest > SET(t->how->explodes) * t->raised) & ~k->relaxed & ~k->watching;
     if (!any(lacks)) return;
     k->relaxed |= lacks;
@@ -313,11 +313,11 @@ static void relax(Barrier *t, Track *k, I running) {
 static I readmit(Barrier *t, Track *k, I of, double admitted) {
     I broken = of & ~of, changed = broken;
     t->admitted = admitted;
-    ROWS(t, 0, broken |= of & is_broken(t, q))
+    EACH_ROW(t, 0, q) broken |= of & is_broken(t, q);
     if (!any(broken)) return changed;
-    ROWS(t, 0, t->dz[q] = tgco_truth(t->out[q])) /* no step is under way */
+    EACH_ROW(t, 0, q) t->dz[q] = tgco_truth(t->out[q]); /* no step is under way */
     visit_rows(t, broken, 0, come_in);
-    ROWS(t, 0, changed |= t->dz[q] != tgco_truth(t->out[q]))
+    EACH_ROW(t, 0, q) changed |= t->dz[q] != tgco_truth(t->out[q]);
     if (!any(changed)) return changed;
     for (int l = 0; l < LANES; l++) if (changed[l]) {
         t->mu[l] = first_barrier(t, l);
@@ -341,7 +341,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     expand(t);
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(how->smoothing) * t->scale) * scale_z);
-    I ended = running & ~running, astray = running & k->watching & ~finite(*error);
+    I ended = running & ~running, astray = running & k->watching & ~tgco_finite(*error);
     I small = (*error <= most(SET(how->tol), SET(how->acceptable_tol))) & (primal <= SET(how->constr_viol_tol));
     small &= ~k->restoring; /* no step that can't be taken matters there */
     if (any(astray)) go_back(t, k, astray);
@@ -396,7 +396,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
    rows have become so stiff that rounding decides, none. */
 static I find_falls(Barrier *t, I ended) {
     V shift = t->shift, stiffest = SET(0.0);
-    ROWS(t, 0, stiffest = most(by_role(t, q, t->z[q] / t->s[q], SET(0.0)), stiffest))
+    EACH_ROW(t, 0, q) stiffest = most(by_role(t, q, t->z[q] / t->s[q], SET(0.0)), stiffest);
     ended &= stiffest < SET(1.0 / t->how->rounding);
     if (!any(ended)) return ended;
     expand(t);

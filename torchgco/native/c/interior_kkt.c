@@ -32,7 +32,7 @@ static inline V weight_of(const Barrier *t, const System *of, int64_t q) {
 
 /* A row of inequalities that holds has this curvature; one that doesn't none. (The interior point: z / s.) */
 static void stiffen(Barrier *t, const System *of) {
-    ROWS(t, 0, t->s[q] = tgco_choose(of->active[q] > SET(0.0), t->z[q] / weight_of(t, of, q), SET(INFINITY)))
+    EACH_ROW(t, 0, q) t->s[q] = tgco_choose(of->active[q] > SET(0.0), t->z[q] / weight_of(t, of, q), SET(INFINITY));
     t->soft = SET(1.0) / of->sigma;
 }
 

@@ -34,13 +34,13 @@ static void remember(const Barrier *t, Track *k, int l) {
 static int is_good(
     const Barrier *t, const Track *k, int l, double alpha, double slope, double theta, double phi, int *descends) {
     const Interior *how = t->how;
-    double old = k->theta[l], noise = how->noise * __DBL_EPSILON__ * __builtin_fabs(k->phi[l]);
+    double old = k->theta[l], noise = how->noise * DBL_EPSILON * fabs(k->phi[l]);
     *descends = 0;
     if (!(theta - theta == 0) || !(phi - phi == 0)) return 0;
     if (k->restoring[l]) return theta <= (1 - how->eta_phi * alpha) * old;
     if (is_refused(k, l, theta, phi)) return 0;
-    double gain = slope < 0 ? alpha * __builtin_pow(-slope, how->s_phi) : 0;
-    int switches = gain > how->delta * __builtin_pow(old, how->s_theta);
+    double gain = slope < 0 ? alpha * pow(-slope, how->s_phi) : 0;
+    int switches = gain > how->delta * pow(old, how->s_theta);
     if (old <= k->lowest[l] && switches) {
         *descends = 1;
         return phi - k->phi[l] - noise <= how->eta_phi * alpha * slope;
@@ -53,13 +53,13 @@ static int is_good(
 /* The longest steps that leave a share 1 - tau of slacks and multipliers. */
 static void longest(const Barrier *t, V tau, V *primal, V *dual) {
     *primal = *dual = SET(1.0);
-    ROWS(t, 0, {
+    EACH_ROW(t, 0, q) {
         V a = -tau * t->s[q] / t->ds[q], b = -tau * t->z[q] / t->dz[q];
         *primal = tgco_choose((t->ds[q] < SET(0.0)) & (a < *primal), a, *primal);
         I falls = t->dz[q] < SET(0.0);
         if (t->some_out) falls &= ~t->out[q];
         *dual = tgco_choose(falls & (b < *dual), b, *dual);
-    })
+    }
 }
 
 /* The trial at step lengths alpha: its theta and phi. */
@@ -70,14 +70,14 @@ static void attempt(Barrier *t, V alpha, V *theta, V *phi) {
     for (int64_t i = 0; i < N * NU; i++) s->Un[i] = s->U[i] + alpha * t->du[i];
     V cost = values(t, s->Xn, s->Un, t->cn, t->gapn);
     /* A slack that the row leaves more room for takes it: theta and phi fall both. */
-    ROWS(t, 0, {
+    EACH_ROW(t, 0, q) {
         V moved = t->s[q] + alpha * t->ds[q], roomy = tgco_choose(-t->cn[q] > moved, -t->cn[q], moved);
         t->sn[q] = t->some_out ? tgco_choose(t->out[q], t->s[q], roomy) : roomy;
-    })
+    }
     V sum = SET(0.0);
     for (int64_t i = 0; i < N * NX; i++) sum += tgco_fabs(t->gapn[i]);
-    ROWS(t, 0, sum += tgco_fabs(by_role(t, q, t->cn[q] + t->sn[q], t->cn[q])))
-    ROWS(t, 1, sum += tgco_fabs(t->cn[q]))
+    EACH_ROW(t, 0, q) sum += tgco_fabs(by_role(t, q, t->cn[q] + t->sn[q], t->cn[q]));
+    EACH_ROW(t, 1, q) sum += tgco_fabs(t->cn[q]);
     *theta = sum;
     *phi = cost - t->mu * logarithms(t, t->sn);
 }
@@ -91,7 +91,7 @@ static V descent(const Barrier *t) {
         for (int i = 0; i < NX; i++) ADD(sum, slope[i], t->dx[k * NX + i]);
         if (k < p->N) for (int j = 0; j < NU; j++) ADD(sum, slope[NX + j], t->du[k * NU + j]);
     }
-    ROWS(t, 0, sum -= t->mu * t->ds[q] / t->s[q])
+    EACH_ROW(t, 0, q) sum -= t->mu * t->ds[q] / t->s[q];
     return sum;
 }
 
@@ -99,11 +99,11 @@ static V descent(const Barrier *t) {
 static void correct(Barrier *t, I of, V alpha) {
     for (int64_t i = 0; i < t->lanes.of->N * NX; i++)
         t->aim[i] = tgco_choose(of, alpha * t->aim[i] + t->gapn[i], t->aim[i]);
-    ROWS(t, 0, {
+    EACH_ROW(t, 0, q) {
         V left = alpha * t->r[q] + t->cn[q];
         t->r[q] = tgco_choose(of, by_role(t, q, left + t->sn[q], left), t->r[q]);
-    })
-    ROWS(t, 1, t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q], t->r[q]))
+    }
+    EACH_ROW(t, 1, q) t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q], t->r[q]);
     expand(t);
     solve(t);
     solve_rows(t);
@@ -128,13 +128,13 @@ static void accept(Barrier *t, I won, V alpha, V dual) {
     }
     for (int64_t i = 0; i < N * NU; i++) s->U[i] = tgco_choose(won, s->Un[i], s->U[i]);
     for (int64_t i = 0; i < N * NX; i++) t->gap[i] = tgco_choose(won, t->gapn[i], t->gap[i]);
-    ROWS(t, 1, t->z[q] = tgco_choose(won, t->z[q] + step * t->dz[q], t->z[q]))
-    ROWS(t, 0, {
+    EACH_ROW(t, 1, q) t->z[q] = tgco_choose(won, t->z[q] + step * t->dz[q], t->z[q]);
+    EACH_ROW(t, 0, q) {
         V z = t->z[q] + dual * t->dz[q], center = t->mu / t->sn[q];
         z = most(least(z, bound * center), center / bound);
         t->z[q] = tgco_choose(won, by_role(t, q, z, t->z[q] + step * t->dz[q]), t->z[q]);
         t->s[q] = tgco_choose(won, t->sn[q], t->s[q]);
-    })
+    }
     for (int64_t q = 0; q < t->rows; q++) t->c[q] = tgco_choose(won, t->cn[q], t->c[q]);
 }
 

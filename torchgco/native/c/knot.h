@@ -99,10 +99,10 @@ static inline void near_expand(
 
 #if DIM > 0
 /* Rows of a body, ball by ball. */
-__attribute__((noinline)) static V body_value(const Lanes *s, int64_t i, int64_t k, const V *x, V total) {
+TGCO_APART V body_value(const Lanes *s, int64_t i, int64_t k, const V *x, V total) {
     const Constraint *con = s->of->constraint + i;
-    V centers[con->balls * DIM];
-    int64_t near[con->rows / con->balls + 1], count = 0;
+    V centers[MAX_ROWS];
+    int64_t *near = s->rows[i].near, count = 0;
     Ball ball;
     ball_centers(s, i, k, x, centers);
     if (con->kind_of_balls == SPHERES && !(count = spheres_near(s, i, k, centers, near))) return total;
@@ -115,11 +115,11 @@ __attribute__((noinline)) static V body_value(const Lanes *s, int64_t i, int64_t
     return total;
 }
 
-__attribute__((noinline)) static void body_expand(const Lanes *s, int64_t i, int64_t k, const V *x, V *g, V *H) {
+TGCO_APART void body_expand(const Lanes *s, int64_t i, int64_t k, const V *x, V *g, V *H) {
     const Constraint *con = s->of->constraint + i;
-    V centers[con->balls * DIM], e[con->balls * DIM * S], own[POSITION + DIM], square[(POSITION + DIM) * S];
+    V centers[MAX_ROWS], e[MAX_ROWS * S], own[POSITION + DIM], square[(POSITION + DIM) * S];
     const int *columns = 0;
-    int64_t near[con->rows / con->balls + 1], some = 0;
+    int64_t *near = s->rows[i].near, some = 0;
     int count = -1;
     Ball ball;
     ball_centers(s, i, k, x, centers);
@@ -144,7 +144,7 @@ __attribute__((noinline)) static void body_expand(const Lanes *s, int64_t i, int
 #endif
 
 /* Rows that are traced, in functions of their own: room for any number of them would cost the others time. */
-__attribute__((noinline)) static V traced_value(
+TGCO_APART V traced_value(
     const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V total) {
     const Constraint *con = s->of->constraint + i;
     V c[MAX_ROWS];
@@ -153,7 +153,7 @@ __attribute__((noinline)) static V traced_value(
     return total;
 }
 
-__attribute__((noinline)) static void traced_expand(
+TGCO_APART void traced_expand(
     const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V *g, V *H) {
     const Constraint *con = s->of->constraint + i;
     const V *numbers = at(s->rows[i].bound, &con->bound, con->place[k]);

@@ -20,8 +20,8 @@ static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, 
             gaps(s, gap);
             backward(s, knot_expand, gap, &linear, &squares, &lowest);
             if (round > 0) { /* the first gains are those that failed */
-                roll(s, knot_value, SET(1.0), SET(__builtin_inf()), &cost, &merit);
-                I low = open & finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
+                roll(s, knot_value, SET(1.0), SET(INFINITY), &cost, &merit);
+                I low = open & tgco_finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
                 for (int l = 0; l < used; l++) if (low[l]) {
                     int64_t e = s->element[l];
                     for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->Xn[i][l];

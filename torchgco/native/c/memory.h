@@ -36,7 +36,10 @@ static int64_t lay_out(Lanes *s, V *memory) {
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
         rows.stops = cut(&m, length(&c->stops, 1)); rows.radii = cut(&m, length(&c->radii, c->knots));
         rows.lift = cut(&m, length(&c->lift, c->knots));
-        if (c->balls > 0) rows.widest = cut(&m, c->squares.size / c->balls);
+        if (c->balls > 0) {
+            rows.widest = cut(&m, c->squares.size / c->balls);
+            rows.near = (int64_t *)cut(&m, c->rows / c->balls);
+        }
         rows.pushed = (I *)cut(&m, c->knots);
         for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;

@@ -57,7 +57,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
         if (!q->of->geometric[i] || con->place[k] == NOWHERE) continue;
 #if DIM > 0
         if (con->kind == BODY) {
-            V centers[con->balls * DIM];
+            V centers[MAX_ROWS];
             Ball ball;
             ball_centers(&q->s, i, k, x, centers);
             for (int b = 0; b < con->balls; b++) {

@@ -36,7 +36,7 @@ void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
 void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
     V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ], pivots[NU];
-    V sum = SET(0.0), square = SET(0.0), least = SET(__builtin_inf());
+    V sum = SET(0.0), square = SET(0.0), least = SET(INFINITY);
     int regular = any(s->mu_r > SET(0.0));
     memset(g, 0, sizeof g); memset(H, 0, sizeof H);
     cost_expand(s, p->N, s->X + p->N * NX, 0, g, H);

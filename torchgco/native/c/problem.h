@@ -19,6 +19,7 @@
 typedef struct {
     V *lam, *bound, *squares, *velocities, *radii, *stops, *lift;
     V *widest; /* of a body among spheres: the largest inflated radius of each, ABSENT without one */
+    int64_t *near; /* room for the numbers of those that a ball may touch */
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
     const float *map[LANES]; /* of a FIELD: each lane's map */
 } Rows;
@@ -35,7 +36,7 @@ typedef struct {
 } Lanes;
 
 static inline int any(I where) { return tgco_any(where); }
-static inline I finite(V a) { return (a - a) == SET(0.0); }
+static inline I tgco_finite(V a) { return (a - a) == SET(0.0); }
 
 static inline const V *at(const V *array, const Array *shape, int64_t k) {
     return array + (shape->knot ? k * shape->size : 0);

@@ -12,7 +12,7 @@ static I factor_start(Barrier *t) {
         I own = tgco_is(t->is_free[j]);
         V whole = tgco_choose(own, t->P[j * NX + j], one), pivot = whole;
         for (int a = 0; a < j; a++) SUBTRACT(pivot, L[j * NX + a], L[j * NX + a]);
-        good &= (pivot > SET(1e-14) * tgco_fabs(whole)) & finite(pivot);
+        good &= (pivot > SET(1e-14) * tgco_fabs(whole)) & tgco_finite(pivot);
         V inverse = one / tgco_sqrt(pivot);
         L[j * NX + j] = inverse;
         for (int i = j + 1; i < NX; i++) {
@@ -46,7 +46,7 @@ I factor(Barrier *t, I open) {
         factor_controls(Q, L, pivots);
         for (int j = 0; j < NU; j++) {
             V whole = Q[(NX + j) * S + NX + j];
-            good &= (pivots[j] > SET(t->how->pivot) * tgco_fabs(whole)) & finite(pivots[j]);
+            good &= (pivots[j] > SET(t->how->pivot) * tgco_fabs(whole)) & tgco_finite(pivots[j]);
             for (int i = 0; i < NX; i++) Y[j * NX + i] = Q[i * S + NX + j];
         }
         solve_lower(L, Y, NX, NX);

@@ -45,7 +45,7 @@ int tgco_gains(const Problem *p, int64_t first, int64_t last) {
 }
 
 /* Rollout from the first knot of X, in place: of U, or with feedback of U + K (x - X), in place of U, too. */
-static inline __attribute__((always_inline)) int roll_out(const Problem *p, int64_t first, int64_t last, int feedback) {
+TGCO_INLINE int roll_out(const Problem *p, int64_t first, int64_t last, int feedback) {
     int64_t N = p->N;
     V parameters[NP ? NP : 1], x[2 * NX], u[NU];
     for (int64_t e = first; e < last; e += LANES) {

@@ -157,7 +157,7 @@ def literal(value: float) -> str:
     """A number as a literal of C, exact to the last bit."""
     if math.isfinite(value):
         return float(value).hex()
-    return '__builtin_nan("")' if math.isnan(value) else f"{'-' if value < 0 else ''}__builtin_inf()"
+    return "NAN" if math.isnan(value) else f"{'-' if value < 0 else ''}INFINITY"
 
 
 _OPERATORS = {

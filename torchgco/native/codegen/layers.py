@@ -212,7 +212,8 @@ class NetSource:
         for i in range(len(self.net.layers), 0, -1):
             layer = self.net.layers[i - 1]
             if isinstance(layer, Linear):
-                lines.append(f"    net_back({_matrices(layer)}, {layer.k}, {layer.h}, v{i}, v{layer.source});")
+                given = f"{_matrices(layer)}, {layer.k}, {layer.h}, v{i}, v{layer.source}"
+                lines.append(f"    {{ REAL s[NET_SIZE({layer.k})]; net_back({given}, s); }}")
             else:
                 lines += self._bend(i, layer)
         lines.append(f"    memcpy(v, v0, {sizes[0]} * sizeof(REAL));")
