@@ -63,7 +63,8 @@ def pair_of(text: str) -> tuple[Header, type[Structure]]:
         """Numbers and where others lie."""
 
     header = Header(text, {"TWO": 2})
-    return header, header.declares(Pair)
+    header.declare(Pair)
+    return header, Pair
 
 
 SUM = """

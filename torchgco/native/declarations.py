@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -99,9 +99,6 @@ class Structure(ctypes.Structure):
         return value.data_ptr()
 
 
-Kind = TypeVar("Kind", bound=type[Structure])
-
-
 class Header:
     """The structures of a header of C, typedef struct { ... } NAME; of numbers, pointers, structures, arrays of these.
 
@@ -115,14 +112,14 @@ class Header:
         self._sizes = sizes or {}
         self._fields = {name: _fields(body) for body, name in _STRUCTURE.findall(_COMMENT.sub("", text))}
 
-    def declares(self, kind: Kind) -> Kind:
-        """Give a class the fields of the structure of its name."""
-        kind.declared = self._fields[kind.__name__]
-        pointed = {name: TENSOR_TYPES.get(field.kind) for name, field in kind.declared.items() if field.pointer}
-        kind.tensors = {name: dtype for name, dtype in pointed.items() if dtype is not None}
-        kind._fields_ = [(name, self._type(field)) for name, field in kind.declared.items()]
-        self.made[kind.__name__] = kind
-        return kind
+    def declare(self, *kinds: type[Structure]) -> None:
+        """Give classes the fields of the structures of their names; those that others hold come before these."""
+        for kind in kinds:
+            declared = kind.declared = self._fields[kind.__name__]
+            pointed = {name: TENSOR_TYPES.get(field.kind) for name, field in declared.items() if field.pointer}
+            kind.tensors = {name: dtype for name, dtype in pointed.items() if dtype is not None}
+            kind._fields_ = [(name, self._type(field)) for name, field in declared.items()]
+            self.made[kind.__name__] = kind
 
     def _type(self, field: Field) -> Any:
         if field.pointer:

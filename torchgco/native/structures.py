@@ -41,47 +41,22 @@ CONSTANTS = {
         ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
     )},
 }  # fmt: skip
+
+
+# fmt: off
+class Array(Structure): ...
+class Constraint(Structure): ...
+class Options(Structure): ...
+class Problem(Structure): ...
+class Outer(Structure): ...
+class Sampling(Structure): ...
+class Interior(Structure): ...
+class Kkt(Structure): ...
+# fmt: on
+
+
 HEADER = Header((C / "structures.h").read_text(), CONSTANTS)
-
-
-@HEADER.declares
-class Array(Structure):
-    """An array over (problems, knots, numbers)."""
-
-
-@HEADER.declares
-class Constraint(Structure):
-    """The rows of a constraint."""
-
-
-@HEADER.declares
-class Options(Structure):
-    """The options of iLQR and its line search."""
-
-
-@HEADER.declares
-class Problem(Structure):
-    """Problems of one form with their iterates, and where results are written."""
-
-
-@HEADER.declares
-class Outer(Structure):
-    """The outer loop of the augmented Lagrangian."""
-
-
-@HEADER.declares
-class Sampling(Structure):
-    """MPPI's rounds."""
-
-
-@HEADER.declares
-class Interior(Structure):
-    """The interior point."""
-
-
-@HEADER.declares
-class Kkt(Structure):
-    """Linear systems with the matrix of the KKT conditions."""
+HEADER.declare(Array, Constraint, Options, Problem, Outer, Sampling, Interior, Kkt)
 
 
 def constants() -> str:

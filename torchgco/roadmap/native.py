@@ -28,12 +28,13 @@ GROUP = 4  # of them, at least so many by each thread
 BLOCK, EDGES_AT_ONCE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
 C = Path(__file__).parent / "c"
+
+
+class Arguments(Structure): ...
+
+
 SEARCH_HEADER = Header((C / "search.h").read_text())
-
-
-@SEARCH_HEADER.declares
-class Arguments(Structure):
-    """What the library in C reads and writes."""
+SEARCH_HEADER.declare(Arguments)
 
 
 @dataclass(frozen=True)

@@ -19,27 +19,18 @@ from torchgco.native.includes import included, joined
 SURE_SPACINGS = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 WAY_PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at
 C = Path(__file__).parent / "c"
+
+
+# fmt: off
+class Map(Structure): ...
+class Graph(Structure): ...
+class Sweep(Structure): ...
+class String(Structure): ...
+# fmt: on
+
+
 LATTICE_HEADER = Header((C / "lattice.h").read_text())
-
-
-@LATTICE_HEADER.declares
-class Map(Structure):
-    """A map of distances."""
-
-
-@LATTICE_HEADER.declares
-class Graph(Structure):
-    """Blocks of cells."""
-
-
-@LATTICE_HEADER.declares
-class Sweep(Structure):
-    """The cheapest ways to all blocks."""
-
-
-@LATTICE_HEADER.declares
-class String(Structure):
-    """A path that is drawn taut."""
+LATTICE_HEADER.declare(Map, Graph, Sweep, String)
 
 
 def library_for(d: int) -> ctypes.CDLL | None:

@@ -1,6 +1,5 @@
 /* Boxes that may be turned, as obstacles: the rows of a knot, for problems with boxes (obstacles/boxes.py). */
 #pragma once
-
 #include "box.h"
 #include "penalty.h"
 

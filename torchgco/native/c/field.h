@@ -1,7 +1,6 @@
 /* Maps as obstacles: the row of a knot, from a distance field (maps/field.py). maps/lookup.py does the same, and explains
    it. Numbers of type V are per problem, and so is the map that a lane reads. */
 #pragma once
-
 #include "penalty.h"
 
 /* The numbers of a problem: its first node (DIM), 1 / h, h^2, R^2, the factor a, the core, what counts as distance 0, and

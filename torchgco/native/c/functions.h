@@ -1,7 +1,6 @@
 /* Exponentials, logarithms and the tangent of all lanes at once, each within 3 units in the last place. Where a lane's
    argument is out of the range that a formula is made for, or not finite, the C library is called for that lane. */
 #pragma once
-
 #include "lanes.h"
 
 #if TGCO_IS_DOUBLE

@@ -1,7 +1,6 @@
 /* iLQR (Algorithm 2) for problems side by side: the line search, and the loop that keeps the lanes filled.
    A problem's results agree with PyTorch's kernels up to rounding (tests/native). */
 #pragma once
-
 #include "knot.h"
 #include "memory.h"
 #include "passes.h"

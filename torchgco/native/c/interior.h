@@ -1,6 +1,5 @@
 /* The interior point's data: constraints are c(x, u) + s = 0 with slacks s > 0, or c(x, u) = 0. */
 #pragma once
-
 #include "model.h"
 
 typedef struct {

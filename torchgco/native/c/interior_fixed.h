@@ -5,7 +5,6 @@
    at its end: what is feasible there, with no multiplier, is optimal with the row, too. Of two bounds that coincide, the
    upper one becomes an equality, and the lower one stays out. */
 #pragma once
-
 #include <float.h>
 #include "interior_memory.h"
 

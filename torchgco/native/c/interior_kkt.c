@@ -9,7 +9,6 @@
    The interior point's factors of H + A'wA with w = 1 / (D + 1 / sigma), and of F, give steps towards the solution: each
    round closes what the last one has left open, of active rows all but a share of about 1 / sigma, as the method of
    multipliers does. */
-
 #include "interior_fixed.h"
 
 #define LEAST 1e-200 /* multiplier of an active row of an inequality, by which its stiffness is divided */

@@ -2,7 +2,6 @@
    paper (Waechter and Biegler 2006): theta is the sum of all residuals, phi the cost less mu times the logarithms of
    the slacks. */
 #pragma once
-
 #include "interior_step.h"
 #include "memory.h"
 
@@ -66,10 +65,7 @@ static int start_barrier(Barrier *t, const Interior *how) {
 }
 
 static void enter_barrier(Barrier *t, int lane, int64_t e) {
-    const Problem *p = t->lanes.of;
-    enter_problem(&t->lanes, lane, e);
-    for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->lanes.X[i][lane] = p->X[e * (p->N + 1) * NX + i];
-    for (int64_t i = 0; i < p->N * NU; i++) t->lanes.U[i][lane] = p->U[e * p->N * NU + i];
+    enter_iterate(&t->lanes, lane, e);
     if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
 }
 

@@ -1,6 +1,5 @@
 /* The rows of constraints in the interior point. */
 #pragma once
-
 #include "interior.h"
 #include "solids.h"
 

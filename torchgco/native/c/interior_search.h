@@ -1,7 +1,6 @@
 /* The interior point's filter and its line search (Waechter and Biegler 2006), with second-order corrections and a
    watchdog. */
 #pragma once
-
 #include <float.h>
 #include "interior_memory.h"
 

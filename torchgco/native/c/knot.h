@@ -1,6 +1,5 @@
 /* The terms of one knot of the iterate beside its cost: constraints and guide. */
 #pragma once
-
 #include "penalty.h"
 #include "solids.h"
 
@@ -253,6 +252,19 @@ static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     if (p->guide != NO_GUIDE) more += guide_value(s, k, x);
 #endif
     return more;
+}
+
+/* L_M along X, U, and the cost in it. */
+static V merit_of(const Lanes *s, V *cost) {
+    int64_t N = s->of->N;
+    V more = SET(0.0);
+    *cost = SET(0.0);
+    for (int64_t k = 0; k <= N; k++) {
+        const V *x = s->X + k * NX, *u = k < N ? s->U + k * NU : 0;
+        *cost += cost_value(s, k, x, u);
+        more += knot_value(s, k, x, u);
+    }
+    return *cost + more;
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of these terms. */

@@ -1,6 +1,5 @@
 /* Vectors V of LANES numbers of type REAL (double or float), one problem or sample per lane; lanes are never mixed. */
 #pragma once
-
 #include <math.h>
 #include <stdint.h>
 

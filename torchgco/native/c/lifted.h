@@ -1,6 +1,5 @@
 /* The search that lifts rollouts which diverge (ilqr/lifted.py). */
 #pragma once
-
 #include "ilqr.h"
 
 /* Up to `rounds` Gauss-Newton steps in states and controls together, where rollouts diverge (solvers/lifted.py). The

@@ -1,5 +1,4 @@
 /* MPPI (Algorithm 3): all rounds of sampled controls, problem by problem, with LANES samples side by side. */
-
 #include <float.h>
 #include "memory.h"
 #include "normal.h"

@@ -4,7 +4,6 @@
    y = b + M' a, and there are their transposes T (h, k). Arrays over neurons have NET_SIZE(h) numbers, of which those
    from h on are of no account; tangents G are such arrays for each column. */
 #pragma once
-
 #include <stdint.h>
 #include <string.h>
 #include "functions.h"

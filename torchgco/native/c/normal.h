@@ -1,7 +1,6 @@
 /* Normal draws in single precision that are a function of a key and of their number, as `draws.standard_normal` makes
    them: a counter per sample and row is hashed by MurmurHash3's finaliser (Appleby), two words to a Box-Muller pair. */
 #pragma once
-
 #include "constants.h"
 #include "lanes.h"
 

@@ -1,6 +1,5 @@
 /* The outer loop of the augmented Lagrangian (Algorithm 1): inner solves of all problems, then multipliers, penalties
    and the tests of the end, until each has ended. solvers/augmented_lagrangian.py does the same in PyTorch. */
-
 #include <float.h>
 #include "lifted.h"
 
@@ -176,7 +175,7 @@ static int64_t tested(const Outer *o, int64_t e, double violation, int caught) {
    A problem that has failed only gets its violation. */
 static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int count, int failed) {
     const Problem *p = s->of;
-    V least, total = SET(0.0), more = SET(0.0);
+    V least, total;
     I caught;
     for (int l = 0; l < LANES; l++) {
         int64_t e = number[l < count ? l : 0];
@@ -215,14 +214,10 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
         if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= DBL_MAX)) keep(o, e, violation[l]);
     }
     if (!going) return;
-    for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
-        total += cost_value(s, k, x, u);
-        more += knot_value(s, k, x, u);
-    }
+    V merit = merit_of(s, &total);
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];
-        p->cost[e] = total[l]; p->merit[e] = total[l] + more[l];
+        p->cost[e] = total[l]; p->merit[e] = merit[l];
         p->regularisation[e] = 0; p->inner[e] = p->rung[e] = 0;
     }
 }
@@ -280,38 +275,33 @@ int tgco_outer(const Outer *o, int64_t first, int64_t last) {
     return done;
 }
 
-static int violations(const Problem *p, int obstacles, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    I caught;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter_iterate(s, l, e + l < last ? e + l : e);
-        V violation = swept(s, obstacles, 0, SET(0.0), &caught).violation;
-        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = violation[l];
-    }
-    finish(s);
-    return 1;
-}
-
 /* The largest violation of given trajectories, into `merit`. */
-int tgco_violation(const Problem *p, int64_t first, int64_t last) { return violations(p, 0, first, last); }
+static void put_violation(Lanes *s, int64_t e, int used) {
+    I caught;
+    V violation = swept(s, 0, 0, SET(0.0), &caught).violation;
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
+}
+int tgco_violation(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, enter_iterate, put_violation);
+}
 
 /* The same of rows of obstacles alone. */
-int tgco_penetration(const Problem *p, int64_t first, int64_t last) { return violations(p, 1, first, last); }
+static void put_penetration(Lanes *s, int64_t e, int used) {
+    I caught;
+    V violation = swept(s, 1, 0, SET(0.0), &caught).violation;
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
+}
+int tgco_penetration(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, enter_iterate, put_penetration);
+}
 
 /* The sums of |lam c| over inequalities with c < 0 of given trajectories, into `merit`. */
-int tgco_slack(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
+static void put_slack(Lanes *s, int64_t e, int used) {
     I caught;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        V slack = swept(s, 0, 0, SET(0.0), &caught).slack;
-        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = slack[l];
-    }
-    finish(s);
-    return 1;
+    V slack = swept(s, 0, 0, SET(0.0), &caught).slack;
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = slack[l];
 }
+int tgco_slack(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_slack); }
 
 #if DIM > 0
 /* Squared distance of the origin from the segment that begins at a and goes along. */

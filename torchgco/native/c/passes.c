@@ -1,5 +1,4 @@
 /* Passes along a trajectory: rollouts with the gains, and the backward pass that computes them. */
-
 #include "model.h"
 #include "code.h"
 #include "cholesky.h"

@@ -1,6 +1,5 @@
 /* The terms that multipliers and penalty add to L_M for one row of a constraint. */
 #pragma once
-
 #include "problem.h"
 
 /* The term that a row adds to L_M. */

@@ -6,7 +6,6 @@
    are Python's text (native/codegen/source.py): constants.h, and code.h with the functions of a model, its cost and its
    traced constraints. `editor` has one of each, and compile_flags.txt the sizes, with which every file compiles alone. */
 #pragma once
-
 #include <stdlib.h>
 #include <string.h>
 #include "functions.h"

@@ -1,5 +1,4 @@
 /* The Riccati recursion of the interior point: factors of all stages, and the step in states, controls and costates. */
-
 #include "interior.h"
 #include "code.h"
 #include "cholesky.h"
@@ -114,7 +113,7 @@ void solve(Barrier *t) {
             for (int i = 0; i < NX; i++) ADD(du[j], K[j * NZ + i], dx[i]);
             z[NX + j] = du[j];
         }
-        tgco_push(t->f + k * NJ, z, along_f);
+        model_push(t->f + k * NJ, z, along_f);
         for (int i = 0; i < NX; i++) dx[NX + i] = along_f[i] + t->aim[k * NX + i];
         for (int i = 0; i < NX; i++) {
             V y = t->p[(k + 1) * NX + i];

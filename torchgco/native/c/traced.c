@@ -5,7 +5,6 @@
        tgco_stage_value(x, u, p, w, value)
        tgco_stage_entries(x, u, p, w, e)   STAGE_ENTRIES derivatives: STAGE_SLOPES of the gradient, then the Hessian's
        tgco_stage_places                where they belong in g and H */
-
 #include "model.h"
 #include "code.h"
 

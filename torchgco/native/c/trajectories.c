@@ -1,48 +1,32 @@
 /* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions, gains,
    rollouts, `lift`, and inner solves. They return 0 without memory. */
-
 #include "lifted.h"
 
 /* J_var and L_M of given trajectories. */
-int tgco_value(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        V total = SET(0.0), more = SET(0.0);
-        for (int64_t k = 0; k <= p->N; k++) {
-            const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
-            total += cost_value(s, k, x, u);
-            more += knot_value(s, k, x, u);
-        }
-        for (int l = 0; l < LANES && e + l < last; l++) {
-            p->cost[e + l] = total[l];
-            p->merit[e + l] = total[l] + more[l];
-        }
+static void put_values(Lanes *s, int64_t e, int used) {
+    V total, merit = merit_of(s, &total);
+    for (int l = 0; l < used; l++) {
+        s->of->cost[e + l] = total[l];
+        s->of->merit[e + l] = merit[l];
     }
-    finish(s);
-    return 1;
 }
+int tgco_value(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_values); }
 
 /* One backward pass along given trajectories: gains (E, N, NU, NZ) and the two sums of the expected change. */
-int tgco_gains(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        V linear, squares, lowest;
-        backward(s, knot_expand, NULL, &linear, &squares, &lowest);
-        V quadratic = -linear - s->mu_r * squares;
-        for (int l = 0; l < LANES && e + l < last; l++) {
-            p->cost[e + l] = linear[l];
-            p->merit[e + l] = quadratic[l];
-            p->status[e + l] = lowest[l] > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
-            for (int64_t i = 0; i < p->N * NU * NZ; i++) p->gains[(e + l) * p->N * NU * NZ + i] = s->G[i][l];
-        }
+static void put_gains(Lanes *s, int64_t e, int used) {
+    const Problem *p = s->of;
+    int64_t size = p->N * NU * NZ;
+    V linear, squares, lowest;
+    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
+    V quadratic = -linear - s->mu_r * squares;
+    for (int l = 0; l < used; l++) {
+        p->cost[e + l] = linear[l];
+        p->merit[e + l] = quadratic[l];
+        p->status[e + l] = lowest[l] > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
+        for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = s->G[i][l];
     }
-    finish(s);
-    return 1;
 }
+int tgco_gains(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_gains); }
 
 /* Rollout from the first knot of X, in place: of U, or with feedback of U + K (x - X), in place of U, too. */
 TGCO_INLINE int roll_out(const Problem *p, int64_t first, int64_t last, int feedback) {
@@ -85,27 +69,22 @@ int tgco_open_loop(const Problem *p, int64_t first, int64_t last) { return roll_
 int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 1); }
 
 /* Gradients (E, N+1, S) and upper triangles of the Hessians (E, N+1, S, S) of all terms. */
-int tgco_expand(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        for (int64_t k = 0; k <= p->N; k++) {
-            V g[S], H[S * S];
-            memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-            const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
-            cost_expand(s, k, x, u, g, H);
-            knot_expand(s, k, x, u, g, H);
-            for (int l = 0; l < LANES && e + l < last; l++) {
-                int64_t at = (e + l) * (p->N + 1) + k;
-                for (int i = 0; i < S; i++) p->slopes[at * S + i] = g[i][l];
-                for (int i = 0; i < S * S; i++) p->curvatures[at * S * S + i] = H[i][l];
-            }
+static void put_expansion(Lanes *s, int64_t e, int used) {
+    const Problem *p = s->of;
+    for (int64_t k = 0; k <= p->N; k++) {
+        V g[S], H[S * S];
+        memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        cost_expand(s, k, x, u, g, H);
+        knot_expand(s, k, x, u, g, H);
+        for (int l = 0; l < used; l++) {
+            int64_t at = (e + l) * (p->N + 1) + k;
+            for (int i = 0; i < S; i++) p->slopes[at * S + i] = g[i][l];
+            for (int i = 0; i < S * S; i++) p->curvatures[at * S * S + i] = H[i][l];
         }
     }
-    finish(s);
-    return 1;
 }
+int tgco_expand(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_expansion); }
 
 /* Up to `limit` iterations of inner solves. */
 int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {

@@ -150,7 +150,7 @@ def _value(function: ca.Function, k: int, read: list[str], shared: int | None) -
 
 def switch(head: str, cases: Iterable[str], *end: str) -> str:
     """A function of C that chooses by its argument i."""
-    return "\n".join((f"static inline {head} {{", "    switch (i) {", *cases, "    }", *end, "}"))
+    return "\n".join((f"{head} {{", "    switch (i) {", *cases, "    }", *end, "}"))
 
 
 def literal(value: float) -> str:

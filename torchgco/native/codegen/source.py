@@ -66,7 +66,7 @@ PASS_SOURCES = "model.c", "passes.c"
 SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c"))
 SAMPLER = Library(("model.c",), (), ("mppi.c",))
 # The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
-INTERIOR = Library(PASS_SOURCES, ("curvature.c", "riccati.c"), ("interior.c", "interior_kkt.c"))
+INTERIOR = Library(PASS_SOURCES, ("riccati.c",), ("interior.c", "interior_kkt.c"))
 SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
 
 
@@ -174,7 +174,7 @@ def _written_out(model: DynamicsSource) -> str:
 
 
 def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int]) -> str:
-    """`tgco_rows`, `tgco_add_rows` and `tgco_slopes`, which call the functions of a constraint by its place."""
+    """`model_rows`, `model_add_rows` and `model_slopes`, which call the functions of a constraint by its place."""
     values, adds, slopes = [], [], []
     for i, rows in functions:
         name = f"tgco_{rows.key}"
@@ -187,8 +187,8 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
     given = "int i, const V *x, const V *u, const V *p, const double *w"
     return "\n".join(
         (
-            switch(f"void tgco_rows({given}, V *c)", values),
-            switch(f"void tgco_add_rows(\n    {given}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
-            switch(f"int tgco_slopes(\n    {given}, V *e, const int **columns)", slopes, "    return 0;"),
+            switch(f"void model_rows({given}, V *c)", values),
+            switch(f"void model_add_rows(\n    {given}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
+            switch(f"int model_slopes(\n    {given}, V *e, const int **columns)", slopes, "    return 0;"),
         )
     )

@@ -1,6 +1,5 @@
 /* Squared distances of points and of segments from boxes; box.h has the numbers of a box. A vector V has LANES edges. */
 #pragma once
-
 #include <float.h>
 #include <stdint.h>
 #include "../../native/c/box.h"

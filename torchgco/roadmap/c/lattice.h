@@ -1,7 +1,6 @@
 /* What the search among a map's cells reads and writes. Python's own declaration follows from this one
    (roadmap/native_maps.py), which also gives the numbers of compile_flags.txt. */
 #pragma once
-
 #include <stdint.h>
 
 typedef struct {

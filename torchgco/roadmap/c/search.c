@@ -4,7 +4,6 @@
    roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
    compared as squares, detours and costs with a tolerance, and ties are broken by the lowest index: the paths are the
    same. DIM is the number of coordinates, BLOCK of edges measured side by side. */
-
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>

@@ -2,7 +2,6 @@
    corners. Python's own declaration follows from this one (roadmap/native.py), which also gives the numbers of
    compile_flags.txt. */
 #pragma once
-
 #include <stdint.h>
 
 typedef struct {

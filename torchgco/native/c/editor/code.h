@@ -1,4 +1,5 @@
-/* For editors: what the text that Python writes for a form of problems (native/codegen) defines. */
+/* For editors: what the text that Python writes for a form of problems (native/codegen) defines beside functions of
+   model.h. */
 #pragma once
 
 #include "../model.h"
@@ -8,10 +9,6 @@ void tgco_jacobian(const V *x, const V *u, const V *p, const double *w, V *f);
 void tgco_gather(const V *P, const V *f, V *T); /* T = P [fx fu] */
 void tgco_product(const V *f, const V *T, V *H); /* H = [fx fu]' T */
 void tgco_pull_back(const V *p, const V *f, V *g); /* g = [fx fu]' p */
-void tgco_rows(int i, const V *x, const V *u, const V *p, const double *w, V *c);
-void tgco_add_rows(
-    int i, const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc, V *g, V *H);
-int tgco_slopes(int i, const V *x, const V *u, const V *p, const double *w, V *e, const int **columns);
 
 void tgco_stage_value(const V *x, const V *u, const V *p, const double *w, V *value);
 void tgco_stage_entries(const V *x, const V *u, const V *p, const double *w, V *e);
@@ -19,10 +16,3 @@ void tgco_last_value(const V *x, const V *u, const V *p, const double *w, V *val
 void tgco_last_entries(const V *x, const V *u, const V *p, const double *w, V *e);
 enum { STAGE_SLOPES = 1, STAGE_ENTRIES = 2, LAST_SLOPES = 1, LAST_ENTRIES = 2 };
 static const int tgco_stage_places[2], tgco_last_places[2];
-
-void tgco_curve(const V *x, const V *u, const V *p, const double *w, const V *y, V *H);
-void tgco_push(const V *f, const V *z, V *out);
-void tgco_model_rows(
-    int i, const V *x, const V *u, const V *p, const double *w, const V *by, const V *cc, const V *lam,
-    V *const *g, V *H);
-void tgco_along_rows(int i, const V *x, const V *u, const V *p, const double *w, const V *z, V *out);
