@@ -33,8 +33,6 @@ from torchgco import Problem
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.reports import export, identify, report, view
-from torchgco.judging.certificate import CHORDS
-from torchgco.judging.judge import CLEARANCES
 from torchgco.kernels import EagerWarning
 from torchgco.native import store
 from torchgco.native.compiler import find_compiler
@@ -232,21 +230,11 @@ def run(page: Path) -> dict[str, object]:
     return names
 
 
-@pytest.fixture
-def registries() -> Iterator[None]:
-    """Restore the registries of obstacles after a page has added to them."""
-    before = [(registry, dict(registry)) for registry in (CLEARANCES, CHORDS)]
-    yield
-    for registry, entries in before:
-        registry.clear()
-        registry.update(entries)
-
-
 RUN = [page for page in PAGES if any(language == PYTHON for language, _ in blocks(page))]
 
 
 @pytest.mark.parametrize("page", mostly(RUN, *(page for page in RUN if page.name == "free_time.md")), ids=name_of)
-def test_every_python_block_runs(page: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_python_block_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if page.name in ("receding.md", "gradients.md") and find_compiler() is None:
         pytest.skip("no C compiler, which compiled problems and forward_ad.dual_level need")
     if page.name == "gym.md":

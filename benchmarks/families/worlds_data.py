@@ -16,7 +16,6 @@ from torch import Tensor
 
 from benchmarks.lib.families import WORLDS, Family
 from torchgco import compose, judge
-from torchgco.judging.distances import box_segment_distance
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import length
 from torchgco.roadmap.roadmap import Roadmap
@@ -58,9 +57,7 @@ def _passable(task: Task) -> Tensor:
     free = found & (length(paths[:, 0]) <= LONG * straight)
     for boxes in task.problem.constraints:
         if isinstance(boxes, BoundBoxes):
-            within = torch.full((1, 1, 1), torch.inf, dtype=paths.dtype)
-            gap = box_segment_distance(boxes, paths[:, 0], within) - boxes.inflated_radii.unsqueeze(1)
-            free &= gap.masked_fill(boxes.absent.unsqueeze(1), torch.inf).flatten(1).amin(-1) >= 0
+            free &= boxes.measured(paths[:, 0])[1].flatten(1).amin(-1) >= 0
     return free
 
 

@@ -14,7 +14,6 @@ from benchmarks.causes import shortfalls
 from benchmarks.causes.shortfalls import CAUSES, Search, cause, listed, refined, study, write
 from benchmarks.lib.families import WORLDS
 from torchgco import compose
-from torchgco.judging.judge import box_clearance
 
 FEW = Search(3, relaxed=[2, 0], compared=[2], chosen=2)
 MORE = Search(6, relaxed=[2, 4, 0, 1], compared=[4, 2], chosen=4)
@@ -77,7 +76,7 @@ def test_candidates_are_refined_to_their_costs(maze) -> None:
     assert len(costs) == 6 and {path for path, cost in enumerate(costs) if cost < inf} == set(ends) != set()
     for X in ends.values():
         assert problem.goal.distance(X[None, -1, problem.position]) < 5  # m, of 21
-        assert box_clearance(problem.geometric[0], X[None])[1] >= 0
+        assert problem.geometric[0].clearances(X[None])[1] >= 0
 
 
 def test_a_layout_gets_a_row_and_a_picture(maze, tmp_path: Path) -> None:

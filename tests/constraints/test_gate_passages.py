@@ -25,7 +25,6 @@ from torchgco import (
     judge,
 )
 from torchgco.constraints.gates import GateSquares
-from torchgco.explaining.places import row_told
 from torchgco.judging.gates import passes
 
 D = torch.float64
@@ -182,7 +181,7 @@ def test_a_gate_that_is_not_passed_is_named() -> None:
             rows |= {(k[g] + shift, row): ("plane", g) for g in (0, 1) for shift, row in ((1, 0), (-1, 0), (2, 1))}
         assert len(rows) == (2 if balls else 10)
         for (knot, row), (what, g) in rows.items():
-            assert row_told(gates, row, knot, problem.dynamics) == f"the {what} of gate {g + 1}, "
+            assert gates.told(row, knot, problem.dynamics) == f"the {what} of gate {g + 1}"
 
 
 @pytest.mark.parametrize(("along", "knots"), [

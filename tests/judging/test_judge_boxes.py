@@ -11,10 +11,8 @@ from tests.reference import boxes as brute_force
 from tests.slow import mostly
 from torchgco import Boxes, Problem, certify, judge
 from torchgco.dynamics.rollout import open_loop
-from torchgco.judging.certificate import CHORDS
-from torchgco.judging.distances import box_segment_distance
-from torchgco.judging.judge import box_clearance
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.measured import closest
 
 SAMPLES = 601
 
@@ -46,16 +44,18 @@ def test_clearances_against_sampled_segments(d: int, rounded: bool) -> None:
     X, _ = random_trajectory(problem, spread=0.5)
     X[:, 3] = X[:, 2]  # a segment of no length
     X[:, 5, :d] = 2 * boxes.centers[:, 0] - X[:, 4, :d]  # and one right through a box
-    at_knots, between = box_clearance(boxes, X)
+    at_knots, between = boxes.clearances(X)
     for b in range(2):
         single = boxes.take(torch.tensor([b]))
-        at, radii = X[b : b + 1, :, :d], single.inflated_radii.unsqueeze(1)
-        chords = (box_segment_distance(single, at, torch.full_like(radii, torch.inf)) - radii)[0]
-        near = CHORDS[BoundBoxes](single, X[b])
-        assert (near <= chords).all() and torch.equal(near.amin(), chords.amin())
-        loose = box_segment_distance(single, at, near.amin() + 0.05 + radii)[0] - radii[0]
-        close = loose < near.amin() + 0.05
-        assert (loose <= chords).all() and (loose < chords).any() and torch.equal(loose[close], chords[close])
+        near, a = single.measured(X[b : b + 1])[1][0], X[b, :, :d]
+        boxes_of = [part[0] for part in (single.axes, single.centers, single.half_sizes)]
+        each = [
+            closest(*(part.expand(8, *part.shape[1:]) for part in box), a[:-1], a.diff(dim=0))
+            for box in zip(*(part.split(1) for part in boxes_of), strict=True)
+        ]
+        chords = torch.stack(each, dim=-1) - single.inflated_radii
+        assert (near <= chords + 1e-12).all() and (near < chords - 1e-3).any()
+        torch.testing.assert_close(near.amin(), chords.amin(), rtol=0, atol=1e-12)
         p, knots, nearest = X[b, :, :d].numpy(), np.inf, np.inf
         for i in range(3):
             box = tuple(part[b, i] for part in parts)
@@ -78,7 +78,7 @@ def test_a_path_through_a_wall_is_seen_between_knots_alone() -> None:
     (boxes,) = problem.constraints
     X = plain.x0.unsqueeze(1).repeat(1, 2, 1)
     X[0, 1, 0] = 1.0
-    at_knots, between = box_clearance(boxes, X)
+    at_knots, between = boxes.clearances(X)
     assert float(at_knots) == pytest.approx(0.99 - 0.057) and float(between) == pytest.approx(-0.01 - 0.057)
 
 

@@ -8,8 +8,14 @@ import torch
 
 from tests.maps.test_field import bound, brute_clearance, points_around, random_grid
 from torchgco import Field, FunctionDynamics, Goal, Problem, QuadraticCost, certify, judge
-from torchgco.judging.maps import EXACT_TO, segment_distances
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
+from torchgco.maps.field import BoundField
+from torchgco.maps.measured import EXACT_TO
+
+
+def along(part: BoundField, p: torch.Tensor) -> torch.Tensor:
+    """Distances (K-1,) of the segments between points p (1, K, d) from what a map holds."""
+    return part.measured(p)[1][0, :, 0] + part.vehicle_radius
 
 
 @pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
@@ -17,7 +23,7 @@ def test_segments_from_cells(d: int) -> None:
     grid = random_grid(d, share=0.03)
     part = bound(DistanceField.of(grid))
     p = torch.from_numpy(points_around(grid, 40, beyond=0.8)).view(1, 40, d)
-    found = segment_distances(part, p)[0].numpy()
+    found = along(part, p).numpy()
     due = brute_clearance(grid, p[0, :-1], p[0, 1:])
     clear = due > 0
     assert clear.any() and (~clear).any()
@@ -30,7 +36,7 @@ def test_points_deep_inside_and_points_that_are_lost() -> None:
     cells[5:35, 5:35] = True
     part = bound(DistanceField.of(OccupancyGrid(cells, [0, 0], 0.1)))
     p = torch.tensor([[[2.0, 2.0], [2.0, 2.1], [2.0, 9.0], [torch.nan, 0], [100.0, 100], [100.0, 101]]]).double()
-    found = segment_distances(part, p)[0]
+    found = along(part, p)
     assert bool((found[:2] < 0).all()) and bool(torch.isnan(found[2:4]).all())
     far = 2**0.5 * (100 - 3.5)
     assert EXACT_TO < float(found[4]) <= far
@@ -40,14 +46,14 @@ def test_clouds_and_empty_maps() -> None:
     rng = np.random.default_rng(0)
     cloud = PointCloud(rng.uniform(-1, 1, (40, 3)), 0.05)
     p = torch.from_numpy(rng.uniform(-1.5, 1.5, (1, 30, 3)))
-    found = segment_distances(bound(DistanceField.of(cloud)), p)[0].numpy()
+    found = along(bound(DistanceField.of(cloud)), p).numpy()
     share = np.linspace(0, 1, 2001)[:, None, None]
     lines = p[0, :-1].numpy() + share * p[0].diff(dim=0).numpy()
     due = np.linalg.norm(lines[:, :, None] - cloud.points, axis=-1).min((0, 2)) - 0.05
     np.testing.assert_allclose(found, due, atol=2e-3)
     assert (found <= due + 1e-8).all()
     empty = bound(DistanceField.of(OccupancyGrid(np.zeros((3, 3), bool), [0, 0], 1.0)))
-    assert bool(torch.isposinf(segment_distances(empty, torch.zeros(1, 4, 2).double())).all())
+    assert bool(torch.isposinf(along(empty, torch.zeros(1, 4, 2).double())).all())
 
 
 def test_verdicts_and_certificates_count_the_cells() -> None:

@@ -16,7 +16,6 @@ from tests.obstacles.test_obstacles import HalfPlane
 from tests.slow import mostly
 from torchgco import Boxes, Capsules, ControlBounds, InputError, Problem, Spheres
 from torchgco.constraints import Constraint
-from torchgco.judging import judge
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
 
@@ -99,13 +98,13 @@ def test_several_kinds_count_together_and_none_is_far_away() -> None:
 def test_a_kind_of_ones_own_counts_once_the_judge_knows_it(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = far()
     problem = Problem(plain.dynamics, plain.cost, [HalfPlane(1.0)], plain.x0, plain.N, plain.goal)
-    with pytest.raises(InputError, match="got HalfPlane"):
+    with pytest.raises(InputError, match=r"HalfPlane\.measured"):
         Contact.among(problem)
 
-    def clearance(wall: HalfPlane, X: Tensor) -> tuple[Tensor, Tensor]:
-        nearest = (wall.edge - X[..., 0]).amin(-1)
-        return nearest, nearest
+    def measured(wall: HalfPlane, X: Tensor) -> tuple[Tensor, Tensor]:
+        away = wall.edge - X[..., :1]
+        return away, torch.minimum(away[:, :-1], away[:, 1:])
 
-    monkeypatch.setitem(judge.CLEARANCES, HalfPlane, clearance)
+    monkeypatch.setattr(HalfPlane, "measured", measured)
     p = torch.tensor([[[0.2, 0.0, 0.0], [0.7, 0.0, 0.0]]], **DOUBLE)
     assert Contact.among(problem).along(p, 0.1).tolist() == [pytest.approx(0.3)]

@@ -30,7 +30,6 @@ from torchgco import (
     Spheres,
     Unicycle,
 )
-from torchgco.explaining.places import row_told
 from torchgco.maps import PointCloud
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
@@ -214,7 +213,7 @@ def test_the_search_sees_the_ball_that_the_body_holds() -> None:
     assert near is not None and near.call.problem.obstacles[0].absent.tolist() == [[False] * 6]
     assert near.places[0].tolist() == [[0, 1, 3, 4, 6, 7]]  # type: ignore[union-attr]
     assert not bool(problem.start_is_clear)
-    assert row_told(problem.constraints[0], 4, 1, problem.dynamics).startswith("ball 1, obstacle 1")
+    assert problem.constraints[0].told(4, 1, problem.dynamics) == "ball 1, obstacle 1"
     assert "Body(3 balls among Spheres(3 each of 1 problems))" in repr(problem)
 
 

@@ -29,7 +29,7 @@ from torchgco import (
 )
 from torchgco.baselines import Hold
 from torchgco.dynamics.rollout import open_loop
-from torchgco.judging.judge import judge, sphere_clearance
+from torchgco.judging.judge import judge
 from torchgco.solvers.polish import polish
 from torchgco.solvers.polish.active_set import multipliers, projected
 from torchgco.solvers.polish.condensed import Condensed
@@ -271,7 +271,7 @@ def test_condensed_derivatives_are_those_of_the_rollout(batch: str) -> None:
 def test_chord_clearance_is_the_judges(batch: str) -> None:
     problem, solution = solved(batch)
     spheres = problem.constraints[0]
-    torch.testing.assert_close(spheres.chord_clearance(solution.X), sphere_clearance(spheres, solution.X)[1])
+    torch.testing.assert_close(spheres.chord_clearance(solution.X), spheres.clearances(solution.X)[1])
 
 
 def test_a_residual_is_relative_to_the_gradient_of_the_cost() -> None:

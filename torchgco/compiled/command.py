@@ -10,10 +10,11 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
+from torchgco.base.numbers import as_floats
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
 from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
-from torchgco.compiled.numbers import Numbers, as_floats, measured
+from torchgco.compiled.numbers import Numbers, measured
 from torchgco.compiled.stages import moved, stage_of, stages_between
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current, open_loop

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchgco.api import solve
 from torchgco.base import clock
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Number
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import CPU, check_untransformed, computing_on
 from torchgco.base.status import Status
@@ -23,7 +24,7 @@ from torchgco.base.tree import put
 from torchgco.compiled.answer import Answer
 from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
 from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
-from torchgco.compiled.numbers import Number, Numbers
+from torchgco.compiled.numbers import Numbers
 from torchgco.explaining.account import Account
 from torchgco.kernels import cost_scale, cost_unit, current, interior_of
 from torchgco.lagrangian.lagrangian import Multipliers

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.compiled.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers
+from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers
 from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic

@@ -1,89 +1,16 @@
-"""The numbers of a problem by name: where they lie, of which shape they are, and how new ones are written there.
-
-Shapes begin with the axis of problems. References have an axis of all knots; what a problem's parts share between
-stages stays shared.
-"""
+"""The numbers of a problem by name, and new ones for them."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import bound_of
-
-Floats = np.ndarray[Any, np.dtype[np.float64]]
-Wrong: TypeAlias = tuple[str, Any] | None  # (expected, got); None: nothing is wrong
-Check: TypeAlias = Callable[[Floats], Wrong]
-Joint: TypeAlias = Callable[[Mapping[str, Floats]], Wrong]
-
-
-@dataclass(slots=True)
-class Number:
-    """One of them.
-
-    Args:
-        name: where it is in the problem, such as "constraints[1].centers".
-        views: the memory that holds it, (B, ...); or of all stages, (B, N, ...), and of the last knot, (B, ...).
-        part: whose number it is: "x0", "cost", "dynamics", or the place of a constraint.
-        derived: whether kernels read what is computed from it, not the number itself.
-        check: says what is wrong with new numbers, (expected, got), or None.
-        after: is called when new numbers have been written.
-        none: what None stands for in new numbers; only bounds have some.
-        joint: says what is wrong with new numbers, by full names, that are written together; raises or returns as
-            `check`.
-    """
-
-    name: str
-    views: tuple[Floats, ...]
-    part: str | int
-    derived: bool
-    check: Check
-    after: Callable[[], object] | None = None
-    joint: Joint | None = None
-    shape: tuple[int, ...] = ()
-    none: float | None = None
-
-    def __post_init__(self) -> None:
-        first, *last = self.views
-        self.shape = first.shape if not last else (len(first), first.shape[1] + 1, *first.shape[2:])
-
-    @property
-    def value(self) -> Floats:
-        """A copy, (B, ...)."""
-        first, *last = self.views
-        return first.copy() if not last else np.concatenate((first, last[0][:, None]), axis=1)
-
-    def checked(self, value: Any) -> Floats:
-        """New numbers of this shape, or without the axis of problems for all of them.
-
-        Raises:
-            InputError: another shape, no numbers, or numbers that the problem can't have.
-        """
-        value = value if self.none is None else bound_of(value, self.none)
-        given, shape = as_floats(value, self.name), self.shape
-        if given.shape != shape and given.shape != shape[1:]:
-            expected = f"shape {shape}" if len(shape) == 1 else f"shape {shape}, or {shape[1:]} for all problems"
-            raise InputError(self.name, expected, given.shape)
-        if (wrong := self.check(given)) is not None:
-            raise InputError(self.name, *wrong)
-        return given
-
-    def write(self, given: Floats) -> None:
-        """Write numbers that are `checked`."""
-        if len(self.views) == 1:
-            self.views[0][...] = given
-        else:
-            first, last = self.views
-            first[...], last[...] = given[..., :-1, :], given[..., -1, :]
-        if self.after is not None:
-            self.after()
+from torchgco.base.numbers import Floats, Number, as_floats
 
 
 class Numbers(Mapping[str, Floats]):
@@ -161,20 +88,6 @@ class Numbers(Mapping[str, Floats]):
         return short if self._by_name.get(short) is self._all[name] else name
 
 
-def as_floats(value: Any, name: str) -> Floats:
-    """Numbers as an array in double precision.
-
-    Raises:
-        InputError: no numbers.
-    """
-    if type(value) is np.ndarray and value.dtype == np.float64:
-        return value
-    try:
-        return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(name, "numbers", type(value).__name__) from None
-
-
 def measured(x: Any, B: int, n: int) -> Floats:
     """States (B, n), or (n,) of all vehicles.
 
@@ -189,44 +102,5 @@ def measured(x: Any, B: int, n: int) -> Floats:
     return state
 
 
-def numbers(
-    where: str,
-    fields: Mapping[str, tuple[Tensor, Check]],
-    part: str | int,
-    derived: bool = True,
-    after: Callable[[], object] | None = None,
-    joint: Joint | None = None,
-) -> list[Number]:
-    """A number for each of these fields, with its check; all else as of `Number`."""
-    return [
-        Number(f"{where}.{name}", (tensor.numpy(),), part, derived, check, after, joint)
-        for name, (tensor, check) in fields.items()
-    ]
-
-
 def _short(name: str) -> str:
     return name.rpartition(".")[2]
-
-
-def finite(new: Floats) -> Wrong:
-    return None if np.isfinite(new).all() else ("finite numbers", "NaN or infinity")
-
-
-def present(new: Floats) -> Wrong:
-    return None if np.isfinite(new).all() else ("finite numbers (put an obstacle far away to be rid of it)", "others")
-
-
-def lengths(new: Floats) -> Wrong:
-    return finite(new) or (None if (new >= 0).all() else ("lengths of at least 0", float(new.min())))
-
-
-def above_zero(new: Floats) -> Wrong:
-    return finite(new) or (None if (new > 0).all() else ("numbers above 0", float(new.min())))
-
-
-def at_least_zero(new: Floats) -> Wrong:
-    return finite(new) or (None if (new >= 0).all() else ("numbers of at least 0", float(new.min())))
-
-
-def above_zero_or_infinite(new: Floats) -> Wrong:
-    return None if (new > 0).all() else ("numbers above 0, or infinity", float(new.min()))

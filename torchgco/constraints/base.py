@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown, undefined
+from torchgco.base.numbers import Number, numbers_of_fields
 from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
@@ -21,6 +22,8 @@ from torchgco.costs.base import add_blocks
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 TOUCH = 1.0 - CONTACT_FACTOR  # the same, as a share beneath the full surface
 ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
+
+NO_ROW = -1.0  # the row of a bound that one problem of a batch doesn't have
 
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor
@@ -86,6 +89,55 @@ class Constraint(PerElement):
             return self.knots.start <= k < self.knots.stop
         return bool((self.knots == k).any())
 
+    def numbers(self, where: str, place: int) -> list[Number]:
+        """Its numbers, which a compiled problem writes; `where` it is in the problem, such as "constraints[1]"."""
+        return numbers_of_fields(self, where, place)
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether violations are lengths."""
+        return self.geometric
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        """A row at a knot in words."""
+        return f"row {row}"
+
+    def by_obstacle(self, rows: Tensor) -> Tensor:
+        """Of each obstacle whether any of its rows (..., p) is marked; of each row, where every row is one's own."""
+        return rows
+
+    def remade(self) -> Constraint:
+        """The same with what is computed from its numbers as they are now."""
+        return self
+
+    def with_more(self, n: int, m: int) -> Constraint:
+        """The same rows in a form of the problem with further states and controls after the first n and m."""
+        return FirstRows(self, n, m)
+
+    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
+        """The same where state n is the factor of time, followed by controls, and `later` factors are to be chosen."""
+        return FirstRowsInTime(self, n, m)
+
+    def paced(self, factor: Tensor) -> Constraint:
+        """The same for obstacles that move `factor` (B,) times as far from knot to knot."""
+        return self
+
+    def at_factor(self, factor: Tensor) -> Constraint:
+        """The same of a form `in_free_time` whose factor (B,) is held."""
+        return self
+
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Constraint:
+        """The same in a form where states are held after each problem's last knot, `horizon` (B,).
+
+        Args:
+            counts: at which of its knots rows count, (B, K), 1 or 0; those of knot N may stand for the last knot.
+            where: the constraint's name in errors.
+
+        Raises:
+            InputError: a constraint that can't end early.
+        """
+        return CountedRows(self, counts)
+
     def grown(self, by: Tensor) -> Self:
         """The same constraint with more distance from its obstacles by `by` (B,), m; itself where it keeps none."""
         return self
@@ -97,6 +149,55 @@ class Constraint(PerElement):
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """Whether the constraint admits a start at x0 (B, n), (B,) bool."""
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)
+
+
+class Distance(Constraint):
+    """A constraint that keeps bodies apart: obstacles, and positions that keep a distance from each other.
+
+    P places of a state, points (B, K, P, d) or vectors between two of them, keep distances from M surfaces each.
+    """
+
+    contact_depths: Any  # (B, P M): how deep beneath the full surfaces bodies touch, m
+
+    def places(self, X: Tensor) -> Tensor:
+        """The places (B, K, P, d), m, of states X (B, K, n)."""
+        raise undefined(self, "places")
+
+    def even_bulge(self, X: Tensor) -> Tensor:
+        """How far places leave their straight lines, m, (B|1, K-1|1, P), where states X (B, K, n) change evenly."""
+        return X.new_zeros(1, 1, 1)
+
+    def measured(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances of states X (B, K, n), k dt apart, as the judge and the certificate take them, m.
+
+        At each state, (B, K, P M), and lower bounds along the straight ways of places between them, (B, K - 1, P M),
+        from the full surfaces: see `obstacles/measured.py`.
+        """
+        raise undefined(self, "measured")
+
+    def clearances(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        """The smallest of these (B,) to where bodies touch: at the states, and there and between; infinite without."""
+        at, between = (least(part + self.contact_depths.unsqueeze(1)) for part in self.measured(X))
+        return at, torch.minimum(at, between)
+
+    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
+        """Smallest distance (B,) of the straight lines between knots from where bodies touch, m; negative in contact.
+
+        As solvers measure it. Counted from a `share` of the margin beneath the full surface, by default from where
+        bodies touch; infinite where there is no obstacle.
+        """
+        raise undefined(self, "chord_clearance")
+
+    def in_pieces(self, count: int) -> Self:
+        """The same for states at the ends of `count` pieces of each stage."""
+        return self
+
+
+def least(distances: Tensor) -> Tensor:
+    """The smallest of distances (B, K, M) per problem, (B,); infinite where there is none."""
+    if distances.shape[1] == 0 or distances.shape[2] == 0:
+        return distances.new_full(distances.shape[:1], torch.inf)
+    return distances.flatten(1).amin(-1)
 
 
 @dataclass(frozen=True)
@@ -113,6 +214,73 @@ class WrappedConstraint(Constraint):
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, constraint=self.constraint.grown(by))
+
+
+@dataclass(frozen=True)
+class FirstRows(WrappedConstraint):
+    """A constraint on the first n states and m controls."""
+
+    n: int
+    m: int
+
+    batched: ClassVar[tuple[str, ...]] = ("constraint",)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.value(X[..., : self.n], U[..., : self.m])
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.violation(X[..., : self.n], U[..., : self.m])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self.constraint.at(x[..., : self.n], k)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        X_own, U_own = X[..., : self.n], U[..., : self.m]
+        add_first(H, X, self.n, self.m, lambda blocks: self.constraint.accumulate(X_own, U_own, g, h, blocks))
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        return self.constraint.start_is_clear(x0[:, : self.n])
+
+
+class FirstRowsInTime(FirstRows):
+    """Rows of the first states and controls that kernels in C measure, too."""
+
+    keeps_rows: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class CountedRows(WrappedConstraint):
+    """A constraint whose rows count at some of its knots."""
+
+    counts: Tensor  # (B, K): 1 where they count, else 0
+
+    batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else NO_ROW)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._where(self.constraint.violation(X, U), 0.0)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        rows, knots = self.constraint.at(x, k), self.knots
+        place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
+        return torch.where(self.counts[:, place, None, None] > 0, rows, NO_ROW)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)
+
+    def _where(self, rows: Tensor, other: float) -> Tensor:
+        return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
+
+
+def add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
+    """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
+    blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
+    write(blocks)
+    one = X.shape[-1]
+    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
+    H[..., own.unsqueeze(-1), own] += blocks
 
 
 def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
@@ -200,6 +368,16 @@ class FunctionConstraint(Constraint):
             raise InputError(f"{self.name}.function", f"a function of {' and '.join(self.of)}", shown(self.function))
         values = bound_values(self.values, self.knot_values, (self.function,), dims, self.name)
         return replace(self, knots=knots, values=values)
+
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Constraint:
+        knots = torch.arange(N + 1, device=horizon.device)[self.knots]
+        stands = (counts > 0) & (knots == N) & (horizon < N).unsqueeze(-1)
+        if not bool(stands.any()):
+            return CountedRows(self, counts)
+        if asks_for_knot(self.function):
+            expected = "a function without an argument k at the last knots: `knot_values` serve"
+            raise InputError("horizon", expected, f"one with it in {where}")
+        return CountedRows(replace(self, values=self.values.ending_at(horizon)), counts)
 
     @property
     def reads_knots(self) -> bool:

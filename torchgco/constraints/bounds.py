@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, inf
+from torch.nn.functional import pad
 
 from torchgco.base.errors import InputError
+from torchgco.base.numbers import Floats, Number, Wrong, crossed, numbers, numbers_of_fields
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, check_shape, tensor
-from torchgco.constraints.base import Constraint, count_of, resolve_knots
+from torchgco.base.tree import is_users
+from torchgco.constraints.base import Constraint, FirstRowsInTime, count_of, resolve_knots
+from torchgco.dynamics.names import controls_of, states_of
 
 LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
 
@@ -55,6 +60,50 @@ class _Bounds(Constraint):
         if count_of(above, size) + count_of(below, size) == 0:
             raise InputError(name, "at least one finite bound", "none")
         return replace(self, lower=lower, upper=upper, knots=knots, above=above, below=below)
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        fields = {side: (getattr(self, side), partial(self._check_new, side=side)) for side in ("lower", "upper")}
+        joint = crossed(self, where, np.greater, "lower bounds of at most the upper ones")
+        found = numbers(where, fields, place, joint=joint)
+        for number, none in zip(found, (-np.inf, np.inf), strict=True):
+            number.none = none
+        return found
+
+    def _check_new(self, new: Floats, side: str) -> Wrong:
+        sign = 1.0 if side == "lower" else -1.0
+        bounded = np.zeros(self.lower.shape[-1], dtype=bool)
+        bounded[self.below if side == "lower" else self.above] = True
+        free = new[..., ~bounded]
+        if np.isnan(new).any() or (new == sign * np.inf).any():
+            return f"numbers or {-sign * np.inf}", new.tolist()
+        if np.isfinite(free).any():
+            expected = "infinity in components that were infinite when the problem was compiled; give them 1e9 then"
+            return expected, float(free[np.isfinite(free)][0])
+        return None
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        places = torch.arange(self.lower.shape[-1])
+        above, below = (places[part].tolist() for part in (self.above, self.below))
+        side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
+        kind, of = ("control", controls_of) if self.of == "u" else ("state", states_of)
+        named = getattr(dynamics, f"{kind}_names")
+        return f"{side} bound of {kind} {component}{f' ({of(dynamics)[component].label})' if len(named) else ''}"
+
+    def with_more(self, n: int, m: int) -> Constraint:
+        return super().with_more(n, m) if is_users(self) else self
+
+    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
+        if is_users(self):
+            return super().in_free_time(n, m, later)
+        if self.of == "x" or later == 0:
+            return self
+        sides = {side: pad(getattr(self, side), (0, 1), value=free) for side, free in (("lower", -inf), ("upper", inf))}
+        return replace(self, **sides)
+
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Constraint:
+        lower, upper = self.by_knot
+        each = counts.unsqueeze(-1) > 0
+        return replace(self, lower=torch.where(each, lower, -inf), upper=torch.where(each, upper, inf))
 
     @property
     def _first_knot(self) -> int:
@@ -169,6 +218,9 @@ class ControlBounds(_Bounds):
     of: ClassVar[Literal["x", "u"]] = "u"
     label: ClassVar[str] = "control_bounds"
 
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Constraint:
+        return self  # controls at rest are within them
+
 
 def joined_bounds(parts: Sequence[ControlBounds], N: int) -> ControlBounds | None:
     """The bounds of several parts, once bound, as one; the only part as it is, and None of none.
@@ -249,6 +301,12 @@ class RateBounds(_Bounds):
         every = self.upper.new_zeros(1, self.upper.shape[-1]) if self.previous is None else self.previous
         return every[:, self.controls]
 
+    def with_more(self, n: int, m: int) -> Constraint:
+        return self.with_states_from(n)
+
+    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
+        return RatesInTime(self.with_states_from(n + 1), n, m)
+
     def with_states_from(self, first: int) -> Self:
         """The same rows for a solver's states, of which those from `first` on are the bounded controls of k - 1."""
         states = torch.zeros(self.upper.shape[-1], dtype=torch.int64, device=self.upper.device)
@@ -260,6 +318,9 @@ class RateBounds(_Bounds):
             return (U - X[:, :-1, self.states])[:, self.knots]
         first = U[:, :1] if self.previous is None else self.previous.unsqueeze(1).expand(U.shape[0], 1, -1)
         return (U - torch.cat((first, U[:, :-1]), dim=1))[:, self.knots]
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        return numbers_of_fields(self, where, place)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         if self.states is None:
@@ -273,3 +334,38 @@ class RateBounds(_Bounds):
             add[..., at, at] = diagonal
         add[..., u, x] = add[..., x, u] = -diagonal
         H[:, self.knots] += add
+
+
+@dataclass(frozen=True)
+class RatesInTime(FirstRowsInTime):
+    """Bounds on changes of controls from stage to stage, which grow with the length of the stage: tau times these."""
+
+    constraint: RateBounds
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        rates, tau = self.constraint, X[:, self.constraint.knots, self.n : self.n + 1]
+        z = (U[..., : self.m] - X[:, : U.shape[1], rates.states])[:, rates.knots]
+        upper, lower = rates.limits()
+        return torch.cat((z[..., rates.above] - tau * upper, tau * lower - z[..., rates.below]), dim=-1)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.value(X, U).clamp(min=0.0)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        rates, one = self.constraint, X.shape[-1]
+        upper, lower = rates.limits()
+        every, before = torch.arange(self.m, device=H.device), rates.states
+        assert before is not None
+        J = H.new_zeros(*torch.broadcast_shapes(upper.shape[:2], g.shape[:2]), g.shape[-1], H.shape[-1])
+        first = 0
+        for which, limit, sign in ((rates.above, upper, 1.0), (rates.below, lower, -1.0)):
+            controls = every[which]
+            rows = first + torch.arange(len(controls), device=H.device)
+            J[..., rows, one + 1 + controls], J[..., rows, before[controls]] = sign, -sign
+            J[..., rows, self.n] = -sign * limit
+            first += len(controls)
+        slope = (g.unsqueeze(-2) @ J).squeeze(-2)
+        add = (h.unsqueeze(-1) * J).mT @ J
+        add[..., one, :] += slope
+        add[..., :, one] += slope
+        H[:, rates.knots] += add

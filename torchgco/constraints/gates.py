@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Number, above_zero, directions, finite, numbers
 from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
-from torchgco.constraints.base import ADMITTED, Constraint, whole
-from torchgco.constraints.norms import NO_ROW, NormBounds, Vectors
+from torchgco.constraints.base import ADMITTED, NO_ROW, Constraint, whole
+from torchgco.constraints.norms import NormBounds, Vectors
 
 # How far, m, a square's plane lies behind and ahead of the knots between which it is crossed: a trajectory that is
 # feasible within the tolerance is still that tolerance away on each side, so that none can stand in the plane.
@@ -92,6 +93,7 @@ class GateBalls(NormBounds):
     per_element: ClassVar[tuple[str, ...]] = ()
     name: ClassVar[str] = "gates"
     label: ClassVar[str] = "gates"
+    in_metres: ClassVar[bool] = True  # type: ignore[misc]
 
     @property
     def centers(self) -> Tensor:
@@ -102,6 +104,15 @@ class GateBalls(NormBounds):
     def sizes(self) -> Tensor:
         """Their radii (B, G), m."""
         return self.upper.gather(1, self.places - 1)
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"the radius of gate {int((self.places[0] == knot).nonzero()[0]) + 1}"
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        """Of gates, which keep their knots."""
+        centers, radii = self.centers, self.sizes
+        fields = {"centers": (centers, finite), "radius": (radii, above_zero)}
+        return numbers("gates", fields, place, after=lambda: self.write(centers, radii))
 
     def write(self, centers: Tensor, sizes: Tensor) -> None:
         """Put other gates (B, G, d) of other radii (B, G) in the places of these, in this memory."""
@@ -124,6 +135,7 @@ class GateSquares(Vectors):
     batched: ClassVar[tuple[str, ...]] = ("centers", "axes", "half_widths", "places", "slopes", "limits")
     of: ClassVar[str] = "x"
     name: ClassVar[str] = "gates"
+    in_metres: ClassVar[bool] = True  # type: ignore[misc]
 
     @property
     def sizes(self) -> Tensor:
@@ -136,6 +148,19 @@ class GateSquares(Vectors):
         bound = replace(self, slopes=slopes, limits=limits, knots=slice(1, dims.N + 1))
         bound.write()
         return bound
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        off = knot - self.places[0]
+        at = (off == 0) | (off == 1)
+        what = "side" if row > 0 and bool(at.any()) else "plane"
+        at = at if bool(at.any()) else off == (2 if row > 0 else -1)
+        return f"the {what} of gate {int(at.nonzero()[0]) + 1}"
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        normals = self.axes[:, :, 0].clone()
+        fields = {"centers": (self.centers, finite), "half_widths": (self.half_widths, above_zero)}
+        found = numbers("gates", fields, place, after=self.write)
+        return found + numbers("gates", {"normals": (normals, directions)}, place, after=lambda: self.write(normals))
 
     def write(self, normals: Tensor | None = None) -> None:
         """Make the rows of the centres and half widths as they are, and of other normals (B, G, d), in this memory."""

@@ -7,16 +7,28 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import (
+    Check,
+    Number,
+    above_zero_or_infinite,
+    angles,
+    crossed,
+    directions,
+    finite,
+    lengths,
+    numbers,
+)
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, tensor
-from torchgco.constraints.base import Constraint, count_of, resolve_knots, whole
+from torchgco.base.tree import is_users
+from torchgco.constraints.base import NO_ROW, Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
-NO_ROW = -1.0  # the row of a bound that one problem of a batch doesn't have
 # Length of a vector, in its units, at which a cone's row is smooth, too: smaller ones cost the interior point hundreds
 # of iterations where a vector ends at the tip, as the way to a landing site does.
 TIP = 1e-4
@@ -43,6 +55,27 @@ class Vectors(Constraint):
         x, u = ((gradient, curvature), (None, None)) if self.of == "x" else ((None, None), (gradient, curvature))  # type: ignore[attr-defined]
         add_blocks(add, X.shape[-1], x[0], u[0], x[1], u[1])
         H[:, self.knots] += add
+
+    def with_more(self, n: int, m: int) -> Constraint:
+        return super().with_more(n, m) if is_users(self) else self
+
+    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
+        return super().in_free_time(n, m, later) if is_users(self) else self
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        checks: dict[str, Check] = {
+            "lower": lengths, "upper": above_zero_or_infinite, "center": finite, "apex": finite, "angle": angles,
+            "axis": directions,
+        }  # fmt: skip
+        both = all(getattr(self, side, None) is not None for side in ("lower", "upper"))
+        joint = crossed(self, where, np.greater_equal, "lower bounds below the upper ones") if both else None
+        given = {field: getattr(self, field) for field in self.per_element if field in checks}
+        fields = {field: (tensor, checks[field]) for field, tensor in given.items() if tensor is not None}
+        return numbers(where, fields, place, joint=joint)
+
+    def _components_told(self) -> str:
+        places = ", ".join(map(str, self.components.tolist()))  # type: ignore[union-attr]
+        return f"{'controls' if self.of == 'u' else 'states'} {places}"  # type: ignore[attr-defined]
 
     def _slopes(self, X: Tensor, U: Tensor) -> Tensor:
         """The derivatives (B, K, p, c) of the rows by the components."""
@@ -119,6 +152,9 @@ class NormBounds(Vectors):
     def sides(self) -> list[str]:
         """Of which bound each row is."""
         return [side for side in ("upper", "lower") if getattr(self, side) is not None]
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"{self.sides[row]} bound of the norm of {self._components_told()}"
 
     @property
     def row_radii(self) -> Tensor:
@@ -228,6 +264,9 @@ class Cone(Vectors):
         w, x, y, z = z.unbind(-1)
         columns = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
         return torch.stack(columns, dim=-1)
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"cone of {self._components_told()}"
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         v = self._directed(X, U)

@@ -11,12 +11,13 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, tensor
-from torchgco.constraints.base import CONTACT_FACTOR, TOUCH, Constraint, resolve_knots, whole
+from torchgco.base.tree import is_users
+from torchgco.constraints.base import CONTACT_FACTOR, TOUCH, Constraint, Distance, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
 
 @dataclass(frozen=True)
-class Separation(Constraint):
+class Separation(Distance):
     """min_distance^2 - |p_i - p_j|^2 <= 0 for pairs of positions within one state, a row for each pair.
 
         apart = Separation([[0, 1, 2], [13, 14, 15]], 1.0)  # two quadrotors, 13 states each, keep 1 m
@@ -79,6 +80,12 @@ class Separation(Constraint):
         add_blocks(add, X.shape[-1], gradient, None, slopes.mT @ (h.unsqueeze(-1) * slopes), None)
         H[:, self.knots] += add
 
+    def with_more(self, n: int, m: int) -> Constraint:
+        return super().with_more(n, m) if is_users(self) else self
+
+    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
+        return super().in_free_time(n, m, later) if is_users(self) else self
+
     def grown(self, by: Tensor) -> Self:
         return replace(self, min_distance=self.min_distance + by)
 
@@ -87,16 +94,32 @@ class Separation(Constraint):
         return (self.away(x0).norm(dim=-1) >= CONTACT_FACTOR * self.min_distance.unsqueeze(-1)).all(-1)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
-        """Smallest distance (B,) to where bodies touch, both on the straight lines between their knots, m.
-
-        They touch a `share` of the distance below it.
-        """
+        """As of `Distance`, both on the straight lines between their knots at the same time."""
         away = self.away(X)
         a, along = away[:, :-1], away.diff(dim=1)
         length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(X.dtype).tiny)
         nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
         contact = 1.0 - (TOUCH if share is None else share)
         return nearest.norm(dim=-1).flatten(1).amin(-1) - contact * self.min_distance
+
+    @property
+    def contact_depths(self) -> Tensor:  # type: ignore[override]
+        return TOUCH * self.min_distance.unsqueeze(-1)
+
+    def places(self, X: Tensor) -> Tensor:
+        return self.away(X)
+
+    def measured(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        at, ways = [], []
+        for first, second in zip(*self.ends, strict=True):
+            away = X[..., first] - X[..., second]
+            along = away.diff(dim=1)
+            square = along.square().sum(-1).clamp(min=torch.finfo(X.dtype).tiny)
+            share = (-(away[:, :-1] * along).sum(-1) / square).clamp(0.0, 1.0).unsqueeze(-1)
+            at.append(away.norm(dim=-1))
+            ways.append((away[:, :-1] + share * along).norm(dim=-1))
+        keep = self.min_distance.view(-1, 1, 1)
+        return torch.stack(at, dim=-1) - keep, torch.stack(ways, dim=-1) - keep
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:

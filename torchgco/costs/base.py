@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import gradient_and_hessian
+from torchgco.base.numbers import Number, numbers_of_fields
 from torchgco.base.shapes import Dimensions, lead
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import whole_numbers_become
@@ -53,6 +54,14 @@ class Cost(PerElement):
     def scaled(self, factor: Tensor) -> Cost:
         """The same cost times `factor` (B,), one positive number per problem."""
         return ScaledCost(self, factor)
+
+    def numbers(self, where: str) -> list[Number]:
+        """Its numbers, which a compiled problem writes; `where` it is in the problem: "cost"."""
+        return numbers_of_fields(self, where, where)
+
+    def by_knot(self, N: int) -> Self:
+        """The same, with memory for the numbers of each of N stages that may be written."""
+        return self
 
     @property
     def reads_knots(self) -> bool:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base.numbers import Number
 from torchgco.base.tree import passed_on
 from torchgco.costs.base import Cost, WrappedCost
 
@@ -44,6 +45,9 @@ class QuadraticInFreeTime(WrappedCost):
         """Read the references of `cost` as they are, in this memory."""
         for own, new in zip((self.along, self.rests), _read(self.cost), strict=True):
             own.copy_(new)
+
+    def numbers(self, where: str) -> list[Number]:
+        return self.cost.numbers(where, self.write)
 
     @property
     def of_errors(self) -> Cost:

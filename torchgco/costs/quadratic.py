@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -11,9 +12,12 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks
+from torchgco.base.numbers import Floats, Number, Wrong, at_least_zero, finite, numbers
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, lead, tensor
 from torchgco.costs.base import Cost, add_blocks
 from torchgco.costs.in_free_time import QuadraticInFreeTime
+
+WEIGHTS = "Q", "R", "Qf"
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,28 @@ class BoundQuadratic(Cost):
     def precision(self, dtype: torch.dtype) -> AbstractContextManager[None]:
         # No number is made of a knot's; a user's subclass may.
         return nullcontext() if type(self) is BoundQuadratic else super().precision(dtype)
+
+    def numbers(self, where: str, after: Callable[[], object] | None = None) -> list[Number]:
+        if type(self) is not BoundQuadratic:  # of which kernels read what its code computes
+            return super().numbers(where)
+        found = [Number(f"{where}.x_ref", (self.x_ref.numpy(), self.xf_ref.numpy()), where, False, finite, after)]
+        for name in ("u_ref", *WEIGHTS, "q", "r", "qf", "H"):
+            tensor = getattr(self, name)
+            if tensor is not None:
+                check = finite if name not in WEIGHTS else at_least_zero if self.diagonal else _matrices
+                joint = self._check_new if name in ("Q", "R", "H") and self.H is not None else None
+                found += numbers(where, {name: (tensor, check)}, where, False, joint=joint)
+        return found
+
+    def _check_new(self, new: Mapping[str, Floats]) -> None:
+        """Check Q, R and H together: each alone may be fine, and the stage cost still fall without end."""
+        own = {name: new.get(f"cost.{name}", getattr(self, name).numpy()) for name in (*WEIGHTS, "H")}
+        check_semidefinite(**{name: torch.tensor(weights) for name, weights in own.items()})
+
+    def by_knot(self, N: int) -> BoundQuadratic:
+        """The same with references of its own memory for each stage."""
+        refs = {name: getattr(self, name) for name in ("x_ref", "u_ref")}
+        return replace(self, **{name: ref.expand(-1, N, -1).clone() for name, ref in refs.items()})
 
     @property
     def control_curvatures(self) -> Tensor:
@@ -237,3 +263,7 @@ def unfit(W: Tensor, what: str = "a weight") -> tuple[str, str] | None:
         return "a symmetric matrix", "an unsymmetric one"
     lowest = float(torch.linalg.eigvalsh(W).min())
     return (f"{what} that is positive semidefinite", f"an eigenvalue of {lowest:.3g}") if lowest < -rounding else None
+
+
+def _matrices(new: Floats) -> Wrong:
+    return finite(new) or unfit(torch.from_numpy(new))

@@ -9,16 +9,9 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.gates import GateBalls, GateSquares
-from torchgco.constraints.norms import Cone, NormBounds
-from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.gates import passes
 from torchgco.judging.worst import NO_PLACE, kind_of, worst_rows
-from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.body import BoundBody
-from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 PLACES_SHOWN = 4  # runs of knots, or obstacles, that are named
@@ -57,8 +50,7 @@ def caught_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None, depth:
     for i, constraint in enumerate(problem.constraints):
         if constraint.geometric:
             deep = (constraint.violation(X, U)[0] > depth).cpu()
-            if isinstance(constraint, BoundBody):  # whichever ball it is
-                deep = deep.unflatten(-1, (len(constraint.balls), -1)).any(1)
+            deep = constraint.by_obstacle(deep)
             inside = torch.zeros(problem.N + 1, deep.shape[-1], dtype=torch.bool)
             inside[constraint.knots] = deep
             inside[0] = inside[-1] = False
@@ -80,15 +72,15 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     """The row that X (1, N+1, n), U (1, N, m) violates most; None where it violates none."""
     times = None if problem.time is None or t is None else t.unsqueeze(0)
     worst = {name: column[0] for name, column in worst_rows(problem, X, U, times).items()}
-    if worst["constraint"] == NO_PLACE:
+    if (i := worst["constraint"]) == NO_PLACE:
         return None
-    if worst["constraint"] >= len(problem.constraints):
+    if i >= len(problem.constraints):
         return f"the bounds of the time, by a factor of {number(worst['violation'])}"
-    constraint = problem.constraints[worst["constraint"]]
-    length = " m" if constraint.geometric or isinstance(constraint, GoalBall | GateBalls | GateSquares) else ""
+    constraint = problem.constraints[i]
+    length = " m" if constraint.in_metres else ""
     where = knots_told([worst["knot"]], t)
-    row = row_told(constraint, worst["row"], worst["knot"], problem.dynamics)
-    return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
+    row = f"{constraint_told(constraint, i)}, {constraint.told(worst['row'], worst['knot'], problem.dynamics)}"
+    return f"{row}, {where}, by {number(worst['violation'])}{length}"
 
 
 def constraint_told(constraint: Constraint, i: int) -> str:
@@ -111,40 +103,3 @@ def gates_told(problem: Problem, X: Tensor) -> list[str]:
         after = "" if g == 0 else " after those before it"
         lines.append(f"gate {g + 1} of {way.passed.shape[1]} isn't passed{after}: {told}")
     return lines
-
-
-def row_told(constraint: Constraint, row: int, knot: int, dynamics: Dynamics) -> str:
-    """A row of a constraint: which obstacle, or which bound of which component, by its name where it has one."""
-    if isinstance(constraint, BoundBody):
-        return "ball {}, obstacle {}, ".format(*divmod(row, constraint.inscribed.absent.shape[1]))
-    if isinstance(constraint, Obstacles):
-        return f"obstacle {row}, "
-    if isinstance(constraint, ControlBounds | StateBounds):
-        places = torch.arange(constraint.lower.shape[-1])
-        above, below = (places[part].tolist() for part in (constraint.above, constraint.below))
-        side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
-        kind, of = ("control", controls_of) if constraint.of == "u" else ("state", states_of)
-        named = getattr(dynamics, f"{kind}_names")
-        return f"{side} bound of {kind} {component}{f' ({of(dynamics)[component].label})' if len(named) else ''}, "
-    if isinstance(constraint, GateBalls | GateSquares):
-        return _gate_told(constraint, row, knot)
-    if isinstance(constraint, GoalBall):
-        return "its radius, "
-    if isinstance(constraint, GoalState):
-        return f"state {constraint.components.tolist()[row]}, "  # type: ignore[union-attr]
-    if isinstance(constraint, NormBounds | Cone):
-        what = "cone of" if isinstance(constraint, Cone) else f"{constraint.sides[row]} bound of the norm of"
-        places = listed(constraint.components.tolist())  # type: ignore[union-attr]
-        return f"{what} {'controls' if constraint.of == 'u' else 'states'} {places}, "
-    return f"row {row}, "
-
-
-def _gate_told(gates: GateBalls | GateSquares, row: int, knot: int) -> str:
-    """Which gate a row of a knot is of: its radius, or its plane, or one of its sides."""
-    off = knot - gates.places[0]
-    at, what = off == 0, "radius"
-    if isinstance(gates, GateSquares):
-        at |= off == 1
-        what = "side" if row > 0 and bool(at.any()) else "plane"
-        at = at if bool(at.any()) else off == (2 if row > 0 else -1)
-    return f"the {what} of gate {int(at.nonzero()[0]) + 1}, "

@@ -19,21 +19,13 @@ from torch import Tensor
 from torchgco.base.autodiff import gradients, slope_along
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import check_shape, computing_on
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Distance, least
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.constraints.separation import Separation
-from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances, segment_distance
-from torchgco.judging.judge import by_kind, doubled, in_double
-from torchgco.judging.maps import segment_distances
+from torchgco.judging.judge import doubled, in_double
 from torchgco.judging.steps import step_errors
-from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.body import BoundBody
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.in_free_time import SpheresInFreeTime
-from torchgco.obstacles.oscillating import BoundOscillatingBoxes
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.alone import row_by_row
+from torchgco.problem.between import bends
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, current_problem
@@ -182,105 +174,30 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    nearest, states = X.new_full((), torch.inf), torch.arange(problem.n, device=X.device)
+    nearest = X.new_full((), torch.inf)
     own = int(problem.stages[0])  # the chords after them are points
-    for obstacles in problem.obstacles:
-        position = states[problem.position]
-        if not bool(obstacles.absent.all()):
-            if isinstance(obstacles, BoundBody):
-                path = _ball_chords(obstacles, X[0], _body_bulge(obstacles, problem, X, U))
-            else:
-                path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U, position).unsqueeze(-1)
-            nearest = torch.minimum(nearest, path[:own, ~obstacles.absent[0]].amin())
-    for apart in (constraint.bare for constraint in problem.constraints):
-        if isinstance(apart, Separation):
-            nearest = torch.minimum(nearest, _separation(apart, problem, X, U))
+    for part in (constraint.bare for constraint in problem.constraints):
+        if isinstance(part, Distance):
+            chords = part.measured(X)[1][0]
+            bulge = _bulge(part, problem, X, U)  # (N|1, P|1)
+            gaps = chords.unflatten(-1, (bulge.shape[-1], -1)) - bulge.unsqueeze(-1)
+            nearest = torch.minimum(nearest, least(gaps[:own].flatten(1).unsqueeze(0))[0])
     return nearest
 
 
-def _separation(apart: Separation, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """Smallest distance of a pair, or a lower bound of it, less the one to keep, (), m."""
-    bulges = [_bulge(problem, X, U, at) for at in apart.positions]
-    paths = []
-    for i, j in apart.pairs.tolist():
-        away = X[0][:, apart.positions[i]] - X[0][:, apart.positions[j]]
-        paths.append((segment_distance(away[:-1], away[1:]) - bulges[i] - bulges[j])[: int(problem.stages[0])])
-    return torch.stack(paths).amin() - apart.min_distance[0]
-
-
-def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
-    k = torch.arange(X.shape[0], dtype=X.dtype, device=X.device).view(-1, 1, 1)
-    relative = X[:, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
-    if spheres.velocities is not None:
-        relative = relative - k * spheres.dt * spheres.velocities[0]
-    return segment_distance(relative[:-1], relative[1:]) - spheres.inflated_radii[0]
-
-
-def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
-    p, radii = X[None, :, boxes.position], torch.where(boxes.absent, -torch.inf, boxes.inflated_radii).unsqueeze(1)
-    # Bounds are close up to a step's length above the smallest distance: the path hardly leaves a chord by more.
-    close = ((box_distance(boxes, p) - radii).amin() + p.diff(dim=1).norm(dim=-1).amax()).clamp(min=0.0)
-    return (box_segment_distance(boxes, p, close + radii) - radii)[0]
-
-
-def _oscillating_chords(swings: BoundOscillatingBoxes, X: Tensor) -> Tensor:
-    radii = torch.where(swings.absent, -torch.inf, swings.boxes.inflated_radii).unsqueeze(1)
-    return (oscillating_distances(swings, X[None, :, swings.position])[1] - radii)[0]
-
-
-def _ball_chords(body: BoundBody, X: Tensor, bulge: Tensor) -> Tensor:
-    """Distances (N, P M) of the chords of all balls, less `bulge` (N, P)."""
-    centers, found = body.points.at(X.unsqueeze(0))[0], []
-    for i, ball in enumerate(body.balls):
-        found.append(by_kind(CHORDS, ball)(ball, centers[:, i]) - bulge[:, i : i + 1])
-    return torch.cat(found, dim=-1)
-
-
-# By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
-# bounds of them, which are close where they are below 0.
-CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
-    BoundSpheres: _sphere_chords,
-    SpheresInFreeTime: lambda part, X: _sphere_chords(part.along(X.unsqueeze(0)), X),
-    BoundBoxes: _box_chords,
-    BoundOscillatingBoxes: _oscillating_chords,
-    BoundField: lambda map, X: segment_distances(map, X[None, :, map.position])[0].unsqueeze(-1) - map.vehicle_radius,
-    # Less what the balls leave their chords by where the vehicle turns evenly from knot to knot.
-    BoundBody: lambda body, X: _ball_chords(body, X, body.points.bulge(X.unsqueeze(0))[0]),
-}
-
-
-def _bulge(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
-    """How far the path of the states `at` (d,) may leave the chord of each interval, (N,), m."""
+def _bulge(part: Distance, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """How far a part's places may leave their chord of each interval, (N|1, P|1), m: along a known field, else where
+    the states change evenly."""
     dynamics = problem.along
-    if dynamics.integrator not in ("midpoint", "rk4"):
-        return X.new_zeros(problem.N)
-    half = X[:, :-1] + 0.5 * dynamics.dt * dynamics.field(X[:, :-1], U)
-    samples = torch.stack([_acceleration(problem, x, U, at) for x in (X[:, :-1], half, X[:, 1:])])  # (3, N, d)
-    change = samples.diff(dim=0).norm(dim=-1).amax(0)
-    return dynamics.dt**2 / 8.0 * (samples.norm(dim=-1).amax(0) + change)
-
-
-def _body_bulge(body: BoundBody, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """The same of the centers of a body's balls, (N, P): along a known field, else where the states change evenly."""
-    dynamics = problem.along
-    if dynamics.integrator not in ("midpoint", "rk4"):
-        return body.points.bulge(X)[0]
+    if not bends(problem):
+        return part.even_bulge(X)[0]
     field = lambda x: dynamics.field(x, U)
-    velocity = lambda x: slope_along(body.points.at, (x,), (field(x),))
+    velocity = lambda x: slope_along(part.places, (x,), (field(x),))
     half = X[:, :-1] + 0.5 * dynamics.dt * field(X[:, :-1])
     samples = [slope_along(velocity, (x,), (field(x),))[0] for x in (X[:, :-1], half, X[:, 1:])]
     a = torch.stack(samples)  # (3, N, P, d)
     change = a.diff(dim=0).norm(dim=-1).amax(0)
-    return (dynamics.dt**2 / 8.0 * torch.ones_like(X[0, :-1, :1])) * (a.norm(dim=-1).amax(0) + change)
-
-
-def _acceleration(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
-    """Second time derivative (N, d) of the states `at` at x (1, N, n), u (1, N, m): d field_at / dx times field."""
-    d = len(at)
-    twins = problem.along.take(torch.zeros(d, dtype=torch.int64, device=X.device))
-    u = U.repeat(d, 1, 1)
-    (slopes,) = gradients(lambda x: twins.field(x, u)[..., at].diagonal(dim1=0, dim2=2), X.repeat(d, 1, 1))
-    return (slopes * problem.along.field(X, U)).sum(-1).mT
+    return dynamics.dt**2 / 8.0 * (a.norm(dim=-1).amax(0) + change)
 
 
 def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.judging.certificate import CHORDS
-from torchgco.judging.judge import by_kind
-from torchgco.judging.maps import path_distances
 from torchgco.maps.distance import DistanceField
+from torchgco.maps.measured import path_distances
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.body import BoundBody
 
@@ -89,7 +87,8 @@ def _beneath(part: Obstacles, X: Tensor) -> Tensor:
     """The same (P, M) beneath the full surfaces; of a kind that can't be judged, by its own distances at the ends."""
     X = X.to(part.vehicle_radius.device, part.vehicle_radius.dtype)
     try:
-        gaps = by_kind(CHORDS, part)(part, X)
+        ways, bulge = part.measured(X.unsqueeze(0))[1][0], part.even_bulge(X.unsqueeze(0))[0]
+        gaps = (ways.unflatten(-1, (bulge.shape[-1], -1)) - bulge.unsqueeze(-1)).flatten(1)
     except InputError:
         ends = part.signed_distance(X[None, :, part.position], part.dt * torch.arange(len(X), device="cpu").to(X))[0]
         gaps = torch.minimum(ends[:-1], ends[1:])

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import GateBalls, GateSquares
-from torchgco.judging.distances import segment_distance
 from torchgco.obstacles.base import ADMITTED
+from torchgco.obstacles.measured import segment_distance
 
 
 class Passes(NamedTuple):

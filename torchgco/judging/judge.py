@@ -6,7 +6,7 @@ obstacles by plain differences. docs/words.md defines the terms that it returns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,20 +15,10 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_finite, check_shape, check_tensor, computing_on, tensor
-from torchgco.constraints.base import CONTACT_FACTOR, Constraint
+from torchgco.constraints.base import ADMITTED, Constraint, Distance
 from torchgco.constraints.gates import has_gates
-from torchgco.constraints.separation import Separation
-from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances, segment_distance
 from torchgco.judging.gates import passes
-from torchgco.judging.maps import segment_distances
 from torchgco.judging.steps import StepErrors, step_errors
-from torchgco.maps.field import BoundField
-from torchgco.obstacles.base import ADMITTED, Obstacles
-from torchgco.obstacles.body import BoundBody
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.in_free_time import SpheresInFreeTime
-from torchgco.obstacles.oscillating import BoundOscillatingBoxes
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.alone import row_by_row
 from torchgco.problem.between import Paths, paths
 from torchgco.problem.goal import Goal
@@ -36,7 +26,7 @@ from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 
 SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
-NUMBERS_AT_ONCE = 2**18  # numbers held at once where distances from spheres are measured: 2 MB
+NUMBERS_AT_ONCE = 2**18  # numbers held at once where distances are measured: 2 MB
 
 
 @dataclass(frozen=True)
@@ -213,7 +203,7 @@ def _verdict(
     for constraint in problem.constraints:
         worst = constraint.worst(X, U) if problem.horizon is None else _worst_within(problem, constraint, X, U)
         violation = torch.maximum(violation, worst)
-        if isinstance(constraint, Obstacles | Separation):
+        if isinstance(constraint, Distance):
             at_knots, between = _clearances(problem, constraint, X, along)
             clearance_knots = torch.minimum(clearance_knots, at_knots)
             clearance = torch.minimum(clearance, between)
@@ -231,7 +221,7 @@ def _verdict(
         goal_distance = (X[:, -1, problem.position] - goal[0]).square().sum(-1).sqrt()
         required = problem.goal is not None and problem.goal.required  # rows among the others are kept as far as these
         reached = feasible & (goal_distance < goal[1] + (ADMITTED if required else 0.0))
-    if problem.dynamics.position is None and not any(isinstance(part, Separation) for part in problem.constraints):
+    if problem.dynamics.position is None and not any(isinstance(part, Distance) for part in problem.constraints):
         clearance_knots = clearance = torch.full_like(cost, torch.nan)
     of_goal, of_steps = (goal_distance, feasible, reached), (errors.step_error, errors.step_cost)
     return Verdict(cost, violation, clearance_knots, clearance, *of_goal, clear_95, passed, *of_steps)
@@ -253,9 +243,7 @@ def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor
     return worst
 
 
-def _clearances(
-    problem: Problem, obstacles: Constraint, X: Tensor, along: Sequence[Paths]
-) -> tuple[Tensor, Tensor]:
+def _clearances(problem: Problem, part: Distance, X: Tensor, along: Sequence[Paths]) -> tuple[Tensor, Tensor]:
     """Smallest distances (B,) at the knots and between them; those of a horizon's own knots where horizons differ."""
     at_knots, between = (torch.empty_like(X[:, 0, 0]) for _ in range(2))
     for path in along:
@@ -263,142 +251,19 @@ def _clearances(
         for last in [problem.N] if problem.horizon is None else stages.unique().tolist():
             own = (stages == last).nonzero().flatten()
             rows = path.rows[own]
-            part, measure = obstacles.take(rows), by_kind(CLEARANCES, obstacles)
-            at_knots[rows], between[rows] = measure(part, X[rows, : last + 1])
+            at_knots[rows], between[rows] = _measured(part.take(rows), X[rows, : last + 1])
             if path.pieces > 1:
-                fine = part.in_pieces(path.pieces) if isinstance(part, Obstacles) else part
-                between[rows] = measure(fine, path.X[own, : path.pieces * last + 1])[1]
+                fine = part.take(rows).in_pieces(path.pieces)
+                between[rows] = _measured(fine, path.X[own, : path.pieces * last + 1])[1]
     return at_knots, between
 
 
-def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest distance (B,) to a surface of 0.95 (r_obs + r_veh), at the knots and along the segments between, m.
-
-    Infinite where there is no obstacle. All knots count, the given start too. With Euler steps vehicle and obstacle
-    both move straight from knot to knot, so the distance is exact; for other integrators it is that of the chord.
-    """
-    if spheres.centers.shape[1] == 0:
-        far = torch.full_like(X[:, 0, 0], torch.inf)
-        return far, far
-    rows = max(1, NUMBERS_AT_ONCE // (X.shape[1] * spheres.centers[0].numel()))
-    starts = (slice(i, i + rows) for i in range(0, X.shape[0], rows))
-    at_knots, between = zip(*(_sphere_clearance(spheres.take(some), X[some]) for some in starts), strict=True)
+def _measured(part: Distance, X: Tensor) -> tuple[Tensor, Tensor]:
+    """The clearances (B,) of a part, of as many problems at a time as memory should hold distances of."""
+    size = max(1, NUMBERS_AT_ONCE // (X.shape[1] * X.shape[2] * max(1, part.contact_depths.shape[1])))
+    starts = (slice(i, i + size) for i in range(0, len(X), size))
+    at_knots, between = zip(*(part.take(some).clearances(X[some]) for some in starts), strict=True)
     return torch.cat(at_knots), torch.cat(between)
-
-
-def _sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
-    contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.inflated_radii).unsqueeze(1)
-    p = X[..., spheres.position].unsqueeze(2)
-    relative, move = p - spheres.centers.unsqueeze(1), p.diff(dim=1)
-    if spheres.velocities is not None:
-        v = spheres.velocities.unsqueeze(1)
-        t = spheres.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1, 1)
-        relative, move = relative - t * v, move - spheres.dt * v
-    apart = relative.norm(dim=-1)
-    at_knots = (apart - contact).flatten(1).amin(-1)
-    # A segment's closest point lies within half its length of an end: so bounded, most can't be the closest.
-    half = 0.5 * move.norm(dim=-1)
-    least = (torch.minimum(apart[:, :-1], apart[:, 1:]).square() - half.square()).clamp(min=0.0).sqrt()
-    i, k, j = (least - contact < at_knots.view(-1, 1, 1)).nonzero(as_tuple=True)
-    near = segment_distance(relative[i, k, j], relative[i, k + 1, j]) - contact[i, 0, j]
-    return at_knots, at_knots.scatter_reduce(0, i, near, "amin")
-
-
-def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest distance (B,) to a surface grown by 0.95 (r + r_veh), at the knots and along the segments between, m.
-
-    As for spheres: all knots count, and it is infinite where there is no obstacle.
-    """
-    p = X[..., boxes.position]
-    if boxes.centers.shape[1] == 0:
-        far = torch.full_like(p[:, 0, 0], torch.inf)
-        return far, far
-    contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.inflated_radii).unsqueeze(1)
-    at_knots = (box_distance(boxes, p) - contact).flatten(1).amin(-1)
-    between = (box_segment_distance(boxes, p, at_knots.view(-1, 1, 1) + contact) - contact).flatten(1).amin(-1)
-    return at_knots, torch.minimum(between, at_knots)
-
-
-def oscillating_clearance(swings: BoundOscillatingBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
-    """As `box_clearance`, of boxes that move; between the knots a lower bound, by dt^2 / 8 of their accelerations."""
-    p, boxes = X[..., swings.position], swings.boxes
-    if boxes.centers.shape[1] == 0:
-        far = torch.full_like(p[:, 0, 0], torch.inf)
-        return far, far
-    contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.inflated_radii).unsqueeze(1)
-    ends, ways = oscillating_distances(swings, p)
-    at_knots, between = ((part - contact).flatten(1).amin(-1) for part in (ends, ways))
-    return at_knots, torch.minimum(between, at_knots)
-
-
-def separation_clearance(separation: Separation, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest distance (B,) of a pair, less 0.95 of that to keep, at the knots and along the segments between, m.
-
-    Both positions move along their segments at the same time; all knots count.
-    """
-    at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
-    for i, j in separation.pairs.tolist():
-        away = X[..., separation.positions[i]] - X[..., separation.positions[j]]
-        at_knots = torch.minimum(at_knots, away.norm(dim=-1).amin(-1))
-        between = torch.minimum(between, segment_distance(away[:, :-1], away[:, 1:]).amin(-1))
-    contact = CONTACT_FACTOR * separation.min_distance
-    return at_knots - contact, torch.minimum(between, at_knots) - contact
-
-
-def field_clearance(field: BoundField, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest distance (B,) of the occupied cells, or points, less r_veh - 1e-3, at the knots and between them, m.
-
-    Where nothing is nearer than `maps.EXACT_TO` a lower bound; infinite where the map is empty. At the start, and in
-    the first stage, contact is where the start is, or at 0.95 r_veh if that is nearer.
-    """
-    p, radius = X[..., field.position], field.vehicle_radius.unsqueeze(-1)
-    at_knots = segment_distances(field, torch.stack((p, p), dim=2).flatten(1, 2))[:, ::2] - radius
-    along = segment_distances(field, p) - radius
-    ways = (gaps + field.depths_along(at_knots[:, 0], gaps.shape[1]) for gaps in (at_knots, along))
-    nearest, between = (gaps.amin(-1) for gaps in ways)
-    return nearest, torch.minimum(between, nearest)
-
-
-def body_clearance(body: BoundBody, X: Tensor) -> tuple[Tensor, Tensor]:
-    """The same of all balls of a body, whose state changes evenly between the knots: there a lower bound.
-
-    Between them the balls' centers are taken from states a part of a step apart, and what they leave the chords of
-    these by where the vehicle turns evenly is subtracted.
-    """
-    fine, states = body.finer(X)
-    bulge = fine.points.bulge(states).amax(1)  # (B, P)
-    at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
-    whole, parts = body.points.at(X), fine.points.at(states)
-    for i, (ball, finer) in enumerate(zip(body.balls, fine.balls, strict=True)):
-        measure = by_kind(CLEARANCES, ball)
-        at_knots = torch.minimum(at_knots, measure(ball, whole[:, :, i])[0])
-        between = torch.minimum(between, measure(finer, parts[:, :, i])[1] - bulge[:, i])
-    return at_knots, torch.minimum(between, at_knots)
-
-
-# By kind of obstacles: smallest distances (B,) from X (B, N+1, n) to where bodies touch, at the knots and between them.
-CLEARANCES: dict[type[Constraint], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
-    BoundSpheres: sphere_clearance,
-    SpheresInFreeTime: lambda part, X: sphere_clearance(part.along(X), X),
-    BoundBoxes: box_clearance,
-    BoundOscillatingBoxes: oscillating_clearance,
-    BoundField: field_clearance,
-    BoundBody: body_clearance,
-    Separation: separation_clearance,
-}
-
-
-def by_kind(measures: dict[type[Constraint], Any], obstacles: Constraint) -> Any:
-    """The function that measures obstacles of this kind.
-
-    Raises:
-        InputError: no function measures this kind. Without the error these obstacles would count as absent.
-    """
-    for kind, measure in measures.items():
-        if isinstance(obstacles, kind):
-            return measure
-    known = ", ".join(kind.__name__ for kind in measures)
-    raise InputError("constraints", f"obstacles that can be judged ({known})", type(obstacles).__name__)
 
 
 def frame_columns(verdict: Verdict) -> dict[str, Any]:
@@ -424,7 +289,7 @@ def columns(problem: Problem, U: Tensor, start: Tensor | None = None, times: Ten
     problem = current_problem(problem)
     if problem.dynamics.position is None:
         return {}
-    names = ["clearance"] if any(isinstance(c, tuple(CLEARANCES)) for c in problem.constraints) else []
+    names = ["clearance"] if any(isinstance(c, Distance) for c in problem.constraints) else []
     names += ["reached"] if problem.goal is not None else []
     if not names and not has_gates(problem):
         return {}

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from torchgco.constraints.separation import Separation
+from torchgco.constraints.base import Distance
 from torchgco.dynamics import rollout
 from torchgco.eager import sampling
 from torchgco.eager.kernels import EagerInterior
@@ -22,7 +22,6 @@ from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept_descent import KeptDescent
-from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 
 InteriorKernels: TypeAlias = InteriorEngine | EagerInterior
@@ -114,7 +113,6 @@ def clearance_of(parts: list[Any], X: Tensor, share: float | None, least: Tensor
     """Smallest distance (B,) from the lines between knots to those of the parts that keep a distance; or `least`."""
     least = X.new_full(X.shape[:1], torch.inf) if least is None else least
     for part in parts:
-        if isinstance(part, Obstacles | Separation):
-            away = part.chord_clearance(X) if share is None else part.chord_clearance(X, share)
-            least = torch.minimum(least, away)
+        if isinstance(part, Distance):
+            least = torch.minimum(least, part.chord_clearance(X, share))
     return least

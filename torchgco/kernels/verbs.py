@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchgco.constraints.base import Distance
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -14,7 +15,6 @@ from torchgco.dynamics import rollout
 from torchgco.kernels.choice import kernels_of
 from torchgco.kernels.in_pytorch import InteriorKernels, clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.obstacles.base import Obstacles
 from torchgco.problem.between import bends, bulge, paths
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
@@ -106,7 +106,7 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         if path.pieces > 1:
             rows = near[path.rows]
             parts = (constraint.bare for constraint in problem.take(rows).constraints)
-            fine = [part.in_pieces(path.pieces) if isinstance(part, Obstacles) else part for part in parts]
+            fine = [part.in_pieces(path.pieces) for part in parts if isinstance(part, Distance)]
             found[rows] = clearance_of(fine, path.X, None)
     return found
 

@@ -16,10 +16,12 @@ from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.maps.distance import ALL_FREE, DistanceField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
+from torchgco.maps.measured import segment_distances
 from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import ABSENT, ADMITTED, CONTACT_FACTOR, TOUCH, OwnKind, least
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import dimension, vehicle_radii
+from torchgco.obstacles.measured import Distances
 
 Interpolation = Literal["smooth", "linear"]
 SEGMENT_STEPS = 0.5  # spacings of the lattice between points at which a segment's distance is looked up
@@ -148,6 +150,18 @@ class BoundField(OwnKind):
 
     def in_pieces(self, count: int) -> Self:
         return replace(super().in_pieces(count), pieces=count * self.pieces)
+
+    def measured(self, X: Tensor) -> Distances:
+        p, radius = X[..., self.position], self.vehicle_radius.unsqueeze(-1)
+        twice = torch.stack((p, p), dim=2).flatten(1, 2)
+        at = segment_distances(self.field, self.which, twice)[:, ::2] - radius
+        return at.unsqueeze(-1), (segment_distances(self.field, self.which, p) - radius).unsqueeze(-1)
+
+    def clearances(self, X: Tensor) -> Distances:
+        at, ways = (part.squeeze(-1) for part in self.measured(X))
+        nearest, between = (part + self.depths_along(at[:, 0], part.shape[1]) for part in (at, ways))
+        nearest = nearest.amin(-1)
+        return nearest, torch.minimum(nearest, least(between.unsqueeze(-1)))
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         if share is not None:

@@ -11,10 +11,9 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, undefined
 from torchgco.base.tree import PerElement
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.maps.field import BoundField
 from torchgco.missions.planning_problem import airframe_of, planning_state
 from torchgco.obstacles.base import ADMITTED, TOUCH, Obstacles
@@ -44,7 +43,8 @@ class Contact(PerElement):
         """
         found = tuple(part for part in problem.constraints if isinstance(part, Obstacles))
         for part in found:
-            by_kind(CLEARANCES, part)
+            if type(part).measured is Obstacles.measured:
+                raise undefined(part, "measured")
         maps = [isinstance(part.inscribed, BoundField) for part in found]  # flown at 0.95 of the radius, too
         shrunk = (part.grown(ADMITTED - TOUCH * part.vehicle_radius) for part in found)
         found = tuple(less if is_map else part for less, is_map, part in zip(shrunk, maps, found, strict=True))
@@ -70,7 +70,7 @@ class Contact(PerElement):
     def along(self, x: Tensor, dt: float) -> Tensor:
         """Smallest distances (B,) on the ways between x (B, K, 17), K above 0, at times k dt, s.
 
-        Positions move straight from one to the next; a body turns evenly, see `body_clearance`.
+        Positions move straight from one to the next; a body turns evenly, see `BoundBody.clearances`.
         """
         return self._nearest(x, 0.0, dt) if x.shape[1] > 1 else self.distance(x[:, 0], 0.0)
 
@@ -92,7 +92,7 @@ class Contact(PerElement):
         for part in self.obstacles:
             now = part.later(t).with_step(dt) if part.moving else part
             X = self._planning(x) if isinstance(part, BoundBody) else p
-            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(now, X)[1])
+            nearest = torch.minimum(nearest, now.clearances(X)[1])
         return nearest
 
     def _planning(self, x: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.constraints.gates import GateBalls, gates_of
-from torchgco.judging.distances import segment_distance
 from torchgco.judging.gates import through_balls
 from torchgco.obstacles.base import ADMITTED
+from torchgco.obstacles.measured import segment_distance
 from torchgco.problem.problem import Problem
 
 

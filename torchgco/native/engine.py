@@ -38,7 +38,7 @@ from torchgco.native.packing import (
 )
 from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import Kind, array
-from torchgco.obstacles.in_free_time import SpheresInFreeTime
+from torchgco.obstacles.spheres import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
 NO_MEMORY = "native kernels: no memory"

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.base.brief import brief
-from torchgco.base.errors import ScaleWarning, undefined
+from torchgco.base.errors import InputError, ScaleWarning, undefined
+from torchgco.base.numbers import Number
 from torchgco.base.shapes import MISTAKES, Dimensions
+from torchgco.base.tree import field_names
 from torchgco.constraints.base import ADMITTED as ADMITTED
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
-from torchgco.constraints.base import Constraint, add_at, count_of
+from torchgco.constraints.base import Distance, add_at, count_of
+from torchgco.constraints.base import least as least
 
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
 TINY = 1e-12  # what is divided by is at least this: lengths and their squares in the search for paths
@@ -67,7 +71,7 @@ class Solids:
         return (reduce(torch.add, axes) < limit).any(-1)
 
 
-class Obstacles(Constraint):
+class Obstacles(Distance):
     """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.
 
     Distances count from the full surface, the obstacle's own grown by the vehicle's radius: positive outside, negative
@@ -79,6 +83,7 @@ class Obstacles(Constraint):
         bind, value, at, accumulate           as any constraint; `grown` too, or its chords can't be repaired
         absent, margins                       which obstacles there are, and their lengths
         signed_distance, segment_clearance    distances of points and of segments
+        measured                              the same by separate code, for the judge and the certificate
 
     and it may define
 
@@ -88,8 +93,7 @@ class Obstacles(Constraint):
         chosen                                some of its obstacles: without it none is left out of a search
         sizes, start_is_clear                 where the margins don't say enough
 
-    The judge and the certificate measure distances by separate code, to which a kind is added in `judge.CLEARANCES` and
-    `certificate.CHORDS`. Kernels in C are optional.
+    Kernels in C are optional.
     """
 
     geometric: ClassVar[bool] = True
@@ -162,6 +166,22 @@ class Obstacles(Constraint):
         """
         raise undefined(self, "segment_clearance")
 
+    def places(self, X: Tensor) -> Tensor:
+        return X[..., self.position].unsqueeze(-2)
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        return self.numbers_of(where, place, ())
+
+    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+        """The same where `others`, the same obstacles of other balls of a body, have the numbers, too; by default none.
+
+        Absent obstacles are padding: where there are any, which are there isn't a number, and none can be written.
+        """
+        return []
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"obstacle {row}"
+
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
@@ -175,11 +195,7 @@ class Obstacles(Constraint):
         return self.contact_depths if share is None else share * self.margins
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
-        """Smallest distance (B,) from the straight lines between knots to obstacles, m; negative inside of them.
-
-        Counted from a `share` of the margin beneath the full surface, by default from where bodies touch; infinite
-        where there is no obstacle. Obstacles that move override this.
-        """
+        """As of `Distance`; obstacles that move override this."""
         p = X[..., self.position]
         return least(self.segment_clearance(p[:, :-1], p[:, 1:]) + self.beneath(share).unsqueeze(1))
 
@@ -195,6 +211,24 @@ class Obstacles(Constraint):
         knots = torch.arange(count, device=rows.device)[self.knots]
         return rows.masked_fill((knots > self.stops.unsqueeze(-1)).unsqueeze(-1), other)
 
+    def with_more(self, n: int, m: int) -> Self:
+        return self
+
+    def in_free_time(self, n: int, m: int, later: int) -> Obstacles:
+        return self
+
+    def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Self:
+        """Obstacles that don't count after the last knots; those of knot N alone meet the state of the last knot."""
+        late = torch.arange(N + 1, device=horizon.device)[self.knots].tolist()
+        if late == [N] and not self.moving:
+            return self
+        if N in late and not all(self.holds_at(int(h)) for h in horizon.unique()):
+            raise InputError("horizon", f"last knots at which {where} holds", horizon.unique().tolist())
+        if "stops" not in field_names(type(self.inscribed)):
+            got = type(self.inscribed).__name__
+            raise InputError("horizon", "obstacles that are Spheres, Boxes, Capsules or a Field", got)
+        return self.stopping_at(horizon)
+
     def stopping_at(self, knots: Tensor) -> Self:
         """The same obstacles, which don't count, and don't move, after each problem's knot (B,)."""
         raise undefined(self, "stopping_at")
@@ -204,7 +238,6 @@ class Obstacles(Constraint):
         return replace(self, dt=dt)  # type: ignore[type-var]
 
     def in_pieces(self, count: int) -> Self:
-        """The same obstacles for states at the ends of `count` pieces of each stage."""
         part = self if self.stops is None else self.stopping_at(count * self.stops)
         return part.with_step(part.dt / count) if part.moving else part
 
@@ -265,11 +298,14 @@ def warn_of_small(obstacles: Obstacles, field: str) -> None:
         warnings.warn(f"{field}: {text}", ScaleWarning, stacklevel=6)
 
 
-def least(distances: Tensor) -> Tensor:
-    """The smallest of distances (B, K, M) per problem, (B,); infinite where there is none."""
-    if distances.shape[1] == 0 or distances.shape[2] == 0:
-        return distances.new_full(distances.shape[:1], torch.inf)
-    return distances.flatten(1).amin(-1)
+def copied(whole: Tensor, others: Sequence[Tensor]) -> Callable[[], None] | None:
+    """What copies a number into the memory of others; None where there are none."""
+
+    def copy() -> None:
+        for other in others:
+            other.copy_(whole)
+
+    return copy if others else None
 
 
 def picked(values: Tensor, at: Tensor) -> Tensor:

@@ -12,11 +12,13 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Number
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement, passed_on
 from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.obstacles.attitude import Attitude, attitude_of
 from torchgco.obstacles.base import Obstacles, Solids, places_of
+from torchgco.obstacles.measured import Distances
 
 if TYPE_CHECKING:
     from torchgco.constraints.base import Constraint
@@ -294,6 +296,24 @@ class BoundBody(Obstacles):
         found = [ball.chord_clearance(P, share) for ball, P in part.each(X)]
         return (torch.stack(found, dim=-1) - part.points.bulge(X).amax(1)).amin(-1)
 
+    def places(self, X: Tensor) -> Tensor:
+        return self.points.at(X)
+
+    def even_bulge(self, X: Tensor) -> Tensor:
+        return self.points.bulge(X)
+
+    def measured(self, X: Tensor) -> Distances:
+        at, ways = zip(*(ball.measured(P) for ball, P in self.each(X)), strict=True)
+        return torch.cat(at, dim=-1), torch.cat(ways, dim=-1)
+
+    def clearances(self, X: Tensor) -> Distances:
+        """As of all obstacles, between the knots from states a part of a step apart, which change evenly."""
+        fine, states = self.finer(X)
+        bulge = fine.points.bulge(states).amax(1)
+        at = torch.stack([ball.clearances(P)[0] for ball, P in self.each(X)]).amin(0)
+        ways = [ball.clearances(P)[1] - bulge[:, i] for i, (ball, P) in enumerate(fine.each(states))]
+        return at, torch.minimum(at, torch.stack(ways).amin(0))
+
     def _nearest(self, X: Tensor, share: float | None) -> Tensor | None:
         """Places (B, M') of those that may be the nearest to a ball on its way along X; None of a kind that can't say.
 
@@ -340,6 +360,18 @@ class BoundBody(Obstacles):
     def chosen(self, at: Tensor) -> Self:
         """With the obstacles at places (B, M') alone, of all balls."""
         return self._of_each(lambda part: part.chosen(at))
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return "ball {}, obstacle {}".format(*divmod(row, self.inner.absent.shape[1]))
+
+    def by_obstacle(self, rows: Tensor) -> Tensor:
+        return rows.unflatten(-1, (len(self.balls), -1)).any(-2)
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        return self.inner.numbers_of(where, place, self.balls)
+
+    def remade(self) -> Self:
+        return self._of_each(lambda part: part.remade())
 
     def grown(self, by: Tensor) -> Self:
         return self._of_each(lambda part: part.grown(by))

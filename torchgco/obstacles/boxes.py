@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -9,14 +10,16 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.numbers import Number, numbers, present
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.obstacles.attitude import in_plane
-from torchgco.obstacles.base import ABSENT, OwnKind, picked
+from torchgco.obstacles.base import ABSENT, OwnKind, copied, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, points, rows, vehicle_radii
+from torchgco.obstacles.measured import Distances, box_distances
 
 BOX_GAPS_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
@@ -154,6 +157,9 @@ class BoundBoxes(OwnKind):
         apart[k, e, j] = boxes.segment_distance((k, e, j), a, b)
         return apart
 
+    def measured(self, X: Tensor) -> Distances:
+        return box_distances(self, X[:, :, None, self.position] - self.centers.unsqueeze(1))
+
     def grown(self, by: Tensor) -> Self:
         more = torch.where(self.absent, 0.0, by.unsqueeze(-1))
         inflated, depths = self.inflated_radii + more, self.depths + more
@@ -166,6 +172,12 @@ class BoundBoxes(OwnKind):
         for name in ("centers", "half_sizes", "inflated_radii", "depths"):
             parts[name] = parts[name].masked_fill(absent.view(*absent.shape, *([1] * (parts[name].dim() - 2))), 0.0)
         return replace(self, absent=absent, **parts)
+
+    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+        if bool(self.absent.any()):
+            return []
+        after = copied(self.centers, [other.centers for other in others])
+        return numbers(where, {"centers": (self.centers, present)}, place, after=after)
 
     def inflated(self) -> Cuboids:
         return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)

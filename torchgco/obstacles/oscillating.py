@@ -19,6 +19,7 @@ from torchgco.obstacles.base import ABSENT, OwnKind, least, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, segment_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
+from torchgco.obstacles.measured import Distances, box_distances
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,21 @@ class BoundOscillatingBoxes(OwnKind):
         gap = segment_distance(begin, along, self._solids.halves()) - self.bulge.unsqueeze(1)
         gap = gap + (self.beneath(share) - self.boxes.inflated_radii).unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
+
+    def measured(self, X: Tensor) -> Distances:
+        t = self.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1)
+        away, strongest = [], []
+        for i, p in enumerate(X[..., self.position].unbind(-1)):
+            sines = (part[..., i].unbind(-1) for part in (self.amplitudes, self.rates, self.phases))
+            place, most = self.boxes.centers[..., i].unsqueeze(1), torch.zeros_like(self.boxes.centers[..., i])
+            for amplitude, rate, phase in zip(*sines, strict=True):
+                angle = rate.unsqueeze(1) * t + phase.unsqueeze(1)
+                place, most = place + amplitude.unsqueeze(1) * angle.sin(), most + amplitude.abs() * rate**2
+            away.append(p.unsqueeze(2) - place)
+            strongest.append(most)
+        # Seen from a box, the way between two knots leaves its chord by dt^2 / 8 of the box's acceleration at most.
+        bulge = self.dt**2 / 8.0 * torch.stack(strongest, dim=-1).norm(dim=-1)
+        return box_distances(self.boxes, torch.stack(away, dim=-1), bulge)
 
     @property
     def bulge(self) -> Tensor:

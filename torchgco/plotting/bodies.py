@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import ConvexHull
 
-from torchgco.judging.distances import closest
-from torchgco.judging.judge import segment_distance
+from torchgco.obstacles.measured import closest, segment_distance
 
 Plane = tuple[int, int]  # the two coordinates that a map shows: (0, 1) from above, (0, 2) from the side
 ABOVE: Plane = (0, 1)

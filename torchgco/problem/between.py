@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.separation import Separation
+from torchgco.constraints.base import Distance
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import INTEGRATORS
-from torchgco.obstacles.base import ADMITTED, Obstacles
-from torchgco.obstacles.body import BoundBody
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 
 PIECES_AT_MOST = 16  # of a stage: their chords are 256 times as close to a path as the stage's own
@@ -54,12 +53,12 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Of a body that is where its balls are, of pairs that keep a distance the vector between them.
     """
     off = torch.zeros_like(X[:, 0, 0])
-    parts = [one.bare for one in problem.constraints if isinstance(one.bare, Obstacles | Separation)]
+    parts = [one.bare for one in problem.constraints if isinstance(one.bare, Distance)]
     if not parts or len(X) == 0:
         return off
     middle, even = _within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
     for part in parts:
-        apart = _places(part, middle) - _places(part, even)
+        apart = part.places(middle) - part.places(even)
         off = torch.maximum(off, apart.norm(dim=-1).flatten(1).amax(-1))
     return off
 
@@ -99,12 +98,3 @@ def _within(problem: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:
     if problem.horizon is None:
         return inner
     return torch.where(problem.running[..., None, None], inner, X[:, :-1].unsqueeze(2))  # at rest after the last knot
-
-
-def _places(part: Any, X: Tensor) -> Tensor:
-    """What is measured of states X (B, K, n), as vectors (B, K, P, d)."""
-    if isinstance(part, BoundBody):
-        return part.points.at(X)
-    if isinstance(part, Separation):
-        return part.away(X)
-    return X[..., part.position].unsqueeze(-2)

@@ -15,7 +15,6 @@ from torchgco.base.tree import PerElement
 from torchgco.constraints.base import resolve_knots
 from torchgco.costs.base import Cost
 from torchgco.costs.in_free_time import QuadraticInFreeTime
-from torchgco.obstacles.spheres import BoundSpheres
 
 A_CLOCK = "time as a state of the model's own, whose derivative is 1, says what it is"
 ALIKE = 1e-9  # difference of a stage cost from that of another stage, as a share, that is no dependence on the stage
@@ -141,7 +140,7 @@ def check_served(problem: Any) -> None:
         raise InputError("time.segments", "None where x_ref follows the time", f"{problem.time.count} segments")
     for i, part in enumerate(problem.constraints):
         if getattr(part, "moving", False):
-            if not isinstance(part, BoundSpheres):
+            if part.in_free_time(problem.n, problem.m, 0) is part:
                 expected = "where the time is free, obstacles at rest, or Spheres that a ball is clear of"
                 raise InputError(
                     f"constraints[{i}]", expected, f"{type(part).__name__.removeprefix('Bound')} that move"

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Floats, Number, Wrong, above_zero, finite, numbers
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row, space_of
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import Constraint
@@ -124,6 +126,18 @@ class GoalBall(NormBounds):
 
     name: ClassVar[str] = "goal"
     label: ClassVar[str] = "goal"
+    in_metres: ClassVar[bool] = True  # type: ignore[misc]
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return "its radius"
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        centre, radius = self.center[:, 0], self.upper[:, 0]
+        return numbers("goal", {"position": (centre, finite), "radius": (radius, above_zero)}, place)
+
+    def goal(self, before: Goal, position: slice) -> Goal:
+        """The goal whose numbers lie in the memory of this row's."""
+        return Goal(self.center[:, 0], self.upper[:, 0], True)
 
 
 @dataclass(frozen=True)
@@ -142,6 +156,21 @@ class GoalState(Constraint):
     def bind(self, dims: Dimensions) -> Self:
         components = (~torch.isnan(self.state[0])).nonzero().flatten()
         return replace(self, components=components, knots=slice(dims.N, dims.N + 1))
+
+    def told(self, row: int, knot: int, dynamics: Any) -> str:
+        return f"state {self.components.tolist()[row]}"  # type: ignore[union-attr]
+
+    def numbers(self, where: str, place: int) -> list[Number]:
+        return numbers("goal", {"state": (self.state, self._check_new)}, place)
+
+    def _check_new(self, new: Floats) -> Wrong:
+        free = np.isnan(self.state.numpy()[0])
+        fits = (np.isnan(new) == free).all() and np.isfinite(new[..., ~free]).all()
+        return None if fits else ("finite numbers, and NaN in the components that are free at the end", new.tolist())
+
+    def goal(self, before: Goal, position: slice) -> Goal:
+        """As of `GoalBall`."""
+        return Goal(self.state[:, position], before.radius.clone(), True, self.state)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return X[:, self.knots][..., self.components] - self.state[:, self.components].unsqueeze(1)

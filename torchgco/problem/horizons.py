@@ -18,17 +18,12 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import lead
 from torchgco.base.tree import passed_on
 from torchgco.base.values import asks_for_knot
-from torchgco.constraints.base import Constraint, FunctionConstraint, WrappedConstraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
-from torchgco.constraints.norms import NO_ROW
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
-from torchgco.maps.field import BoundField
-from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.in_time import in_time
 from torchgco.problem.problem import Problem
 from torchgco.problem.rates import with_controls_before
@@ -223,62 +218,4 @@ def _constraint(problem: Problem, i: int) -> Constraint:
     if counts.shape[1] > 0 and bool(missing.any()):
         b = int(missing.nonzero()[0, 0])
         raise InputError("horizon", f"a knot of constraints[{i}] within each", f"{int(horizon[b])} of problem {b}")
-    if isinstance(constraint, Obstacles):
-        return _obstacles(constraint, problem, i)
-    if isinstance(constraint, ControlBounds):
-        return constraint  # controls at rest are within them
-    if isinstance(constraint, StateBounds | RateBounds):
-        lower, upper = constraint.by_knot
-        each = counts.unsqueeze(-1)
-        return replace(
-            constraint, lower=torch.where(each, lower, -torch.inf), upper=torch.where(each, upper, torch.inf)
-        )
-    knots = torch.arange(problem.N + 1, device=horizon.device)[constraint.knots]
-    stands = counts & (knots == problem.N) & (horizon < problem.N).unsqueeze(-1)
-    if isinstance(constraint, FunctionConstraint) and bool(stands.any()):
-        if asks_for_knot(constraint.function):
-            expected = "a function without an argument k at the last knots: `knot_values` serve"
-            raise InputError("horizon", expected, f"one with it in constraints[{i}]")
-        constraint = replace(constraint, values=constraint.values.ending_at(horizon))
-    return _Rows(constraint, counts.to(problem.x0.dtype))
-
-
-def _obstacles(obstacles: Obstacles, problem: Problem, i: int) -> Obstacles:
-    """Obstacles that don't count after the last knots; those of knot N alone meet the state of the last knot there."""
-    horizon = problem.horizon
-    assert horizon is not None
-    late = torch.arange(problem.N + 1, device=horizon.device)[obstacles.knots].tolist()
-    if late == [problem.N] and not obstacles.moving:
-        return obstacles
-    if problem.N in late and not all(obstacles.holds_at(int(h)) for h in horizon.unique()):
-        raise InputError("horizon", f"last knots at which constraints[{i}] holds", horizon.unique().tolist())
-    if not isinstance(obstacles.inscribed, BoundSpheres | BoundBoxes | BoundField):
-        got = type(obstacles.inscribed).__name__
-        raise InputError("horizon", "obstacles that are Spheres, Boxes, Capsules or a Field", got)
-    return obstacles.stopping_at(horizon)
-
-
-@dataclass(frozen=True)
-class _Rows(WrappedConstraint):
-    """A constraint whose rows count at some of its knots."""
-
-    counts: Tensor  # (B, K): 1 where they count, else 0
-
-    batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else NO_ROW)
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._where(self.constraint.violation(X, U), 0.0)
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        rows, knots = self.constraint.at(x, k), self.knots
-        place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
-        return torch.where(self.counts[:, place, None, None] > 0, rows, NO_ROW)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)
-
-    def _where(self, rows: Tensor, other: float) -> Tensor:
-        return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
+    return constraint.ending(horizon, problem.N, counts.to(problem.x0.dtype), f"constraints[{i}]")

@@ -18,16 +18,14 @@ from torch.nn.functional import pad
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, lead
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.dynamics.integrators import INTEGRATORS
-from torchgco.obstacles.in_free_time import SpheresInFreeTime
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.problem import Problem
-from torchgco.problem.rates import FirstRows, on_first, rates_of
+from torchgco.problem.rates import rates_of
 
 FREE_TIME_FORM = "in free time"  # what is kept with the form of the problem for this one
 HELD_FORM = "at held times"  # the same, where obstacles move
@@ -63,7 +61,7 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
         "time": None,
     }
     whole = problem._with(parts, known=problem.known.of_lifted(f"{FREE_TIME_FORM} {time.segments}"))
-    rows = tuple(_constraint(c, problem) for c in problem.constraints)
+    rows = tuple(c.in_free_time(problem.n, problem.m, time.count - 1) for c in problem.constraints)
     object.__setattr__(whole, "constraints", (*rows, *_bounds(whole, time, problem.n)))
     return whole
 
@@ -166,8 +164,7 @@ def paced(problem: Problem, times: Tensor | None) -> Problem:
     if problem.time is None or times is None or not any(part.moving for part in problem.obstacles):
         return problem
     factor = factors_of(problem, times)[:, 0]
-    parts = (part.paced(factor) if isinstance(part, BoundSpheres) else part for part in problem.constraints)
-    return problem._with({"constraints": tuple(parts)})
+    return problem._with({"constraints": tuple(part.paced(factor) for part in problem.constraints)})
 
 
 def at_held_times(problem: Problem, n: int) -> Problem:
@@ -176,10 +173,7 @@ def at_held_times(problem: Problem, n: int) -> Problem:
     assert free is not None
     own, known = free.clone(), problem.known
     own[:, n] = False
-    parts: tuple[Constraint, ...] = tuple(
-        part.at_factor(problem.x0[:, n]) if isinstance(part, SpheresInFreeTime) else part
-        for part in problem.constraints
-    )
+    parts = tuple(part.at_factor(problem.x0[:, n]) for part in problem.constraints)
     if any(a is not b for a, b in zip(parts, problem.constraints, strict=True)):
         known = known.of_lifted(HELD_FORM)
     held = problem._with({"free_start": own, "constraints": parts}, known)
@@ -326,56 +320,3 @@ def _bounds(whole: Problem, time: FreeTime, n: int) -> list[Constraint]:
             bound[..., -1] = factors[:, 1:]
         found.append(ControlBounds(*later, knots=[k - 1 for k in time.segments[1:]]).bind(dims))
     return found
-
-
-def _constraint(constraint: Constraint, problem: Problem) -> Constraint:
-    n, m = problem.n, problem.m
-    if isinstance(constraint, RateBounds):
-        return _Rates(constraint.with_states_from(n + 1), n, m)
-    if isinstance(constraint, ControlBounds) and problem.time is not None and problem.time.count > 1:
-        return replace(constraint, lower=pad(constraint.lower, (0, 1), value=-torch.inf),
-                       upper=pad(constraint.upper, (0, 1), value=torch.inf))  # fmt: skip
-    if isinstance(constraint, BoundSpheres) and constraint.moving:
-        return SpheresInFreeTime(constraint, n)
-    return on_first(constraint, n, m, _Rows)
-
-
-class _Rows(FirstRows):
-    """Rows of the first states and controls that kernels in C measure, too."""
-
-    keeps_rows: ClassVar[bool] = True
-
-
-@dataclass(frozen=True)
-class _Rates(_Rows):
-    """Bounds on changes of controls from stage to stage, which grow with the length of the stage: tau times these."""
-
-    constraint: RateBounds
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        rates, tau = self.constraint, X[:, self.constraint.knots, self.n : self.n + 1]
-        z = (U[..., : self.m] - X[:, : U.shape[1], rates.states])[:, rates.knots]
-        upper, lower = rates.limits()
-        return torch.cat((z[..., rates.above] - tau * upper, tau * lower - z[..., rates.below]), dim=-1)
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.value(X, U).clamp(min=0.0)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        rates, one = self.constraint, X.shape[-1]
-        upper, lower = rates.limits()
-        every, before = torch.arange(self.m, device=H.device), rates.states
-        assert before is not None
-        J = H.new_zeros(*torch.broadcast_shapes(upper.shape[:2], g.shape[:2]), g.shape[-1], H.shape[-1])
-        first = 0
-        for which, limit, sign in ((rates.above, upper, 1.0), (rates.below, lower, -1.0)):
-            controls = every[which]
-            rows = first + torch.arange(len(controls), device=H.device)
-            J[..., rows, one + 1 + controls], J[..., rows, before[controls]] = sign, -sign
-            J[..., rows, self.n] = -sign * limit
-            first += len(controls)
-        slope = (g.unsqueeze(-2) @ J).squeeze(-2)
-        add = (h.unsqueeze(-1) * J).mT @ J
-        add[..., one, :] += slope
-        add[..., :, one] += slope
-        H[:, rates.knots] += add

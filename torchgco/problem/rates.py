@@ -6,26 +6,19 @@ knot; all other parts see the first n states.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Constraint, WrappedConstraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
-from torchgco.constraints.norms import Cone, NormBounds
-from torchgco.constraints.separation import Separation
+from torchgco.constraints.base import add_first
+from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
-from torchgco.obstacles.base import Obstacles
-from torchgco.problem.goal import GoalBall
 from torchgco.problem.problem import Problem
 
-# Besides obstacles, which read the position alone: kinds that find their states and controls among others, too.
-IN_PLACE = (ControlBounds, StateBounds, NormBounds, Cone, Separation, GoalBall)
 RATES_FORM = "with controls before"  # what is kept with the form of the problem for this one
 
 
@@ -41,7 +34,7 @@ def with_controls_before(problem: Problem) -> Problem:
     parts: dict[str, object] = {
         "dynamics": _Dynamics(problem.dynamics, controls),
         "cost": _cost(problem.cost, n, len(controls)),
-        "constraints": tuple(_constraint(c, n, m) for c in problem.constraints),
+        "constraints": tuple(c.with_more(n, m) for c in problem.constraints),
         "x0": torch.cat((x0, bounds.before.expand(problem.B, -1)), dim=-1),
         "free_start": None if free is None else torch.nn.functional.pad(free, (0, len(controls))),
     }
@@ -119,7 +112,7 @@ class _OwnExpansion(_FirstStates):
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         H.zero_()
-        _add_first(H, X, self.n, U.shape[-1], lambda blocks: self.cost.expand(X[..., : self.n], U, blocks))
+        add_first(H, X, self.n, U.shape[-1], lambda blocks: self.cost.expand(X[..., : self.n], U, blocks))
 
 
 class _OwnTotal(_OwnExpansion):
@@ -127,50 +120,3 @@ class _OwnTotal(_OwnExpansion):
 
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         return self.cost.total(X[..., : self.n], U)
-
-
-def _constraint(constraint: Constraint, n: int, m: int) -> Constraint:
-    if isinstance(constraint, RateBounds):
-        return constraint.with_states_from(n)
-    return on_first(constraint, n, m, FirstRows)
-
-
-def on_first(constraint: Constraint, n: int, m: int, kind: type[FirstRows]) -> Constraint:
-    """The constraint where further states and controls follow the first n and m."""
-    in_place = isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE
-    return constraint if in_place else kind(constraint, n, m)
-
-
-@dataclass(frozen=True)
-class FirstRows(WrappedConstraint):
-    """A constraint on the first n states and m controls."""
-
-    n: int
-    m: int
-
-    batched: ClassVar[tuple[str, ...]] = ("constraint",)
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.value(X[..., : self.n], U[..., : self.m])
-
-    def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.violation(X[..., : self.n], U[..., : self.m])
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        return self.constraint.at(x[..., : self.n], k)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        X_own, U_own = X[..., : self.n], U[..., : self.m]
-        _add_first(H, X, self.n, self.m, lambda blocks: self.constraint.accumulate(X_own, U_own, g, h, blocks))
-
-    def start_is_clear(self, x0: Tensor) -> Tensor:
-        return self.constraint.start_is_clear(x0[:, : self.n])
-
-
-def _add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
-    """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
-    blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
-    write(blocks)
-    one = X.shape[-1]
-    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
-    H[..., own.unsqueeze(-1), own] += blocks

@@ -1,4 +1,4 @@
-"""Distances from what a map holds, as judge and certificate measure them: from occupied cells as boxes, from points.
+"""Distances from what a map holds, as the judge and the certificate measure them: from cells as boxes, from points.
 
 Nothing is shared with the solvers' distance fields: cells and points near a segment are found in a tree, and each is
 measured by itself.
@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.shapes import computing_on
-from torchgco.judging.distances import closest
 from torchgco.maps.distance import DistanceField
-from torchgco.maps.field import BoundField
 from torchgco.maps.grid import OccupancyGrid
+from torchgco.obstacles.measured import closest
 
 EXACT_TO = 2.0  # m: distances up to here are exact, farther ones lower bounds
 BOUND_ROUNDING = 1e-12  # m, of a bound's rounding
@@ -53,16 +52,16 @@ class Solid:
         return np.logical_and(within, held)
 
 
-def segment_distances(field: BoundField, p: Tensor) -> Tensor:
-    """Distances (B, K-1) of the map from the straight segments between points p (B, K, d), m.
+def segment_distances(field: DistanceField, which: Tensor, p: Tensor) -> Tensor:
+    """Distances (B, K-1), m, of a field's maps `which` (B,) from the straight segments between points p (B, K, d).
 
     Below `EXACT_TO` close lower bounds, within 1e-9 m, of the signed distances from the nearest cell or point: negative
     where a segment enters one. Farther away they may be loose. Infinite where nothing is occupied, NaN at points that
     are NaN.
     """
-    paths = zip(field.which.tolist(), p.detach().cpu().double(), strict=True)
+    paths = zip(which.tolist(), p.detach().cpu().double(), strict=True)
     with computing_on(torch.device("cpu")):  # as the trees of solids do, wherever the problem lies
-        rows = [path_distances(field.field, which, path) for which, path in paths]
+        rows = [path_distances(field, one, path) for one, path in paths]
     return torch.stack(rows).to(p)
 
 
