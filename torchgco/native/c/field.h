@@ -165,20 +165,12 @@ static inline V depth_of(const Rows *rows, V c) {
     return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[SLOPE_SCALE], number[CORE]);
 }
 
-TGCO_APART V field_value(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
-    V lam = rows->lam[con->place[k]];
+TGCO_APART V field_terms(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total, V *g, V *H) {
+    V lam = rows->lam[con->place[k]], slopes[DIM];
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return total;
-    return total + worth(s, 0, field_row(con, rows, k, x, 0, 0), lam);
-}
-
-TGCO_APART void field_expand(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
-    V lam = rows->lam[con->place[k]], slopes[DIM], rho;
-    if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return;
-    V c = field_row(con, rows, k, x, slopes, 0), slope = pull(s, 0, c, lam, &rho);
-    for (int a = 0; a < DIM; a++) {
-        ADD(g[POSITION + a], slope, slopes[a]);
-        for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], rho * slopes[a], slopes[b]);
-    }
+    V c = field_row(con, rows, k, x, g ? slopes : 0, 0);
+    if (!g) return total + worth(s, 0, c, lam);
+    add_slopes(s, c, lam, slopes, g, H);
+    return total;
 }
