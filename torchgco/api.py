@@ -17,7 +17,7 @@ from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputErr
 from torchgco.base.options import check_value, option_places
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
-from torchgco.constraints import ControlBounds
+from torchgco.constraints.bounds import bounds_of
 from torchgco.constraints.norms import within_norms
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
@@ -324,11 +324,10 @@ def _guess(problem: Problem, whole: Problem) -> Tensor:
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         rest = within_norms(rest, problem.constraints)
         middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
-        for bounds in problem.constraints:
-            if isinstance(bounds, ControlBounds):
-                held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
-                outside[:, bounds.knots] |= (held < lower) | (held > upper)
-                middle[:, bounds.knots] = bounds.middle(held)
+        for bounds in bounds_of(problem.constraints, "u"):
+            held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+            outside[:, bounds.knots] |= (held < lower) | (held > upper)
+            middle[:, bounds.knots] = bounds.middle(held)
         middle = within_norms(middle, problem.constraints)
         next_factors = rest.new_ones(*rest.shape[:2], whole.m - problem.m)  # where the time is free
         lost = ~torch.isfinite(open_loop(whole, torch.cat((rest, next_factors), dim=-1))).flatten(1).all(-1)

@@ -17,9 +17,10 @@ from torchgco.dynamics import Dynamics
 from torchgco.judging.contact import contacts
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.shapes import RoundedBoxes
 from torchgco.view import document
 from torchgco.view.flights import flights_of, violated, whole
-from torchgco.view.shapes import SHAPES, Shapes, merged, once, shapes_of, turns
+from torchgco.view.shapes import Shapes, merged, once, shapes_of, turns
 from torchgco.view.vehicles import Look, look_of
 
 
@@ -76,11 +77,12 @@ def test_equal_rows_are_kept_once() -> None:
 
 def test_a_kind_that_is_added_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     part = problem(1).obstacles[1]
-    other = Shapes(np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1))
+    other = RoundedBoxes(np.zeros((1, 3)), np.ones((1, 3)), np.eye(3)[None], np.zeros(1))
     seen = shapes_of(part, 0)  # as the search for paths sees boxes
     assert seen is not None and np.allclose(seen.half, part.half_sizes[0])  # type: ignore[attr-defined]
-    monkeypatch.setitem(SHAPES, BoundBoxes, lambda part, b: other)
-    assert shapes_of(part, 0) is other
+    monkeypatch.setattr(BoundBoxes, "shapes", lambda part, b: other)
+    drawn = shapes_of(part, 0)
+    assert drawn is not None and drawn.half is other.half and drawn.center is other.center
 
 
 @pytest.mark.parametrize("shape", [(7,), (6, 9), (5, 6, 7), (1, 1, 1)])

@@ -18,7 +18,6 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement, apart
 from torchgco.constraints.bounds import LOOSE
-from torchgco.maps.field import BoundField
 from torchgco.native.codegen.dynamics import elements
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
@@ -84,7 +83,7 @@ def transcribe(problem: Problem) -> Program:
         InputError: a part that can't be traced, or that uses an operation without a counterpart in CasADi; horizons;
             maps.
     """
-    if any(isinstance(part.inscribed, BoundField) for part in problem.obstacles):
+    if any(part.map is not None for part in problem.obstacles):
         expected = "no Field: ipopt and fatrop can't take maps; gco, multistart and interior_point do"
         raise InputError("problem.constraints", expected, "a Field")
     if problem.horizon is not None:

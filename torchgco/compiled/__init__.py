@@ -1,4 +1,9 @@
-"""A problem compiled once and solved again and again: `compile`, and the numbers that calls may change."""
+"""A problem compiled once and solved again and again: `compile`, and the numbers that calls may change.
+
+`compiled.Compiled` keeps a problem packed for C, `numbers` names what may be written there, `mpc.MPC` is a receding
+horizon over it, `holding` what it returns where no plan is found. It imports all rooms but `experiments`. Begin with
+`compiled.py`.
+"""
 
 from torchgco.compiled.answer import Answer as Answer
 from torchgco.compiled.command import MPPIController as MPPIController

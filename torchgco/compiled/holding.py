@@ -16,7 +16,6 @@ from torchgco.constraints.norms import within_norms
 from torchgco.kernels import current, followed, measured, open_loop, path_clearance
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival, violation
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
 from torchgco.problem.rates import rates_of
@@ -123,7 +122,7 @@ def _sum_of_violations(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _but_goal(problem: Problem) -> list[Constraint]:
-    return [part for part in problem.constraints if not isinstance(part.bare, GoalBall | GoalState)]
+    return [part for part in problem.constraints if not part.bare.is_goal]
 
 
 def _moved_on(plan: Plan, now: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -12,9 +12,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers
-from torchgco.constraints.bounds import RateBounds
-from torchgco.costs.function import FunctionCost
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.kernels import cost_scale, cost_unit, current, interior_of
 from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -42,7 +39,7 @@ class KeptInTime(Kept):
         super().__init__(kernels, whole.in_cost_units(), cost_scale(whole), options)
         self._given = user.x0.numpy()
         pairs = zip(user.constraints, whole.constraints, strict=False)
-        self._copied_parts = {i for i, (a, b) in enumerate(pairs) if isinstance(a, RateBounds) or _differ(a, b)}
+        self._copied_parts = {i for i, (a, b) in enumerate(pairs) if a.joins_knots or _differ(a, b)}
 
     @property
     def times(self) -> Tensor:
@@ -126,14 +123,9 @@ def kept_in_time(problem: Problem, options: BarrierOptions) -> KeptInTime | None
 
 def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:
     """The numbers of a problem with a free time: those of the problem, of the time, and checks of what is by stage."""
-    time, cost = problem.time, problem.cost
+    time = problem.time
     assert time is not None
-    by_stage = set[str]()
-    if type(cost) is BoundQuadratic:
-        names = "x_ref", "u_ref", "Q", "R", "q", "r", "H"
-        by_stage = {name for name in names if (part := getattr(cost, name)) is not None and part.shape[1] > 1}
-    elif isinstance(cost, FunctionCost):
-        by_stage = set(cost.values.knot_names)
+    by_stage = problem.cost.names_by_stage()
     for number in found:
         if number.part == "cost" and number.name.rpartition(".")[2] in by_stage:
             number.check = partial(_steady, number, problem.N, number.check)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.compiled.numbers import measured
-from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.bounds import Bounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.problem.between import between
 
@@ -45,7 +45,7 @@ class Plan:
     start: np.ndarray
     dt: float
     dynamics: Dynamics
-    bounds: ControlBounds | None
+    bounds: Bounds | None
     knots: Tensor | None = None
 
     @property

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.constraints.bounds import RateBounds
 from torchgco.constraints.gates import has_gates
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.problem import Problem
@@ -51,7 +50,7 @@ def check_loop_in_free_time(problem: Problem, period: float) -> None:
 
 def follows(part: Any) -> bool:
     """Whether a constraint counts from the controls before."""
-    return isinstance(part, RateBounds) and part.previous is not None
+    return part.joins_knots and getattr(part, "previous", None) is not None
 
 
 def _check_no_gates(problem: Problem) -> None:

@@ -1,4 +1,9 @@
-"""Constraints: a function, a sense, and the knots at which it holds."""
+"""Constraints: a function, a sense, and the knots at which it holds.
+
+`base.Constraint` is all that solvers, kernels, judge and explanations ask of one: rows, numbers, words, and what
+becomes of it in other forms of a problem. A kind answers in its own file, and other rooms name none. `base.Distance`
+is the interface of what keeps bodies apart. It imports `base`, `costs` and `dynamics`. Begin with `base.py`.
+"""
 
 from torchgco.constraints.base import Constraint as Constraint
 from torchgco.constraints.base import FunctionConstraint as FunctionConstraint

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -17,7 +17,7 @@ from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import asks_for_knot, bound_values
-from torchgco.costs.base import add_blocks
+from torchgco.costs.base import add_blocks, add_first
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 TOUCH = 1.0 - CONTACT_FACTOR  # the same, as a share beneath the full surface
@@ -27,6 +27,15 @@ NO_ROW = -1.0  # the row of a bound that one problem of a batch doesn't have
 
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """The numbers of a constraint's rows as kernels in C read them, by the names of `native/structures.py`."""
+
+    by_knot: Mapping[str, Tensor]  # (B|1, K|1, ...)
+    by_problem: Mapping[str, Tensor] = field(default_factory=dict)  # (B, ...)
+    plain: Mapping[str, Any] = field(default_factory=dict)  # numbers, and tensors that aren't copied
 
 
 class Constraint(PerElement):
@@ -39,6 +48,9 @@ class Constraint(PerElement):
     sense: Sense = "inequality"
     geometric: bool = False
     knots: Any  # a slice, or an int64 tensor (K,), once bound
+    is_goal: ClassVar[bool] = False  # whether it is the row of a required goal
+    says_where: ClassVar[bool] = False  # whether it says where to be, not how fast
+    joins_knots: ClassVar[bool] = False  # whether its rows are of two knots
 
     @property
     def bare(self) -> Constraint:
@@ -94,16 +106,33 @@ class Constraint(PerElement):
         return numbers_of_fields(self, where, place)
 
     @property
+    def kernel(self) -> str:
+        """Which code in C computes the rows: "bounds", "spheres", ...; "function": that of a trace."""
+        return "function"
+
+    def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
+        """The numbers for that code, of a problem with n states.
+
+        Args:
+            others: the same obstacles of a body's other balls, whose rows follow these.
+        """
+        raise undefined(self, "lowered")
+
+    @property
     def in_metres(self) -> bool:
         """Whether violations are lengths."""
         return self.geometric
+
+    def of_both_sides(self, sizes: Tensor) -> Tensor:
+        """Sizes (B, 1, p) of rows, of the two sides of a bound the larger one."""
+        return sizes
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         """A row at a knot in words."""
         return f"row {row}"
 
     def by_obstacle(self, rows: Tensor) -> Tensor:
-        """Of each obstacle whether any of its rows (..., p) is marked; of each row, where every row is one's own."""
+        """Of each obstacle whether any of its rows (..., p) is marked; of each row, where each has its own."""
         return rows
 
     def remade(self) -> Constraint:
@@ -272,15 +301,6 @@ class CountedRows(WrappedConstraint):
 
     def _where(self, rows: Tensor, other: float) -> Tensor:
         return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
-
-
-def add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
-    """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
-    blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
-    write(blocks)
-    one = X.shape[-1]
-    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
-    H[..., own.unsqueeze(-1), own] += blocks
 
 
 def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from typing import Any, ClassVar, Literal, Self
@@ -16,7 +16,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.numbers import Floats, Number, Wrong, crossed, numbers, numbers_of_fields
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, check_shape, tensor
 from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint, FirstRowsInTime, count_of, resolve_knots
+from torchgco.constraints.base import Constraint, FirstRowsInTime, Lowered, count_of, resolve_knots
 from torchgco.dynamics.names import controls_of, states_of
 
 LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
@@ -80,6 +80,12 @@ class _Bounds(Constraint):
             expected = "infinity in components that were infinite when the problem was compiled; give them 1e9 then"
             return expected, float(free[np.isfinite(free)][0])
         return None
+
+    def of_both_sides(self, sizes: Tensor) -> Tensor:
+        every = torch.arange(self.upper.shape[-1], device=sizes.device)
+        place = torch.cat((every[self.above], every[self.below])).expand_as(sizes)
+        either = sizes.new_zeros(*sizes.shape[:2], len(every)).scatter_reduce(2, place, sizes, "amax")
+        return either.gather(2, place)
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         places = torch.arange(self.lower.shape[-1])
@@ -211,18 +217,41 @@ def _bounded(bound: Tensor) -> slice | Tensor:
     return slice(first, first + count) if adjacent else components
 
 
+class Bounds(_Bounds):
+    """Bounds on single controls or states of a knot, as `of` says."""
+
+    @property
+    def kernel(self) -> str:
+        return "function" if is_users(self) else "bounds"
+
+    def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
+        variables = torch.arange(self.lower.shape[-1], dtype=torch.int32) + (n if self.of == "u" else 0)
+        above, below = variables[self.above], variables[self.below]
+        sign = torch.cat((torch.ones(above.numel()), -torch.ones(below.numel()))).double()
+        upper, lower = self.limits()
+        B, K = (max(upper.shape[i], lower.shape[i]) for i in (0, 1))  # one may be shared by all problems or knots
+        bound = torch.cat((upper.expand(B, K, -1), lower.expand(B, K, -1)), dim=-1)
+        return Lowered({"bound": bound}, plain={"variable": torch.cat((above, below)), "sign": sign})
+
+
+def bounds_of(parts: Iterable[Constraint], of: Literal["x", "u"] | None = None) -> list[Bounds]:
+    """The bounds among constraints, of states or controls alone where `of` says so."""
+    return [part for part in parts if isinstance(part, Bounds) and of in (None, part.of)]
+
+
 @dataclass(frozen=True)
-class ControlBounds(_Bounds):
+class ControlBounds(Bounds):
     """lower <= u_k <= upper at knots 0..N-1, in the units of u."""
 
     of: ClassVar[Literal["x", "u"]] = "u"
+    says_where: ClassVar[bool] = True
     label: ClassVar[str] = "control_bounds"
 
     def ending(self, horizon: Tensor, N: int, counts: Tensor, where: str) -> Constraint:
         return self  # controls at rest are within them
 
 
-def joined_bounds(parts: Sequence[ControlBounds], N: int) -> ControlBounds | None:
+def joined_bounds(parts: Sequence[Bounds], N: int) -> Bounds | None:
     """The bounds of several parts, once bound, as one; the only part as it is, and None of none.
 
     Where they leave a control no value, its upper bound counts alone: the problem is infeasible.
@@ -237,7 +266,7 @@ def joined_bounds(parts: Sequence[ControlBounds], N: int) -> ControlBounds | Non
 
 
 @dataclass(frozen=True)
-class StateBounds(_Bounds):
+class StateBounds(Bounds):
     """lower <= x_k <= upper at knots 1..N (x_0 is given), in the units of x."""
 
     of: ClassVar[Literal["x", "u"]] = "x"
@@ -263,6 +292,7 @@ class RateBounds(_Bounds):
         InputError: on `Problem(...)`: as other bounds; a `previous` of another shape or not finite, knot 0 without it.
     """
 
+    joins_knots: ClassVar[bool] = True
     previous: Any = None
     states: Tensor | None = field(default=None, repr=False)  # (m,) int64: where x has each u_{k-1}, in a solver
 

@@ -94,6 +94,7 @@ class GateBalls(NormBounds):
     name: ClassVar[str] = "gates"
     label: ClassVar[str] = "gates"
     in_metres: ClassVar[bool] = True  # type: ignore[misc]
+    says_where: ClassVar[bool] = True
 
     @property
     def centers(self) -> Tensor:
@@ -136,6 +137,7 @@ class GateSquares(Vectors):
     of: ClassVar[str] = "x"
     name: ClassVar[str] = "gates"
     in_metres: ClassVar[bool] = True  # type: ignore[misc]
+    says_where: ClassVar[bool] = True
 
     @property
     def sizes(self) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import ClassVar, Self
@@ -62,6 +63,21 @@ class Cost(PerElement):
     def by_knot(self, N: int) -> Self:
         """The same, with memory for the numbers of each of N stages that may be written."""
         return self
+
+    @property
+    def kernel(self) -> str:
+        """Which code in C computes it: "quadratic", or "function": that of a trace."""
+        return "function"
+
+    def names_by_stage(self) -> set[str]:
+        """The names of its numbers that differ from stage to stage."""
+        return set()
+
+    def with_more(self, n: int, r: int) -> Cost:
+        """The same cost in a form of the problem with r further states after the first n."""
+        if type(self).total is not Cost.total:
+            return OwnTotal(self, n)
+        return FirstStates(self, n) if type(self).expand is Cost.expand else OwnExpansion(self, n)
 
     @property
     def reads_knots(self) -> bool:
@@ -163,3 +179,45 @@ def add_blocks(
     if lux is not None:
         H[..., n + 1 :, :n] += lux
         H[..., :n, n + 1 :] += lux.mT
+
+
+@dataclass(frozen=True)
+class FirstStates(WrappedCost):
+    """A cost of the first n states."""
+
+    n: int
+
+    batched: ClassVar[tuple[str, ...]] = ("cost",)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return self.cost.stage(x[..., : self.n], u, k)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self.cost.terminal(x[..., : self.n])
+
+    def goal(self, x0: Tensor) -> None:
+        """The problem has its goal already."""
+
+
+class OwnExpansion(FirstStates):
+    """Where the cost has its own `expand`."""
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        H.zero_()
+        add_first(H, X, self.n, U.shape[-1], lambda blocks: self.cost.expand(X[..., : self.n], U, blocks))
+
+
+class OwnTotal(OwnExpansion):
+    """Where it has its own `total`."""
+
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.cost.total(X[..., : self.n], U)
+
+
+def add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
+    """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
+    blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
+    write(blocks)
+    one = X.shape[-1]
+    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
+    H[..., own.unsqueeze(-1), own] += blocks

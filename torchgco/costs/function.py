@@ -69,3 +69,6 @@ class FunctionCost(Cost):
         if self.terminal_function is None:
             return x.new_zeros(x.shape[:-1])
         return self.values.call(self.terminal_function, x, k=self.values.stages)
+
+    def names_by_stage(self) -> set[str]:
+        return set(self.values.knot_names)

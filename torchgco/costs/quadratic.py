@@ -125,6 +125,45 @@ class BoundQuadratic(Cost):
         return replace(self, **{name: ref.expand(-1, N, -1).clone() for name, ref in refs.items()})
 
     @property
+    def kernel(self) -> str:
+        return "quadratic" if type(self) is BoundQuadratic else "function"
+
+    def names_by_stage(self) -> set[str]:
+        names = "x_ref", "u_ref", "Q", "R", "q", "r", "H"
+        return {name for name in names if (part := getattr(self, name)) is not None and part.shape[1] > 1}
+
+    def with_more(self, n: int, r: int) -> Cost:
+        if type(self) is not BoundQuadratic:
+            return super().with_more(n, r)
+        parts = {}
+        for name in ("Q", "Qf", "x_ref", "xf_ref", "q", "qf", "H"):
+            value, more = getattr(self, name), r if name in ("Q", "Qf") and not self.diagonal else 0
+            parts[name] = None if value is None else torch.nn.functional.pad(value, (0, r, 0, more))
+        return replace(self, **parts)
+
+    def ending(self, stages: Tensor, running: Tensor, resting: Tensor) -> BoundQuadratic:
+        """The same with the weights of the controls alone, a diagonal above 0, after each problem's last stage.
+
+        Args:
+            stages: numbers of stages (B,), whose knots' references are the terminal ones.
+            running: stages of each problem, (B, N) bool.
+            resting: references (B, N, m) of the controls after these.
+        """
+        runs = running.unsqueeze(-1) if self.diagonal else running[..., None, None]
+        parts: dict[str, Tensor | None] = {"u_ref": torch.where(running.unsqueeze(-1), self.u_ref, resting)}
+        for name in ("Q", "H", "q", "r"):
+            value = getattr(self, name)
+            own = running.unsqueeze(-1) if name in ("q", "r") else runs
+            parts[name] = None if value is None else torch.where(own, value, 0.0)
+        weights = torch.where(self.control_curvatures > 0, self.control_curvatures, 1.0)
+        parts["R"] = torch.where(runs, self.R, weights if self.diagonal else torch.diag_embed(weights))
+        if self.x_ref.shape[1] > 1:
+            B = len(stages)
+            every = torch.cat((self.x_ref.expand(B, -1, -1), self.xf_ref.expand(B, -1).unsqueeze(1)), dim=1)
+            parts["xf_ref"] = every[torch.arange(B, device=stages.device), stages]
+        return replace(self, **parts)
+
+    @property
     def control_curvatures(self) -> Tensor:
         """The second derivatives by each control alone, (B|1, N|1, m)."""
         return self.R if self.diagonal else self.R.diagonal(dim1=-2, dim2=-1)

@@ -1,4 +1,8 @@
-"""Models of vehicles and the integrators that turn their vector fields into steps."""
+"""Models of vehicles and the integrators that turn their vector fields into steps.
+
+`base.Dynamics` is what a model must say: sizes, a time step, and `field` or `step`. Models of one file each follow
+it; `rollout` steps through a horizon, `names` call states and controls. It imports `base`. Begin with `base.py`.
+"""
 
 from torchgco.dynamics.base import Dynamics as Dynamics
 from torchgco.dynamics.base import FunctionDynamics as FunctionDynamics

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.eager.model import Derivatives, Model
 from torchgco.eager.rows import Group, joined
 from torchgco.eager.state import Kinds, State, first_barrier, renew, settle
@@ -38,7 +37,7 @@ def sort_rows(kinds: Kinds, model: Model, t: State) -> None:
     moves, tight = _moves(model.take(rows), some), tight[rows]
     is_state = torch.zeros_like(kinds.equality)
     for group in model.groups:
-        is_state[group.place.rows] = type(group.part) is StateBounds
+        is_state[group.place.rows] = group.is_bound and not group.of_controls
     t.out[rows] = some.out | (tight & ~moves)
     t.fixes[rows] = some.fixes & (moves | ~is_state | ~_looked_at(model, tight))
 
@@ -78,7 +77,7 @@ def _tight(kinds: Kinds, group: Group, t: State) -> Tensor:
     """Rows (b, K, p) with less room than a slack is given at first, or than a guess is moved inside of its bounds."""
     c, room = group.place.of(t.c), torch.full_like(t.mu, kinds.how.bound_push).view(-1, 1, 1)
     if group.is_bound:
-        of = (t.U if isinstance(group.part, ControlBounds) else t.X)[:, group.place.knots]
+        of = (t.U if group.of_controls else t.X)[:, group.place.knots]
         above, below = group.variables(0)
         room = 2.0 * room * torch.cat((of[..., above], of[..., below]), dim=-1).abs().clamp(min=1.0)
     return c > -room
@@ -99,7 +98,7 @@ def _changes(model: Model, t: State) -> tuple[Tensor, Tensor]:
         x = torch.where(free, _uneven(-count(1, n + 1)), x)
     u = _uneven(count(0, N * m)).view(1, N, m).expand_as(t.U).clone()
     for group in model.groups:
-        if isinstance(group.part, ControlBounds) and group.is_bound:
+        if group.is_bound and group.of_controls:
             fixes, above = group.place.of(t.fixes), group.variables(0)[0]
             at = u[:, group.place.knots]
             at[..., above] = torch.where(fixes[..., : len(above)], 0.0, at[..., above])

@@ -14,16 +14,12 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
+from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
-from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.bounds import Bounds
 from torchgco.eager.curvature import Expansion, expansion_of, flat
-from torchgco.maps.field import BoundField
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.obstacles.base import OwnKind
 from torchgco.problem.problem import Problem
-
-BY_POSITION = (BoundSpheres, BoundBoxes, BoundField)  # kinds that read nothing but the position
-BOUNDS = (ControlBounds, StateBounds)  # whose rows are single variables; subclasses are functions like others
 
 
 @dataclass(frozen=True)
@@ -136,7 +132,12 @@ class Group:
     @property
     def is_bound(self) -> bool:
         """Whether rows are bounds of single variables."""
-        return type(self.part) in BOUNDS
+        return isinstance(self.part, Bounds) and not is_users(self.part)
+
+    @property
+    def of_controls(self) -> bool:
+        """Of bounds: whether they are of controls."""
+        return getattr(self.part, "of", None) == "u"
 
     def variables(self, n: int) -> tuple[Tensor, Tensor]:
         """Of bounds: which variables of z have an upper one, and which a lower one."""
@@ -176,7 +177,7 @@ class Group:
             given = [(X if of == "x" else U)[:, part.knots] for of in part.of]
             sizes = [z.shape[-1] for z in given]
             return lambda w: part.rows_at(k, *w.split(sizes, dim=-1)), torch.cat(given, dim=-1)
-        if type(part) in BY_POSITION:
+        if _by_position(part):
             at: Any = part.position  # type: ignore[attr-defined]
             before, after = X[..., : at.start], X[..., at.stop :]
             return lambda w: part.value(torch.cat((before, w, after), dim=-1), U), X[..., at]
@@ -215,11 +216,16 @@ def is_function(part: Constraint) -> bool:
     return isinstance(part, FunctionConstraint) and type(part).value is FunctionConstraint.value
 
 
+def _by_position(part: Constraint) -> bool:
+    """Whether rows are of a kind that reads nothing but the position."""
+    return isinstance(part, OwnKind) and not is_users(part)
+
+
 def _columns(part: Constraint, problem: Problem) -> slice:
     n, S = problem.n, problem.n + problem.m
     if is_function(part):
         return {"x": slice(0, n), "u": slice(n, S), "xu": slice(0, S)}[part.of]  # type: ignore[attr-defined]
-    return part.position if type(part) in BY_POSITION else slice(0, S)  # type: ignore[attr-defined]
+    return part.position if _by_position(part) else slice(0, S)  # type: ignore[attr-defined]
 
 
 def _block(knots: slice | Tensor, columns: slice | Tensor) -> tuple[Any, Any]:

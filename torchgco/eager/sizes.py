@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.bounds import bounds_of
 from torchgco.eager.model import Model
 
 ORDINARY = 1e-2  # sizes from here on are those of ordinary units
@@ -41,12 +41,11 @@ def steepest(model: Model, X: Tensor, U: Tensor, slopes: Tensor, H: Tensor) -> t
 
 def _measure_bounds(model: Model, size: Tensor) -> None:
     """Sizes (b, S) of bounds join those of their variables, in place."""
-    for part in model.problem.constraints:
-        if isinstance(part, ControlBounds | StateBounds):
-            first, width = model.problem.n if part.of == "u" else 0, part.lower.shape[-1]
-            own = size[:, first : first + width]
-            for limits, variables in zip(part.limits(), (part.above, part.below), strict=True):
-                own[:, variables] = torch.maximum(own[:, variables], limits.abs().amax(1))
+    for part in bounds_of(model.problem.constraints):
+        first, width = model.problem.n if part.of == "u" else 0, part.lower.shape[-1]
+        own = size[:, first : first + width]
+        for limits, variables in zip(part.limits(), (part.above, part.below), strict=True):
+            own[:, variables] = torch.maximum(own[:, variables], limits.abs().amax(1))
 
 
 def _infer(model: Model, X: Tensor, U: Tensor, size: Tensor) -> None:

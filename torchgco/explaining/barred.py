@@ -14,28 +14,27 @@ from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.passage import widest_passage
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.problem.covered import covered_goals
-from torchgco.problem.goal import GoalBall, GoalState
 from torchgco.problem.problem import Problem
 
 
 def goal_facts(problem: Problem, X: Tensor, U: Tensor) -> dict[str, Any]:
     """Those of `Facts` on a required goal that X (1, N+1, n), U (1, N, m) misses; none where it doesn't."""
-    row = next((part for part in problem.constraints if isinstance(part, GoalBall | GoalState)), None)
+    row = next((part for part in problem.constraints if part.is_goal), None)
     if row is None:
         return {}
     last = int(problem.stages[0])  # of a problem with its own horizon, whose rows stand at knot N
     missed = float(row.worst(X[:, [last] * X.shape[1]], U))
     if not missed > ADMITTED:
         return {}
-    unit = " m" if isinstance(row, GoalBall) else ""
+    unit = " m" if row.in_metres else ""
     return {"missed": f"{missed:.4g}{unit}", "covered": bool(covered_goals(problem))}
 
 
 def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]:
     """Those of `Facts` that maps know, for a batch of one; none where the vehicle arrived without contact."""
-    fields = [part for part in problem.obstacles if isinstance(part.inscribed, BoundField)]
+    fields = [part for part in problem.obstacles if part.map is not None]
     if status is Status.INVALID_START:
-        return {"in_unknown": any(_is_unknown(problem, one) for one in fields if isinstance(one, BoundField))}
+        return {"in_unknown": any(_is_unknown(problem, one.map) for one in fields if one.body is None)}
     if arrived or problem.goal is None:
         return {}
     found = [fact for field in fields if field.holds_at(problem.N) and (fact := _barred(problem, field)) is not None]

@@ -20,7 +20,7 @@ from torchgco.base.autodiff import gradients, slope_along
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints.base import Distance, least
-from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.bounds import bounds_of
 from torchgco.judging.judge import doubled, in_double
 from torchgco.judging.steps import step_errors
 from torchgco.obstacles.base import Obstacles
@@ -164,12 +164,11 @@ def _dynamics_residual(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     worst = X.new_zeros(())
-    for bounds in problem.constraints:
-        if isinstance(bounds, (ControlBounds, StateBounds)):
-            lower, upper = bounds.by_knot
-            z = (U if bounds.of == "u" else X)[:, bounds.knots, : upper.shape[-1]]  # a free time is another state
-            excess = torch.maximum(z - upper, lower - z)
-            worst = torch.maximum(worst, excess.amax())
+    for bounds in bounds_of(problem.constraints):
+        lower, upper = bounds.by_knot
+        z = (U if bounds.of == "u" else X)[:, bounds.knots, : upper.shape[-1]]  # a free time is another state
+        excess = torch.maximum(z - upper, lower - z)
+        worst = torch.maximum(worst, excess.amax())
     return worst
 
 

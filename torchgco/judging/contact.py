@@ -12,7 +12,6 @@ from torchgco.base.errors import InputError
 from torchgco.maps.distance import DistanceField
 from torchgco.maps.measured import path_distances
 from torchgco.obstacles.base import ADMITTED, Obstacles
-from torchgco.obstacles.body import BoundBody
 
 BETWEEN = 4  # pieces of a stage, each of which has a contact of its own or none
 SAME_DEPTH = 1e-9  # m: depths that differ less are one, as of a way through equal cells
@@ -33,7 +32,7 @@ def contacts(
     depth = np.full(max(len(places) - 1, 0), -np.inf)
     for part in obstacles if len(places) else ():
         along = None
-        if isinstance(part, BoundBody):
+        if part.body is not None:
             if states is None:
                 raise InputError("states", "those of a body's attitude", "none")
             along = pieces(states)[0]

@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import scattered
-from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.judging.worst import NO_PLACE
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
@@ -46,7 +44,7 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
             continue
         least = (constraint.value(*moved) - now).abs().amax(1, keepdim=True)
         sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
-        rows = _of_both_sides(constraint, sizes.amax(1, keepdim=True))
+        rows = constraint.of_both_sides(sizes.amax(1, keepdim=True))
         size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))
         known = size > torch.maximum(least, free)
         admitted = torch.where(known, torch.maximum(SHARE * size, least), LARGE_VIOLATION)
@@ -66,13 +64,3 @@ def _of_start(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     rows = [c for c in problem.constraints if c.sense == "equality" and c.holds_at(0)]
     worst = [torch.zeros_like(X[:, 0, 0]), *(c.worst(X, U) for c in rows)]
     return torch.stack(worst).amax(0).view(-1, 1, 1)
-
-
-def _of_both_sides(constraint: Constraint, sizes: Tensor) -> Tensor:
-    """Sizes (B, 1, p) of rows, of bounds the larger one of those above and below a component."""
-    if not isinstance(constraint, (ControlBounds, StateBounds, RateBounds)):
-        return sizes
-    every = torch.arange(constraint.upper.shape[-1], device=sizes.device)
-    place = torch.cat((every[constraint.above], every[constraint.below])).expand_as(sizes)
-    either = sizes.new_zeros(*sizes.shape[:2], len(every)).scatter_reduce(2, place, sizes, "amax")
-    return either.gather(2, place)

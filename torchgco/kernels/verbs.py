@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Distance
-from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics import rollout
 from torchgco.kernels.choice import kernels_of
 from torchgco.kernels.in_pytorch import InteriorKernels, clearance_of
@@ -79,8 +78,8 @@ def cost_scale(problem: Problem) -> CostScale:
 def is_convex(problem: Problem) -> bool:
     """Whether a problem is known to be convex: affine dynamics, a quadratic cost, and bounds."""
     cost = problem.cost.cost if isinstance(problem.cost, ShiftedCost) else problem.cost
-    bounded = all(isinstance(part, ControlBounds | StateBounds) for part in problem.constraints)
-    return bounded and isinstance(cost, BoundQuadratic) and kernels_of(problem).affine
+    bounded = all(isinstance(part, Bounds) for part in problem.constraints)
+    return bounded and cost.kernel == "quadratic" and kernels_of(problem).affine
 
 
 def chord_clearance(problem: Problem, X: Tensor, share: float | None = None) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Self
 
@@ -12,13 +13,13 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions
-from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.constraints.base import Constraint, Lowered, resolve_knots
 from torchgco.maps.distance import ALL_FREE, DistanceField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
 from torchgco.maps.measured import segment_distances
 from torchgco.maps.points import PointCloud
-from torchgco.obstacles.base import ABSENT, ADMITTED, CONTACT_FACTOR, TOUCH, OwnKind, least
+from torchgco.obstacles.base import ABSENT, ADMITTED, BOUND_SLACK, CONTACT_FACTOR, TOUCH, OwnKind, least
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import dimension, vehicle_radii
 from torchgco.obstacles.measured import Distances
@@ -100,7 +101,13 @@ class BoundField(OwnKind):
     stops: Tensor | None = None  # (B,)
     pieces: int = 1  # of a stage, which are what its knots are apart
 
+    c_kernel: ClassVar[str] = "field"
+
     batched: ClassVar[tuple[str, ...]] = ("which", "origins", "vehicle_radius", "absent", "stops")
+
+    @property
+    def map(self) -> Self:
+        return self
 
     @property
     def lattice(self) -> Lattice:
@@ -150,6 +157,23 @@ class BoundField(OwnKind):
 
     def in_pieces(self, count: int) -> Self:
         return replace(super().in_pieces(count), pieces=count * self.pieces)
+
+    def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
+        """The numbers that field.h reads, and the map itself, which isn't copied."""
+        nodes = self.field.nodes(self.origins.device)
+        x, y, z = (*nodes.shape[1:], 1)[:3]
+        bound = torch.cat([ball._lowered() for ball in (self, *others)], dim=-1)
+        plain = {
+            "map": nodes, "map_of": self.which.contiguous(), "map_x": x, "map_y": y, "map_z": z, "smooth": self.smooth,
+        }  # fmt: skip
+        return Lowered({}, {"bound": bound} | self.lowered_stops(), plain)
+
+    def _lowered(self) -> Tensor:
+        h, d, R, like = self.field.spacing, self.origins.shape[-1], self.vehicle_radius, self.origins
+        factors = torch.where(self.absent[:, 0], ABSENT, self.factors)
+        reach = BOUND_SLACK * (R + 1.5 * h * d**0.5)  # nodes read for a point lie within h sqrt(d) of the nearest one
+        columns = [like.new_full((len(R),), 1.0 / h), like.new_full((len(R),), h * h), R.square(), factors, self.cores]
+        return torch.cat((self.origins, torch.stack([*columns, self.limits, reach], dim=-1)), dim=-1)
 
     def measured(self, X: Tensor) -> Distances:
         p, radius = X[..., self.position], self.vehicle_radius.unsqueeze(-1)

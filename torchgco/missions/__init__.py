@@ -1,4 +1,9 @@
-"""Missions: a planner, a tracker and a plant in closed loop."""
+"""Missions: a planner, a tracker and a plant in closed loop.
+
+`mission.Mission` puts them together, and a `Flight` goes through it step by step; `planner` solves problems again and
+again, `plant` is the true vehicle, `simulators` are other authors' ones, `contact` tells collisions by the judge's
+distances. It imports `solvers`, no search. Begin with `mission.py`.
+"""
 
 from torchgco.missions.disturbance import Disturbance as Disturbance
 from torchgco.missions.log import MissionLog as MissionLog

@@ -14,10 +14,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError, undefined
 from torchgco.base.tree import PerElement
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.maps.field import BoundField
 from torchgco.missions.planning_problem import airframe_of, planning_state
 from torchgco.obstacles.base import ADMITTED, TOUCH, Obstacles
-from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
 
@@ -45,10 +43,10 @@ class Contact(PerElement):
         for part in found:
             if type(part).measured is Obstacles.measured:
                 raise undefined(part, "measured")
-        maps = [isinstance(part.inscribed, BoundField) for part in found]  # flown at 0.95 of the radius, too
+        maps = [part.map is not None for part in found]  # flown at 0.95 of the radius, too
         shrunk = (part.grown(ADMITTED - TOUCH * part.vehicle_radius) for part in found)
         found = tuple(less if is_map else part for less, is_map, part in zip(shrunk, maps, found, strict=True))
-        return cls(found, airframe_of(problem.dynamics) if any(isinstance(part, BoundBody) for part in found) else None)
+        return cls(found, airframe_of(problem.dynamics) if any(part.body is not None for part in found) else None)
 
     @property
     def moving(self) -> bool:
@@ -82,8 +80,8 @@ class Contact(PerElement):
         """How far (B,), m, the part of the vehicle that moved farthest is from where it was: of x (B, 17) each."""
         found = (now[..., :3] - before[..., :3]).norm(dim=-1)
         for part in self.obstacles:
-            if isinstance(part, BoundBody):
-                a, b = (part.points.at(self._planning(x)) for x in (before, now))
+            if part.body is not None:
+                a, b = (part.places(self._planning(x)) for x in (before, now))
                 found = torch.maximum(found, (b - a).norm(dim=-1).amax(-1))
         return found
 
@@ -91,7 +89,7 @@ class Contact(PerElement):
         p, nearest = x[..., :3].contiguous(), torch.full_like(x[:, 0, 0], torch.inf)
         for part in self.obstacles:
             now = part.later(t).with_step(dt) if part.moving else part
-            X = self._planning(x) if isinstance(part, BoundBody) else p
+            X = p if part.body is None else self._planning(x)
             nearest = torch.minimum(nearest, now.clearances(X)[1])
         return nearest
 

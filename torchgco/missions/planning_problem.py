@@ -11,15 +11,14 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.tree import is_users
-from torchgco.constraints import ControlBounds
 from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning, pose_rates
 from torchgco.dynamics.rotors import QuadrotorThrusts
 from torchgco.kernels import current, open_loop
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
-from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 
 MARGIN_PARTS = 4  # of the horizon, with a margin each, where margins grow
@@ -114,10 +113,9 @@ class Margin:
         if self.size == 0 or obstacles.absent.shape[1] == 0:
             return torch.full_like(self.step, self.size)
         step, off = self.step, torch.zeros_like(self.step)
-        if isinstance(obstacles, BoundBody) and self.before is not None:
-            points = obstacles.points
-            step = points.at(self.before).diff(dim=1).norm(dim=-1).flatten(1).amax(-1)
-            off = points.bulge(self.before).flatten(1).amax(-1)
+        if obstacles.body is not None and self.before is not None:
+            step = obstacles.places(self.before).diff(dim=1).norm(dim=-1).flatten(1).amax(-1)
+            off = obstacles.even_bulge(self.before).flatten(1).amax(-1)
         radius = torch.where(obstacles.absent, torch.inf, obstacles.margins).amin(-1)
         return self.size + torch.minimum(step.square() / (8.0 * radius), 0.5 * step) + off
 
@@ -172,10 +170,9 @@ def first_step(problem: Problem, x: Tensor) -> FirstStepRates:
     """The body rates that the rotors lead to in the first period, as far as the planning model can follow."""
     model, reachable = problem.dynamics, None
     assert isinstance(model, QuadrotorPlanning)
-    for bounds in problem.constraints:
-        if isinstance(bounds, ControlBounds):
-            w = x[:, 10:13]
-            share = model.dt / torch.as_tensor(model.rate_time_constant, dtype=x.dtype).reshape(-1, 1)
-            lower, upper = (w + share * (bound[:, 0, :3] - w) for bound in bounds.by_knot)
-            reachable = lower, upper
+    for bounds in bounds_of(problem.constraints, "u"):
+        w = x[:, 10:13]
+        share = model.dt / torch.as_tensor(model.rate_time_constant, dtype=x.dtype).reshape(-1, 1)
+        lower, upper = (w + share * (bound[:, 0, :3] - w) for bound in bounds.by_knot)
+        reachable = lower, upper
     return FirstStepRates(x[:, 13:], model.dt, model.airframe, reachable)

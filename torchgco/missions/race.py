@@ -18,7 +18,7 @@ from torchgco.base import clock
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Meters, NonNegative, Within, check_options
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.bounds import Bounds, bounds_of
 from torchgco.constraints.gates import GateBalls, Gates, gates_of
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import rk4
@@ -74,7 +74,7 @@ class RacePlanner:
         first, at = knots[passed], [knot - knots[passed] for knot in knots[passed + 1 : last + 1]]
         ends = last == len(knots) - 1
         open_ = slice(passed, last - 1 if ends else last)
-        parts = [self._kept(part) for part in whole.constraints if isinstance(part, ControlBounds | StateBounds)]
+        parts = [self._kept(part) for part in bounds_of(whole.constraints)]
         if open_.stop > open_.start:
             sizes = gates.sizes[:, open_]
             sizes = torch.maximum(sizes - self.margin, 0.5 * sizes)
@@ -85,12 +85,10 @@ class RacePlanner:
         goal = whole.goal if ends else None
         return Problem(whole.dynamics, whole.cost, parts, whole.x0, knots[last] - first, goal, time=times)
 
-    def _kept(self, part: ControlBounds | StateBounds) -> Constraint:
+    def _kept(self, part: Bounds) -> Constraint:
         """Bounds for another number of stages; those on thrusts with the reserve."""
-        if isinstance(part, StateBounds):
-            return StateBounds(part.lower, part.upper)
-        room = self.reserve * (part.upper - part.lower)
-        return ControlBounds(part.lower + room, part.upper - room)
+        room = self.reserve * (part.upper - part.lower) if part.of == "u" else 0.0
+        return type(part)(part.lower + room, part.upper - room)
 
 
 def legs_of(problem: Problem) -> list[int]:
@@ -133,7 +131,7 @@ class RaceMission(Mission):
         if gates.places.tolist() != [list(time_.segments[1:])] * problem.B:
             raise InputError("time.segments", "the knots of the gates", list(time_.segments[1:]))
         for i, part in enumerate(problem.constraints):
-            fits = isinstance(part, ControlBounds | StateBounds | GateBalls) or part is problem.constraints[-1]
+            fits = isinstance(part, Bounds | GateBalls) or part is problem.constraints[-1]
             if not fits and not (isinstance(part, Obstacles) and bool(part.absent.all())):
                 expected = "bounds and gates alone in a race, whose plans know nothing else"
                 raise InputError(f"constraints[{i}]", expected, type(part).__name__)
@@ -222,8 +220,8 @@ class Racer:
             self._posed[passed, legs] = self.planner.posed(self.problem, passed, legs)
         problem, x0 = self._posed[passed, legs].take(rows), x[:, : self.problem.n].contiguous()
         parts = [
-            StateBounds(torch.minimum(part.lower, x0), torch.maximum(part.upper, x0))
-            if isinstance(part, StateBounds)
+            type(part)(torch.minimum(part.lower, x0), torch.maximum(part.upper, x0))
+            if isinstance(part, Bounds) and part.of == "x"
             else part
             for part in problem.constraints
         ]

@@ -18,7 +18,6 @@ from torchgco.base.clock import setting_up
 from torchgco.base.errors import InputError
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.norms import NormBounds
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
@@ -64,7 +63,7 @@ class Engine:
         if problem.n + problem.m > MAX_VARIABLES:
             raise InputError("dynamics", f"at most {MAX_VARIABLES} states and controls together", problem.n + problem.m)
         self.model = trace_model(problem)
-        quadratic = problem.cost if type(problem.cost) is BoundQuadratic else None
+        quadratic: Any = problem.cost if problem.cost.kernel == "quadratic" else None
         self.cost = trace_cost(problem) if quadratic is None else None
         parts = problem.constraints
         traced = (i for i, part in enumerate(parts) if is_lifted(part) or kind_of(part) is Kind.FUNCTION)

@@ -9,8 +9,6 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.native.packing import KIND_OF
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Facts, Traced, Unseen
 
@@ -29,10 +27,10 @@ class Signature:
 
 def signature(problem: Problem) -> Signature | None:
     """The signature of problems as they are now; None where a part's code may read what can't be seen."""
-    cost = problem.cost
+    cost: Any = problem.cost
     form = problem.N, problem.n, problem.m, str(problem.x0.dtype), str(problem.x0.device)
-    quadratic = cost.diagonal if type(cost) is BoundQuadratic else None
-    kinds = tuple(type(part) if type(part) in KIND_OF else None for part in problem.constraints)
+    quadratic = cost.diagonal if cost.kernel == "quadratic" else None
+    kinds = tuple(None if part.kernel in ("function", "body") else part.kernel for part in problem.constraints)
     parts: list[Any] = [problem.dynamics, *([] if quadratic is not None else [cost])]
     parts += [part for part, kind in zip(problem.constraints, kinds, strict=True) if kind is None]
     try:

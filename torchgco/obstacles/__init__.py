@@ -1,4 +1,10 @@
-"""Obstacles: their common interface, spheres, boxes and capsules, also boxes that move along sines."""
+"""Obstacles: their common interface, spheres, boxes and capsules, also boxes that move along sines.
+
+`base.Obstacles` adds to a constraint what the search for paths, pictures and sensors ask; users give `Spheres`, and
+bound to a problem they become `BoundSpheres`. `measured` has the judge's distances, which share no code with the
+solvers'. `body` makes a vehicle of several balls of any kind. It imports what `constraints` does. Begin with
+`base.py`.
+"""
 
 from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.obstacles.base import Obstacles as Obstacles

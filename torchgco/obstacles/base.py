@@ -15,14 +15,16 @@ from torchgco.base.brief import brief
 from torchgco.base.errors import InputError, ScaleWarning, undefined
 from torchgco.base.numbers import Number
 from torchgco.base.shapes import MISTAKES, Dimensions
-from torchgco.base.tree import field_names
+from torchgco.base.tree import field_names, is_users
 from torchgco.constraints.base import ADMITTED as ADMITTED
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
 from torchgco.constraints.base import Distance, add_at, count_of
 from torchgco.constraints.base import least as least
+from torchgco.obstacles.shapes import RoundedBoxes
 
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
+BOUND_SLACK = 1.0 + 1e-4  # so that rounding, in single precision too, can't make a row active beyond its box's bounds
 TINY = 1e-12  # what is divided by is at least this: lengths and their squares in the search for paths
 
 
@@ -88,6 +90,7 @@ class Obstacles(Distance):
     and it may define
 
         inflated                              its form as spheres or boxes: without it no path is sought
+        shapes                                how it looks, where `inflated` doesn't say
         moving, chord_clearance, later        where its obstacles move
         stops                                 the last knot at which they count, where horizons differ
         chosen                                some of its obstacles: without it none is left out of a search
@@ -97,6 +100,7 @@ class Obstacles(Distance):
     """
 
     geometric: ClassVar[bool] = True
+    says_where: ClassVar[bool] = True
 
     absent: Tensor  # (B, M) bool
     vehicle_radius: Tensor  # (B,), m
@@ -131,6 +135,16 @@ class Obstacles(Distance):
     def inscribed(self) -> Obstacles:
         """The obstacles of a vehicle that is a ball: themselves, or of a body those of the ball that it holds."""
         return self
+
+    @property
+    def body(self) -> Any:
+        """The `BoundBody` that they are of; None of a vehicle that is a ball."""
+        return None
+
+    @property
+    def map(self) -> Any:
+        """The `BoundField` that the inscribed ball meets; None of other kinds."""
+        return None
 
     @property
     def margins(self) -> Tensor:
@@ -185,6 +199,11 @@ class Obstacles(Distance):
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
+
+    def shapes(self, b: int) -> RoundedBoxes | None:
+        """How those of problem b look; None where nobody says: no page or sensor shows them then."""
+        solids = self.inflated()
+        return None if solids is None else RoundedBoxes.of(solids, self.vehicle_radius, b)
 
     def chosen(self, at: Tensor) -> Obstacles:
         """The same kind with the obstacles at places (B, M') alone; -1 stands for an absent one."""
@@ -252,6 +271,16 @@ class Obstacles(Distance):
 
 class OwnKind(Obstacles):
     """A kind of torchgco's own, once bound: a row per obstacle and knot, of the position and the time alone."""
+
+    c_kernel: ClassVar[str] = "function"
+
+    @property
+    def kernel(self) -> str:
+        return "function" if is_users(self) else self.c_kernel
+
+    def lowered_stops(self) -> dict[str, Tensor]:
+        """The last knots at which obstacles count, for `lowered`."""
+        return {} if self.stops is None else {"stops": self.stops.unsqueeze(-1)}
 
     def bind(self, dims: Dimensions) -> Self:
         return self

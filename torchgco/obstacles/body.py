@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Number
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement, passed_on
-from torchgco.constraints.base import CONTACT_FACTOR
+from torchgco.constraints.base import CONTACT_FACTOR, Lowered
 from torchgco.obstacles.attitude import Attitude, attitude_of
 from torchgco.obstacles.base import Obstacles, Solids, places_of
 from torchgco.obstacles.measured import Distances
@@ -176,7 +176,7 @@ def directions(d: int) -> Tensor:
 
 def check_no_body(problem: Any, field: str, expected: str) -> None:
     """Raise InputError naming `field` where a problem's vehicle is a body of several balls."""
-    if any(isinstance(part, BoundBody) for part in problem.obstacles):
+    if any(part.body for part in problem.obstacles):
         raise InputError(field, expected, "a Body of several balls")
 
 
@@ -234,6 +234,8 @@ class BoundBody(Obstacles):
     batched: ClassVar[tuple[str, ...]] = ("balls", "inner", "points")
 
     inscribed = property(lambda self: self.inner)  # type: ignore[assignment]
+    body = property(lambda self: self)
+    map = property(lambda self: self.inner.map)
     knots, position, dt, stops, moving = passed_on("inner", "knots", "position", "dt", "stops", "moving")
     # Of the largest ball: a length that tells the vehicle's size.
     vehicle_radius = property(lambda self: self.radii.amax(-1))  # type: ignore[assignment]
@@ -360,6 +362,16 @@ class BoundBody(Obstacles):
     def chosen(self, at: Tensor) -> Self:
         """With the obstacles at places (B, M') alone, of all balls."""
         return self._of_each(lambda part: part.chosen(at))
+
+    @property
+    def kernel(self) -> str:
+        """A function where its balls are of no other kind: C traces where they are, and computes their rows itself."""
+        return "function" if self.balls[0].kernel == "function" else "body"
+
+    def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
+        first, *more = self.balls
+        own = first.lowered(n, more)
+        return replace(own, plain={**own.plain, "balls": len(self.balls)})
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return "ball {}, obstacle {}".format(*divmod(row, self.inner.absent.shape[1]))

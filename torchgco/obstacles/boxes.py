@@ -13,9 +13,9 @@ from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number, numbers, present
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row
 from torchgco.base.tree import take
-from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.constraints.base import Constraint, Lowered, resolve_knots
 from torchgco.obstacles.attitude import in_plane
-from torchgco.obstacles.base import ABSENT, OwnKind, copied, picked
+from torchgco.obstacles.base import ABSENT, BOUND_SLACK, OwnKind, copied, marked, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, points, rows, vehicle_radii
@@ -101,6 +101,8 @@ class BoundBoxes(OwnKind):
         "centers", "half_sizes", "axes", "absent", "vehicle_radius", "inflated_radii", "depths", "stops",
     )  # fmt: skip
 
+    c_kernel: ClassVar[str] = "boxes"
+
     @classmethod
     def prepare(
         cls,
@@ -178,6 +180,18 @@ class BoundBoxes(OwnKind):
             return []
         after = copied(self.centers, [other.centers for other in others])
         return numbers(where, {"centers": (self.centers, present)}, place, after=after)
+
+    def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
+        bound = torch.cat([ball._lowered() for ball in (self, *others)], dim=-1)
+        return Lowered({}, {"bound": bound} | self.lowered_stops())
+
+    def _lowered(self) -> Tensor:
+        """The numbers (B, ...) that boxes.h reads: bounds of all boxes, axis by axis, factors, all numbers of each."""
+        absent, radius = self.absent.unsqueeze(-1), self.inflated_radii.unsqueeze(-1)
+        reach = marked(BOUND_SLACK * (self.inflated().extent + radius), absent)
+        bounds = torch.stack((self.centers, reach), dim=-1).transpose(1, 2)
+        numbers = torch.cat((self.centers, self.axes.flatten(2), self.half_sizes, marked(radius, absent)), dim=-1)
+        return torch.cat((bounds.flatten(1), 2.0 * self.depths, numbers.flatten(1)), dim=1)
 
     def inflated(self) -> Cuboids:
         return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)

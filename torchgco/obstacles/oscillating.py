@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, segment_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
 from torchgco.obstacles.measured import Distances, box_distances
+from torchgco.obstacles.shapes import RoundedBoxes, array
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,10 @@ class BoundOscillatingBoxes(OwnKind):
         """How far a centre's path may leave its chord between two knots, (B, M), m: dt^2 / 8 of its acceleration."""
         most = (self.amplitudes.abs() * self.rates.square()).sum(-2).square().sum(-1).sqrt()
         return self.dt**2 / 8.0 * most
+
+    def shapes(self, b: int) -> RoundedBoxes:
+        sines = np.stack([array(part[b]) for part in (self.amplitudes, self.rates, self.phases)])
+        return RoundedBoxes.of(self._solids, self.vehicle_radius, b, sines=sines)
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, boxes=self.boxes.grown(by))

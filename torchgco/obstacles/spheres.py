@@ -18,12 +18,13 @@ from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number, lengths, numbers, present
 from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of
 from torchgco.base.tree import passed_on
-from torchgco.constraints.base import Constraint, add_at, resolve_knots
+from torchgco.constraints.base import Constraint, Lowered, add_at, resolve_knots
 from torchgco.constraints.norms import NO_ROW
-from torchgco.obstacles.base import TOUCH, Obstacles, OwnKind, Solids, copied, least, picked
+from torchgco.obstacles.base import TOUCH, Obstacles, OwnKind, Solids, copied, least, marked, picked
 from torchgco.obstacles.body import Body
 from torchgco.obstacles.inputs import own_radii, points, vehicle_radii
 from torchgco.obstacles.measured import Distances, sphere_distances
+from torchgco.obstacles.shapes import RoundedBoxes, array
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,8 @@ class BoundSpheres(OwnKind):
     batched: ClassVar[tuple[str, ...]] = (
         "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "weights", "first", "second", "stops",
     )  # fmt: skip
+
+    c_kernel: ClassVar[str] = "spheres"
 
     @classmethod
     def prepare(
@@ -222,8 +225,28 @@ class BoundSpheres(OwnKind):
         sizes = {"radii": (radii, lengths)} | ({} if others else {"vehicle_radius": (self.vehicle_radius, lengths)})
         return found + numbers(where, sizes, place, after=inflate)
 
+    def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
+        balls = (self, *others)
+
+        def joined(rows: list[Any]) -> Tensor:
+            """Of one part its own memory, which a compiled problem writes into."""
+            return rows[0].flatten(1) if len(rows) == 1 else torch.cat([row.flatten(1) for row in rows], -1)
+
+        numbers = {
+            "bound": joined([ball.centers for ball in balls]),
+            "squares": joined([marked(ball.inflated_radii.square(), ball.absent) for ball in balls]),
+        }
+        if self.velocities is not None:
+            numbers["velocities"] = joined([ball.velocities for ball in balls])
+        return Lowered({}, numbers | self.lowered_stops(), {"dt": self.dt})
+
     def inflated(self) -> Solids | None:
         return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
+
+    def shapes(self, b: int) -> RoundedBoxes:
+        velocity = None if self.velocities is None or not bool(self.velocities[b].any()) else array(self.velocities[b])
+        solids = Solids(self.centers, self.inflated_radii, self.absent)
+        return RoundedBoxes.of(solids, self.vehicle_radius, b, velocity=velocity)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         o = self.centers.unsqueeze(1)

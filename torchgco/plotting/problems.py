@@ -17,7 +17,8 @@ from matplotlib.patches import Patch
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape
-from torchgco.constraints import ControlBounds, Separation, StateBounds
+from torchgco.constraints import Separation
+from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
@@ -297,8 +298,8 @@ def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.n
     span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-9))
     count = problem.N + 1 if state else problem.N
     ends = [low, high]
-    for part in problem.constraints:
-        if not isinstance(part, StateBounds if state else ControlBounds) or j >= part.lower.shape[-1]:
+    for part in bounds_of(problem.constraints, "x" if state else "u"):
+        if j >= part.lower.shape[-1]:
             continue
         for bound in part.over(count):
             for course in courses:

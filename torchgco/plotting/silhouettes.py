@@ -21,7 +21,7 @@ DRAWN = 9  # knots of a trajectory at which a body is drawn
 
 def body_of(problem: Problem) -> BoundBody | None:
     """Obstacles whose vehicle is a body, the first ones; None where there are none."""
-    return next((part for part in problem.obstacles if isinstance(part, BoundBody)), None)
+    return next((part.body for part in problem.obstacles if part.body is not None), None)
 
 
 def balls_at(body: BoundBody, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.oscillating import BoundOscillatingBoxes
-from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.obstacles.shapes import RoundedBoxes
 from torchgco.plotting.bodies import Ball, Box, Plane, Solid
 from torchgco.plotting.scene import Scene
 from torchgco.plotting.silhouettes import body_of
@@ -53,11 +50,11 @@ def world_of(problem: Problem, b: int) -> World:
     others, maps = [], []
     for whole in one.obstacles:
         part = whole.inscribed
-        vehicle = 0.0 if isinstance(whole, BoundBody) else float(part.vehicle_radius[0])  # its balls are drawn instead
-        if isinstance(part, BoundSpheres | BoundBoxes | BoundOscillatingBoxes):
-            by_radius.setdefault(vehicle, []).extend(_bodies(part))
-        elif isinstance(part, BoundField):
-            maps.append((vehicle, part.field.single(int(part.which[0]))))
+        vehicle = 0.0 if whole.body is not None else float(part.vehicle_radius[0])  # its balls are drawn instead
+        if part.map is not None:
+            maps.append((vehicle, part.map.field.single(int(part.map.which[0]))))
+        elif (shapes := part.shapes(0)) is not None:
+            by_radius.setdefault(vehicle, []).extend(_bodies(shapes))
         else:
             others.append(part)
     start = one.x0[:, one.position].cpu().numpy()
@@ -74,18 +71,16 @@ def world_of(problem: Problem, b: int) -> World:
     return World(tuple(scenes), tuple(others), tuple(one.obstacles), body_of(one))
 
 
-def _bodies(part: BoundSpheres | BoundBoxes | BoundOscillatingBoxes) -> list[Solid]:
-    if isinstance(part, BoundOscillatingBoxes):
-        swings = torch.stack((part.amplitudes[0], part.rates[0], part.phases[0]), dim=1).cpu().numpy()
-        here = swings[~part.absent[0].cpu().numpy()]
-        return [replace(box, swing=own) for box, own in zip(_bodies(part.boxes), here, strict=True)]  # type: ignore
-    centers, radii = part.centers[0].cpu().numpy(), (part.inflated_radii[0] - part.vehicle_radius[0]).cpu().numpy()
-    here = np.flatnonzero(~part.absent[0].cpu().numpy())
-    if isinstance(part, BoundSpheres):
-        moves = np.zeros_like(centers) if part.velocities is None else part.velocities[0].cpu().numpy()
-        return [Ball(centers[i], float(radii[i]), moves[i]) for i in here]
-    halves, axes = part.half_sizes[0].cpu().numpy(), part.axes[0].cpu().numpy()
-    return [Box(centers[i], halves[i], axes[i], max(0.0, float(radii[i]))) for i in here]
+def _bodies(shapes: RoundedBoxes) -> list[Solid]:
+    M, d = shapes.center.shape
+    moves = np.zeros((M, d)) if shapes.velocity is None else shapes.velocity
+    found: list[Solid] = []
+    for i in range(M):
+        center, half, radius = shapes.center[i], shapes.half[i], float(shapes.radius[i])
+        swing = None if shapes.sines is None else shapes.sines[:, i]
+        is_box = half.any() or swing is not None
+        found.append(Box(center, half, shapes.sides[i], radius, swing) if is_box else Ball(center, radius, moves[i]))
+    return found
 
 
 def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, at: float) -> tuple[np.ndarray, ...]:

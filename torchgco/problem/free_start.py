@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import MISTAKES, describe
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import StateBounds
+from torchgco.constraints.bounds import bounds_of
 
 
 def start_mask(given: Any, x0: Tensor) -> Tensor | None:
@@ -41,8 +41,8 @@ def moved_inside(x0: Tensor, free: Tensor | None, constraints: Sequence[Constrai
     """x0 (B, n) with its free components inside the state bounds of knot 0."""
     if free is None:
         return x0
-    for bounds in constraints:
-        if isinstance(bounds, StateBounds) and bounds.holds_at(0):
+    for bounds in bounds_of(constraints, "x"):
+        if bounds.holds_at(0):
             first = 0 if isinstance(bounds.knots, slice) else int((bounds.knots == 0).nonzero())
             lower, upper = (bound[:, first if bound.shape[1] > 1 else 0] for bound in bounds.by_knot)
             x0 = torch.where(free, torch.minimum(torch.maximum(x0, lower), upper), x0)

@@ -127,6 +127,8 @@ class GoalBall(NormBounds):
     name: ClassVar[str] = "goal"
     label: ClassVar[str] = "goal"
     in_metres: ClassVar[bool] = True  # type: ignore[misc]
+    is_goal: ClassVar[bool] = True
+    says_where: ClassVar[bool] = True
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return "its radius"
@@ -152,6 +154,7 @@ class GoalState(Constraint):
     of: ClassVar[str] = "x"
     sense: ClassVar[Any] = "equality"
     name: ClassVar[str] = "goal"
+    is_goal: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Self:
         components = (~torch.isnan(self.state[0])).nonzero().flatten()
@@ -201,7 +204,7 @@ def without_goal(goal: Goal | None, dims: Dimensions, constraints: Sequence[Cons
     """
     if dims.position is None and goal is None:
         return constraints
-    return [part for part in constraints if not isinstance(part, GoalBall | GoalState)]
+    return [part for part in constraints if not part.is_goal]
 
 
 def with_goal(goal: Goal | None, rows: Sequence[Constraint], dims: Dimensions) -> tuple[Constraint, ...]:

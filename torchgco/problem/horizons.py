@@ -19,7 +19,7 @@ from torchgco.base.shapes import lead
 from torchgco.base.tree import passed_on
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.bounds import bounds_of
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.function import FunctionCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -72,12 +72,11 @@ def at_rest_after(problem: Problem, U: Tensor) -> Tensor:
 def _resting(problem: Problem) -> Tensor:
     """Controls (B, N, m) at rest; the middle of their bounds where they aren't inside of these."""
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-    for bounds in problem.constraints:
-        if isinstance(bounds, ControlBounds):
-            held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
-            inside = (held > lower) & (held < upper)
-            rest = rest.clone()
-            rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
+    for bounds in bounds_of(problem.constraints, "u"):
+        held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+        inside = (held > lower) & (held < upper)
+        rest = rest.clone()
+        rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
     return rest
 
 
@@ -121,8 +120,8 @@ def _of_stages(values: Tensor, k: int | Tensor, like: Tensor) -> Tensor:
 
 def _cost(problem: Problem, running: Tensor) -> Cost:
     cost, resting = problem.cost, _resting(problem)
-    if type(cost) is BoundQuadratic:
-        return _quadratic(_with_last_reference(cost, problem.stages), running, resting)
+    if isinstance(cost, BoundQuadratic) and cost.kernel == "quadratic":
+        return cost.ending(problem.stages, running, resting)
     if isinstance(cost, FunctionCost):
         if cost.terminal_function is not None and asks_for_knot(cost.terminal_function):
             raise InputError("horizon", "a terminal function without an argument k: `knot_values` serve", "one with it")
@@ -137,28 +136,6 @@ def _cost(problem: Problem, running: Tensor) -> Cost:
     weight = torch.where(torch.isfinite(weight) & (weight > 0), weight, 1.0)
     kind = _Stages if type(cost).expand is Cost.expand else _OwnExpansion
     return kind(cost, running.to(X.dtype), resting, weight)
-
-
-def _with_last_reference(cost: BoundQuadratic, last: Tensor) -> BoundQuadratic:
-    """The same cost, whose terminal references are those of the knots `last` (B,), each problem's own."""
-    if cost.x_ref.shape[1] == 1:
-        return cost
-    every = torch.cat((cost.x_ref.expand(len(last), -1, -1), cost.xf_ref.expand(len(last), -1).unsqueeze(1)), dim=1)
-    return replace(cost, xf_ref=every[torch.arange(len(last), device=last.device), last])
-
-
-def _quadratic(cost: BoundQuadratic, running: Tensor, resting: Tensor) -> BoundQuadratic:
-    """The same cost with the weights of the controls alone after the last stages: a diagonal above 0."""
-    runs = running.unsqueeze(-1) if cost.diagonal else running[..., None, None]
-    parts: dict[str, Tensor | None] = {"u_ref": torch.where(running.unsqueeze(-1), cost.u_ref, resting)}
-    for name in ("Q", "H", "q", "r"):
-        value = getattr(cost, name)
-        own = running.unsqueeze(-1) if name in ("q", "r") else runs
-        parts[name] = None if value is None else torch.where(own, value, 0.0)
-    weights = cost.R if cost.diagonal else cost.R.diagonal(dim1=-2, dim2=-1)
-    weights = torch.where(weights > 0, weights, 1.0)
-    parts["R"] = torch.where(runs, cost.R, weights if cost.diagonal else torch.diag_embed(weights))
-    return replace(cost, **parts)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
 from torchgco.base.tree import Rows, cast, field_names, is_users, take
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds, RateBounds, joined_bounds
+from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
@@ -162,9 +162,9 @@ class Problem:
         return tuple(c for c in self.constraints if isinstance(c, Obstacles))
 
     @property
-    def control_bounds(self) -> ControlBounds | None:
+    def control_bounds(self) -> Bounds | None:
         """The bounds on controls, those of several parts as one; None where there are none."""
-        return joined_bounds([c for c in self.constraints if isinstance(c, ControlBounds)], self.N)
+        return joined_bounds(bounds_of(self.constraints, "u"), self.N)
 
     @cached_property
     def start_is_clear(self) -> Tensor:
@@ -176,7 +176,7 @@ class Problem:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
         X, U = self.at_rest
         stages = None if self.horizon is None else self.stages
-        if type(self.cost) is BoundQuadratic:
+        if isinstance(self.cost, BoundQuadratic) and self.cost.kernel == "quadratic":
             curvatures = self.cost.control_curvatures.expand(self.B, self.N, self.m)
             return cost_scale(self.cost.total(X, U), curvatures, None, stages, self.control_bounds)
         s = self.n + 1 + self.m
@@ -434,8 +434,7 @@ def _check_constraints(constraints: Any) -> None:
     for constraint in constraints:
         if not isinstance(constraint, Constraint):
             raise InputError("constraints", "a list of Constraint", _named(constraint))
-    rates = sum(isinstance(constraint, RateBounds) for constraint in constraints)
-    if rates > 1:
+    if (rates := sum(constraint.joins_knots for constraint in constraints)) > 1:
         raise InputError("constraints", "one RateBounds at most", rates)
 
 

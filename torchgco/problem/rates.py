@@ -12,10 +12,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import add_first
 from torchgco.constraints.bounds import RateBounds
-from torchgco.costs.base import Cost, WrappedCost
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.problem.problem import Problem
 
@@ -33,7 +30,7 @@ def with_controls_before(problem: Problem) -> Problem:
     n, m, controls, x0, free = problem.n, problem.m, bounds.controls, problem.x0, problem.free_start
     parts: dict[str, object] = {
         "dynamics": _Dynamics(problem.dynamics, controls),
-        "cost": _cost(problem.cost, n, len(controls)),
+        "cost": problem.cost.with_more(n, len(controls)),
         "constraints": tuple(c.with_more(n, m) for c in problem.constraints),
         "x0": torch.cat((x0, bounds.before.expand(problem.B, -1)), dim=-1),
         "free_start": None if free is None else torch.nn.functional.pad(free, (0, len(controls))),
@@ -70,53 +67,3 @@ class _Dynamics(WrappedDynamics):
         fx[..., :n, :n], fu[..., :n, :] = by_x, by_u
         fu[..., n + torch.arange(r), self.controls] = 1.0
         return fx, fu
-
-
-def _cost(cost: Cost, n: int, r: int) -> Cost:
-    if type(cost) is BoundQuadratic:
-        return _quadratic(cost, r)
-    if type(cost).total is not Cost.total:
-        return _OwnTotal(cost, n)
-    return _FirstStates(cost, n) if type(cost).expand is Cost.expand else _OwnExpansion(cost, n)
-
-
-def _quadratic(cost: BoundQuadratic, r: int) -> BoundQuadratic:
-    """The same cost, which is no matter of r further states."""
-    parts = {}
-    for name in ("Q", "Qf", "x_ref", "xf_ref", "q", "qf", "H"):
-        value, more = getattr(cost, name), r if name in ("Q", "Qf") and not cost.diagonal else 0
-        parts[name] = None if value is None else torch.nn.functional.pad(value, (0, r, 0, more))
-    return replace(cost, **parts)
-
-
-@dataclass(frozen=True)
-class _FirstStates(WrappedCost):
-    """A cost of the first n states."""
-
-    n: int
-
-    batched: ClassVar[tuple[str, ...]] = ("cost",)
-
-    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        return self.cost.stage(x[..., : self.n], u, k)
-
-    def terminal(self, x: Tensor) -> Tensor:
-        return self.cost.terminal(x[..., : self.n])
-
-    def goal(self, x0: Tensor) -> None:
-        """The problem has its goal already."""
-
-
-class _OwnExpansion(_FirstStates):
-    """Where the cost has its own `expand`."""
-
-    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
-        H.zero_()
-        add_first(H, X, self.n, U.shape[-1], lambda blocks: self.cost.expand(X[..., : self.n], U, blocks))
-
-
-class _OwnTotal(_OwnExpansion):
-    """Where it has its own `total`."""
-
-    def total(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.cost.total(X[..., : self.n], U)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 
@@ -31,7 +31,7 @@ def cost_scale(
     curvatures: Tensor,
     changes: Tensor | None,
     stages: Tensor | None = None,
-    bounds: ControlBounds | None = None,
+    bounds: Bounds | None = None,
 ) -> CostScale:
     """The mean cost per stage of staying at the start at rest, without its constant.
 
@@ -71,7 +71,7 @@ def cost_scale(
     return CostScale(torch.where(usable, unit, 1.0), constant, size)
 
 
-def reach(dynamics: Dynamics, X: Tensor, bounds: ControlBounds | None) -> tuple[Tensor, Tensor]:
+def reach(dynamics: Dynamics, X: Tensor, bounds: Bounds | None) -> tuple[Tensor, Tensor]:
     """How far states and controls go from the start, (B, 1, n) and (B|1, 1, m), at least where a cost is tried.
 
     By one and by as much as they are; of controls with narrow bounds half their range, and of states then what a

@@ -15,7 +15,6 @@ from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import Cost
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles, Solids
-from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
@@ -52,12 +51,12 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
 
 def has_maps(problem: Problem) -> bool:
     """Whether there are maps among the obstacles."""
-    return any(isinstance(part.inscribed, BoundField) for part in problem.obstacles)
+    return any(part.map is not None for part in problem.obstacles)
 
 
 def around_body(problem: Problem, scene: Scene) -> Scene | None:
     """The same scene as the ball meets it that holds the body; None without a body."""
-    bodies = [part for part in problem.obstacles if isinstance(part, BoundBody)]
+    bodies = [part.body for part in problem.obstacles if part.body is not None]
     if not bodies:
         return None
     more = torch.stack([part.overhang for part in bodies]).amax(0)

@@ -1,4 +1,8 @@
-"""Named sources of obstacle layouts: random families and files."""
+"""Named sources of obstacle layouts: random families and files.
+
+`base.Scenario` draws `layouts.Layouts`, arrays of obstacles, starts and goals, and `vehicle.Vehicle` makes problems
+of them. A family is a file. It imports `problem` and `maps`. Begin with `vehicle.py`.
+"""
 
 from torchgco.scenarios.base import Scenario as Scenario
 from torchgco.scenarios.crossing import Crossing as Crossing

@@ -1,4 +1,9 @@
-"""Search above the local solver: a table of rows, along paths and from samples; or restarts from random guesses."""
+"""Search above the local solver: a table of rows, along paths and from samples; or restarts from random guesses.
+
+`table` says which passes a solver makes, `rows` and `steps` what each does, `proposals` follow the roadmap's paths,
+`restarts` begin again from drawn guesses; `search.Search` is what they share, the best trajectory so far above all. It
+imports `roadmap`, `guidance` and `solvers`. Begin with `table.py`.
+"""
 
 from torchgco.search.candidates import Refine as Refine
 from torchgco.search.chords import ClearChords as ClearChords

@@ -13,12 +13,9 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Below, Count, NonNegative, Positive, check_options
 from torchgco.base.shapes import check_shape, repeated, tensor
 from torchgco.base.tree import take
-from torchgco.constraints.bounds import ControlBounds
-from torchgco.constraints.gates import GateBalls, GateSquares, gates_of
+from torchgco.constraints.gates import gates_of
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
-from torchgco.obstacles.base import Obstacles
-from torchgco.problem.goal import GoalBall
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Inflated, length, points_along
@@ -34,10 +31,6 @@ LEAST_SHARE = 0.05  # share of the horizon between departure and arrival
 LAST_PART = 0.1  # of the distance to the goal: the last part is approached slowly
 CORNER_DEPTH = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
 DEPTH_POINTS = 64  # points of a path at which its depth is measured, about
-
-
-# Constraints that say where to be, not how fast.
-AT_PLACES = (Obstacles, ControlBounds, GoalBall, GateBalls, GateSquares)
 
 
 class Free(NamedTuple):
@@ -232,8 +225,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor)
 
 def limits_states(problem: Problem) -> bool:
     """Whether rows besides obstacles and control bounds may limit how fast a vehicle is."""
-    others = (part for part in problem.constraints if not isinstance(part.bare, AT_PLACES))
-    return any(part.sense == "inequality" for part in others)
+    return any(not part.bare.says_where and part.sense == "inequality" for part in problem.constraints)
 
 
 def _share(problem: Problem, X: Tensor) -> Tensor:

@@ -14,7 +14,6 @@ from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from torchgco.kernels import chord_clearance
-from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
@@ -54,7 +53,7 @@ class Car:
 
 def car(problem: Problem) -> Car | None:
     """The vehicle with a body of a batch of one that drives along its heading, by its equations; None of another."""
-    bodies = [part for part in problem.obstacles if isinstance(part, BoundBody)]
+    bodies = [part.body for part in problem.obstacles if part.body is not None]
     if not bodies or not bool(torch.isfinite(problem.x0).all()):
         return None
     seen = sampled(problem)
@@ -87,7 +86,7 @@ def manoeuvre(search: Search, on_the_spot: bool) -> None:
     Of vehicles that turn on the spot, or of others, of these also the ones that touch between knots. Where every
     trajectory from these touches between knots, too, they are solved again among obstacles that have grown.
     """
-    if not any(isinstance(part, BoundBody) for part in search.call.problem.obstacles):
+    if all(part.body is None for part in search.call.problem.obstacles):
         return
     best, limit = search.best.end.best, search.solver.violation_tolerance
     left = torch.zeros_like(best.violation, dtype=torch.bool)

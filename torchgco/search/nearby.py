@@ -21,7 +21,6 @@ from torchgco.constraints.gates import gates_of
 from torchgco.kernels import chord_clearance, cost_scale, measured
 from torchgco.lagrangian.state import Iterate
 from torchgco.obstacles.base import Obstacles, Solids, places_of
-from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
@@ -143,17 +142,17 @@ def _kept(part: Obstacles, near: Callable[[Obstacles, Solids], Tensor | None]) -
     solids = part.inflated()
     if type(part.inscribed).chosen is Obstacles.chosen or solids is None or solids.absent.shape[1] == 0:
         return None
-    if isinstance(part, BoundBody):
-        solids = solids.grown(part.overhang)
+    if part.body is not None:
+        solids = solids.grown(part.body.overhang)
     return near(part, solids)
 
 
 def _rows(part: Constraint, at: Tensor) -> Tensor:
     """The rows of obstacles at places (B, M'), of each ball in turn where they are those of a body; -1 stays."""
-    if not isinstance(part, BoundBody):
+    if not isinstance(part, Obstacles) or part.body is None:
         return at
-    M = part.inner.absent.shape[1]
-    return torch.cat([torch.where(at < 0, at, at + i * M) for i in range(len(part.balls))], dim=1)
+    M = part.inscribed.absent.shape[1]
+    return torch.cat([torch.where(at < 0, at, at + i * M) for i in range(len(part.body.balls))], dim=1)
 
 
 def _on_the_way(problem: Problem, solids: Solids) -> Tensor | None:

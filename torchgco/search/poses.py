@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.body import BoundBody
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 
@@ -169,16 +168,16 @@ def _clear(part: Obstacles, states: Tensor) -> Tensor:
     if part.margins.shape[-1] == 0:
         return torch.ones_like(states[0, :, 0], dtype=torch.bool)
     inner = _room(part.inscribed, states[..., part.position])
-    good = inner >= 0.0
-    if not isinstance(part, BoundBody):
+    good, body = inner >= 0.0, part.body
+    if body is None:
         return good
-    near = (good & (inner < part.overhang[0])).nonzero().flatten()  # others are clear anyhow
+    near = (good & (inner < body.overhang[0])).nonzero().flatten()  # others are clear anyhow
     if near.numel() == 0:
         return good
-    centers = part.points.at(states[:, near])
-    for size in part.radii[0].unique():
-        own = (part.radii[0] == size).nonzero().flatten()
-        ball, p = part.balls[int(own[0])], centers[:, :, own]
+    centers = body.places(states[:, near])
+    for size in body.radii[0].unique():
+        own = (body.radii[0] == size).nonzero().flatten()
+        ball, p = body.balls[int(own[0])], centers[:, :, own]
         good[near] &= (_room(ball, p.flatten(1, 2)) >= 0.0).view(p.shape[1:3]).all(-1)
     return good
 

@@ -14,7 +14,7 @@ from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.draws import uniform
 from torchgco.base.errors import NAMED
 from torchgco.base.shapes import computing_on
-from torchgco.constraints import ControlBounds, StateBounds
+from torchgco.constraints.bounds import bounds_of
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import length
 from torchgco.roadmap.roadmap import Roadmap
@@ -249,10 +249,8 @@ def bounds_at_inner_knots(problem: Problem) -> tuple[Tensor, Tensor]:
     """The loosest bounds (B, n + m) of the states at knots 1..N-1 and of the controls; infinite without any."""
     low = problem.x0.new_full((problem.B, problem.n + problem.m), -torch.inf)
     high = -low
-    for part in problem.constraints:
-        if not isinstance(part, ControlBounds | StateBounds):
-            continue
-        controls = isinstance(part, ControlBounds)
+    for part in bounds_of(problem.constraints):
+        controls = part.of == "u"
         lower, upper = part.over(problem.N if controls else problem.N + 1)
         inner = slice(None) if controls or lower.shape[1] == 1 else slice(1, max(2, problem.N))
         own = slice(problem.n, problem.n + lower.shape[-1]) if controls else slice(0, lower.shape[-1])

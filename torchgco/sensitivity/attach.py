@@ -15,7 +15,6 @@ from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import MISTAKES, computing_on
 from torchgco.base.tree import copied, is_users
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
@@ -145,7 +144,7 @@ def _are_exact(at: Points, of: Residual) -> Tensor:
 def _system(at: Points) -> System:
     found = at.solution
     problem = at.problem
-    if type(problem.cost) is BoundQuadratic:
+    if problem.cost.kernel == "quadratic":
         # Its numbers may be the user's own tensors, which a step of an optimizer changes before `backward`.
         problem = problem._with({"cost": copied(problem.cost)}, problem.known)
     return System(problem, found.X, found.U, found.multipliers.lam, at.active, at.give, gains_of(problem, found))

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
-from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.bounds import bounds_of
 from torchgco.eager.fixed import GOLDEN, ROUNDINGS
 from torchgco.eager.kernels import least_violation
 from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
@@ -276,15 +276,13 @@ def guessed(call: Call) -> Iterate:
 def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n) and U (B, N, m) moved inside of their bounds, by a share `push` of their size or range at most."""
     X, U = (z.clone(memory_format=torch.contiguous_format) for z in (X, U))
-    for bounds in problem.constraints:
-        if isinstance(bounds, ControlBounds | StateBounds):
-            z = U if bounds.of == "u" else X
-            (lower, upper), size = bounds.by_knot, bounds.lower.shape[-1]
-            half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
-            low, high = (
-                torch.where(at.isinf(), 0.0, push * torch.minimum(at.abs().clamp(min=1.0), half))
-                for at in (lower, upper)
-            )
-            held = z[:, bounds.knots, :size]
-            z[:, bounds.knots, :size] = torch.minimum(torch.maximum(held, lower + low), upper - high)
+    for bounds in bounds_of(problem.constraints):
+        z = U if bounds.of == "u" else X
+        (lower, upper), size = bounds.by_knot, bounds.lower.shape[-1]
+        half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
+        low, high = (
+            torch.where(at.isinf(), 0.0, push * torch.minimum(at.abs().clamp(min=1.0), half)) for at in (lower, upper)
+        )
+        held = z[:, bounds.knots, :size]
+        z[:, bounds.knots, :size] = torch.minimum(torch.maximum(held, lower + low), upper - high)
     return X, U

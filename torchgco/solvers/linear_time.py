@@ -12,9 +12,8 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.shapes import MISTAKES
-from torchgco.constraints.bounds import StateBounds
+from torchgco.constraints.bounds import Bounds, bounds_of
 from torchgco.obstacles.base import Obstacles
-from torchgco.problem.goal import GoalBall
 from torchgco.problem.problem import Problem
 from torchgco.solvers.straight import last_rows
 
@@ -109,8 +108,8 @@ class LinearTime:
     def _fits(self, x: Tensor, u: Tensor, misses: Tensor) -> Tensor:
         """Whether the end is reached, and controls and states are within their bounds, (B,) bool."""
         fits = (misses <= MISSES) & (u.abs().amax((1, 2)) <= 1.0 + LIMIT_SLACK)
-        for bounds in self.problem.constraints:
-            if isinstance(bounds, StateBounds) and isinstance(bounds.knots, slice) and bounds.lower.dim() == 2:
+        for bounds in bounds_of(self.problem.constraints, "x"):
+            if isinstance(bounds.knots, slice) and bounds.lower.dim() == 2:
                 over = torch.maximum(x - bounds.upper.unsqueeze(1), bounds.lower.unsqueeze(1) - x)
                 fits &= over[:, 1:].amax((1, 2)) <= LIMIT_SLACK
         return fits
@@ -127,11 +126,11 @@ def _linear(problem: Problem, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Ten
 def _asked(problem: Problem, end: Tensor) -> Tensor:
     """What is asked of the end (B, n), as rows (B, p, n): those of the last knot, else the position, else all."""
     n, where = problem.n, problem.dynamics.position
-    parts = [c for c in problem.constraints if c.holds_at(problem.N) and not isinstance(c, Obstacles | StateBounds)]
-    ball = any(isinstance(part.bare, GoalBall) for part in parts)  # whose row has no slope in its middle
-    parts = [part for part in parts if not isinstance(part.bare, GoalBall)]
+    parts = [c for c in problem.constraints if c.holds_at(problem.N) and not isinstance(c, Obstacles | Bounds)]
+    balls = [part for part in parts if part.bare.is_goal and part.bare.in_metres]  # of no slope in the middle
+    parts = [part for part in parts if part not in balls]
     rows = [jacobian(lambda z, part=part: last_rows(part, problem, z), end)[0] for part in parts]
-    if not rows or ball:
+    if not rows or balls:
         every = torch.eye(n, dtype=end.dtype, device=end.device)
         rows.append((every if where is None else every[where]).expand(len(end), -1, -1))
     return torch.cat(rows, dim=1)

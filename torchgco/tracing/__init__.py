@@ -1,4 +1,9 @@
-"""Functions of PyTorch tensors, recorded once and replayed with CasADi expressions."""
+"""Functions of PyTorch tensors, recorded once and replayed with CasADi expressions.
+
+`traced.Traced` is such a function: `recorder` sees what PyTorch is asked to do, `operations` says the same in CasADi,
+and `facts` knows what a trace rests on, so that it is used again only where it holds. `native/codegen` makes C of it,
+and `baselines/nlp.py` programs for IPOPT. It imports `base`. Begin with `traced.py`.
+"""
 
 from torchgco.tracing.facts import Facts as Facts
 from torchgco.tracing.facts import Unseen as Unseen

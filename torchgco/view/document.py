@@ -11,7 +11,6 @@ import numpy as np
 
 from torchgco.base.version import VERSION
 from torchgco.judging.worst import kind_of
-from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
@@ -140,8 +139,8 @@ class Document:
 
 def _extent(problem: Problem, b: int) -> list[list[float | None]] | None:
     """Lower and upper corner of the maps of a problem, m; None without one."""
-    parts = (part.inscribed for part in problem.obstacles)
-    fields = [(part.field, int(part.which[b])) for part in parts if isinstance(part, BoundField)]
+    maps = (part.map for part in problem.obstacles if part.map is not None)
+    fields = [(part.field, int(part.which[b])) for part in maps]
     if not fields:
         return None
     low, high = [field.origin[g] for field, g in fields], [field.upper[g] for field, g in fields]

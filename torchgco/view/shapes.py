@@ -1,29 +1,21 @@
 """Obstacles as the page draws them: boxes, rounded outwards by a radius. A sphere is one without sides.
 
-A kind of obstacles of your own is drawn once `SHAPES` has a function for it:
-
-    SHAPES[Shore] = lambda shore, b: Shapes(center, half, radius)  # of problem b, as numpy arrays
-
-Without one it is drawn as the search for paths sees it (`Obstacles.inflated`), and else not at all; the page says so.
+A kind of obstacles of your own says how it looks in `shapes`; without that it is drawn as the search for paths sees it
+(`Obstacles.inflated`), and else not at all; the page says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from torchgco.maps.distance import Unknown
-from torchgco.maps.field import BoundField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.points import PointCloud
-from torchgco.obstacles.base import Obstacles, Solids
-from torchgco.obstacles.box_geometry import Cuboids
-from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.obstacles.base import Obstacles
 from torchgco.view.packing import Packing
 
 NOT_TURNED = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no turn
@@ -62,36 +54,12 @@ class Shapes:
         return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}
 
 
-ShapesOf = Callable[[Any, int], Shapes]
-
-
 def once(rows: np.ndarray) -> np.ndarray:
     """Equal rows as a single one."""
     return rows[:1] if len(rows) > 1 and bool((rows == rows[0]).all()) else rows
 
 
-def _rows(values: Tensor, b: int, here: Tensor) -> np.ndarray:
-    return values[b][here].detach().cpu().double().numpy()
-
-
-def _spheres(part: BoundSpheres, b: int) -> Shapes:
-    still = _solids(part, Solids(part.centers, part.inflated_radii, part.absent), b)
-    stop = None if part.stops is None else float(part.stops[b]) * part.dt
-    if part.velocities is None or not bool(part.velocities[b].any()):
-        return replace(still, until=stop)
-    return replace(still, velocity=_rows(part.velocities, b, ~part.absent[b]), until=stop)
-
-
-def _solids(part: Obstacles, solids: Solids, b: int) -> Shapes:
-    here = ~solids.absent[b]
-    center = _rows(solids.centers, b, here)
-    radius = (_rows(solids.radii, b, here) - float(part.vehicle_radius[b])).clip(min=0.0)
-    if not isinstance(solids, Cuboids):
-        return Shapes(center, np.zeros((1, center.shape[1])), radius)
-    return Shapes(center, _rows(solids.half_sizes, b, here), radius, turns(_rows(solids.axes, b, here)))
-
-
-def _map(part: BoundField, b: int) -> Shapes:
+def _map(part: Any, b: int) -> Shapes:
     """The occupied cells of a grid, or the balls of a cloud."""
     field, g = part.field, int(part.which[b])
     if isinstance(field.source, PointCloud):
@@ -103,10 +71,10 @@ def _map(part: BoundField, b: int) -> Shapes:
 
 def unknown_of(part: Obstacles, b: int) -> Shapes | None:
     """The unknown cells of a map; None where there are none."""
-    if not isinstance(part, BoundField) or not isinstance(part.field.source, OccupancyGrid):
+    if part.map is None or not isinstance(part.map.field.source, OccupancyGrid):
         return None
-    grid = part.field.source.single(int(part.which[b]))
-    return _cells(grid, grid.is_unknown, part.field.unknown) if bool(grid.is_unknown.any()) else None
+    grid = part.map.field.source.single(int(part.map.which[b]))
+    return _cells(grid, grid.is_unknown, part.map.field.unknown) if bool(grid.is_unknown.any()) else None
 
 
 def _cells(grid: OccupancyGrid, cells: np.ndarray, unknown: Unknown | None = None) -> Shapes:
@@ -115,17 +83,17 @@ def _cells(grid: OccupancyGrid, cells: np.ndarray, unknown: Unknown | None = Non
     return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1), cells=True, unknown=unknown)
 
 
-# What the page draws for obstacles of each kind, once bound to a problem, and the place of a problem in its batch.
-SHAPES: dict[type[Obstacles], ShapesOf] = {BoundSpheres: _spheres, BoundField: _map}
-
-
 def shapes_of(part: Obstacles, b: int) -> Shapes | None:
-    """The obstacles of problem b; None where nobody says how they look."""
-    for kind, shapes in SHAPES.items():
-        if isinstance(part, kind):
-            return shapes(part, b)
-    solids = part.inflated()
-    return None if solids is None else _solids(part, solids, b)
+    """The obstacles of problem b, as one that is a ball meets them; None where nobody says how they look."""
+    if part.map is not None:
+        return _map(part.map, b)
+    found = part.shapes(b)
+    if found is None or found.sines is not None:
+        return None
+    until = None if part.stops is None else float(part.stops[b]) * part.dt
+    if not found.half.any():
+        return Shapes(found.center, np.zeros((1, found.center.shape[1])), found.radius, None, found.velocity, until)
+    return Shapes(found.center, found.half, found.radius, turns(found.sides), found.velocity, until)
 
 
 def turns(axes: np.ndarray) -> np.ndarray | None:

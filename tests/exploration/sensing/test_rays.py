@@ -115,7 +115,7 @@ def test_obstacles_without_rays_are_refused() -> None:
     class Fog(Obstacles):
         absent, vehicle_radius = torch.zeros(1, 1, dtype=torch.bool), torch.zeros(1)
 
-    foggy: Any = SimpleNamespace(constraints=[Fog()], take=lambda rows: foggy)
+    foggy: Any = SimpleNamespace(obstacles=[Fog()], take=lambda rows: foggy)
     with pytest.raises(InputError, match="spheres, boxes, capsules or a map"):
         World.of(foggy, 0)
 

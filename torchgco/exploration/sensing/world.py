@@ -8,19 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from torchgco.base.errors import InputError
 from torchgco.exploration.sensing.library import call
-from torchgco.maps.field import BoundField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.oscillating import BoundOscillatingBoxes
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
 
@@ -114,10 +110,10 @@ class World:
             InputError: obstacles of a kind that has no rays.
         """
         one = problem.take(slice(b, b + 1))
-        maps = [part for part in one.constraints if isinstance(part, BoundField)]
+        maps = [part.map for part in one.obstacles if part.map is not None]
         if len(maps) > 1:
             raise InputError("constraints", "one map at most, for a sensor", len(maps))
-        parts = [_bodies(part) for part in one.constraints if isinstance(part, Obstacles) and part not in maps]
+        parts = [_bodies(part) for part in one.obstacles if part.map is None]
         boxes = np.concatenate([np.zeros((0, 16)), *(part[0] for part in parts)])
         world = cls(boxes, Motion.joined([part[1] for part in parts]))
         if not maps:
@@ -154,7 +150,7 @@ class World:
         return distance
 
 
-def _cells(part: BoundField) -> tuple[np.ndarray, tuple[float, float, float], float]:
+def _cells(part: Any) -> tuple[np.ndarray, tuple[float, float, float], float]:
     """The occupied cells of one problem's map, where they begin, m, and their side, m.
 
     A cloud of points is rasterised to the cells that its balls reach into, as large as those of its distance field.
@@ -182,20 +178,12 @@ def _rasterised(cloud: PointCloud, which: int, side: float) -> OccupancyGrid:
 
 def _bodies(part: Obstacles) -> tuple[np.ndarray, Motion]:
     """The boxes (M, 16) of obstacles, and how they move, of one problem, without the absent ones."""
-    if isinstance(part, BoundOscillatingBoxes):
-        boxes, _ = _bodies(part.boxes)
-        here = ~part.absent[0].numpy()
-        sines = (values[0].numpy()[here] for values in (part.amplitudes, part.rates, part.phases))
-        return boxes, Motion(np.zeros((len(boxes), 3)), *sines)
-    if not isinstance(part, BoundSpheres | BoundBoxes):
+    shapes = part.shapes(0)
+    if shapes is None:
         raise InputError("scenario", "spheres, boxes, capsules or a map for a sensor", type(part).__name__)
-    there, centers = ~part.absent[0].numpy(), part.centers[0].numpy()
-    radii, velocities = part.inflated_radii[0].numpy() - float(part.vehicle_radius[0]), np.zeros_like(centers)
-    if isinstance(part, BoundBoxes):
-        axes, half = part.axes[0].numpy().reshape(-1, 9), part.half_sizes[0].numpy()
-    else:
-        axes, half = np.tile(np.eye(3).ravel(), (len(centers), 1)), np.zeros_like(centers)
-        velocities = velocities if part.velocities is None else part.velocities[0].numpy()
-    radii = np.where(radii < 1e-12, 0.0, radii)  # what rounding leaves of a sharp box
-    boxes = np.concatenate([centers, axes, half, radii[:, None]], axis=1)[there]
-    return boxes, Motion.steady(velocities[there])
+    M, radius = len(shapes.center), np.where(shapes.radius < 1e-12, 0.0, shapes.radius)  # of a sharp box: rounding
+    boxes = np.concatenate([shapes.center, shapes.sides.reshape(M, 9), shapes.half, radius[:, None]], axis=1)
+    motion = Motion.steady(np.zeros((M, 3)) if shapes.velocity is None else shapes.velocity)
+    if shapes.sines is not None:
+        motion = Motion(motion.velocities, *shapes.sines)
+    return boxes, motion
