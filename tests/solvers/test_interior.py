@@ -206,6 +206,20 @@ def test_convergence_with_equalities_alone_is_quadratic(monkeypatch) -> None:
     assert len(pairs) >= 2 and all(b <= 5 * a * a for a, b in pairs) and errors[-1] < 1e-12
 
 
+@pytest.mark.parametrize("native", [True, False])
+def test_options_of_ipopt_reach_the_kernels(native: bool) -> None:
+    problem, U0 = circle(torch.tensor([0.8], dtype=D))
+    kernels.use_native(native)
+    try:
+        call, limit = Session(Call.checked(problem, U0), own_units=True).call, int(solved(problem, U0).iterations) - 1
+        ends = [InteriorPoint(max_iterations=limit, acceptable_tolerance=error).solved(call) for error in (1e-10, 1.0)]
+        assert [int(end.status) for end in ends] == [Status.MAX_ITERATIONS, interior.SOLVED]
+        once = [solved(linear_quadratic(), max_iterations=1, bound_push=push).X for push in (1e-2, 0.3)]
+    finally:
+        kernels.use_native(True)
+    assert not torch.allclose(*once, rtol=1e-3)
+
+
 def test_a_step_that_gains_too_little_is_halved() -> None:
     """A full Newton step of length 1 lowers the costs -u + u^2 / 2 + a u^3 by half and by twice what Armijo asks."""
     share = BarrierOptions.eta_phi

@@ -56,7 +56,7 @@ class InteriorPoint(Solver):
         bound_push: least slack at the start, and how far a guess is moved inside of its bounds, as a share of its size
             (of 1 at least) or of half their range. IPOPT: bound_push, bound_frac.
         acceptable_tolerance: an error of the conditions at which a problem counts as solved, too, once it hasn't fallen
-            by half in three iterations, or no step is found. IPOPT: acceptable_tol.
+            by half in three iterations, or no step or iteration is left. IPOPT: acceptable_tol.
 
     Raises:
         InputError: a field out of its range.
