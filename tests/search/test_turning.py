@@ -83,7 +83,8 @@ def check_reached(problem: Problem, solver: str, seed: int) -> None:
     found = torchgco.solve(problem, solver=solver, seed=seed, verbose=False)
     verdict = judge(problem, found.U)
     assert bool(verdict.reached.all()), (~verdict.reached).nonzero().flatten().tolist()
-    assert set(found.statuses) == {Status.CONVERGED}
+    assert set(found.statuses) <= {Status.CONVERGED, Status.FEASIBLE}
+    assert int((found.status == Status.CONVERGED).sum()) >= 0.95 * problem.B
     assert bool((verdict.clearance >= 0.0).all())
 
 

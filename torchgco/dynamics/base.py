@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from dataclasses import field as hidden
 from typing import Any, ClassVar, Literal, Self
 
+import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
@@ -100,12 +101,21 @@ class Dynamics(PerElement):
 
 @dataclass(frozen=True)
 class WrappedDynamics(Dynamics):
-    """A model with sizes, time step and position of another one, in a form of the problem with other steps."""
+    """A model with sizes, time step and position of another one, in a form of the problem with other steps.
+
+    Its `field` is that of the other one's states between two knots, which come first, and 0 of the further ones.
+    """
 
     model: Dynamics
 
-    n, m, dt, position = passed_on("model", "n", "m", "dt", "position")
+    n, m, dt, position, integrator, stretches = passed_on(
+        "model", "n", "m", "dt", "position", "integrator", "stretches"
+    )
     calls_function = property(lambda self: is_users(self.model))
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        rates = self.model.field(x[..., : self.model.n], u)
+        return torch.nn.functional.pad(rates, (0, self.n - self.model.n))
 
 
 @dataclass(frozen=True)

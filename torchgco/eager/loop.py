@@ -74,15 +74,18 @@ def solve(
             continue
         t, part = loop.t.take(ended), loop.model.take(ended)
         rows = t.rows
-        end = torch.where((status[ended] == Status.CONVERGED) & breaks_rows_left_out(kinds, t), int(Status.INFEASIBLE),
-                          status[ended])  # fmt: skip
+        stiffest = torch.nn.functional.pad(torch.where(kinds.inside(t), t.z / t.s, 0.0), (0, 1)).amax(-1)
+        end = status[ended]
+        end = torch.where((end == Status.CONVERGED) & breaks_rows_left_out(kinds, t), int(Status.INFEASIBLE), end)
+        # The slack of a violated row without slope falls to 0, and its multiplier has no end.
+        fails = (end == Status.NON_FINITE) | (end == Status.NOT_POSITIVE_DEFINITE)
+        end = torch.where(fails & torch.isposinf(stiffest), int(Status.LINE_SEARCH_FAILED), end)
         out["status"][rows], out["iterations"][rows] = end.to(torch.int32), t.made
         out["error"][rows], out["theta"][rows] = error[ended], t.theta
         out["gains"][rows, ..., : problem.n] = gains(kinds, part, t)
         if how.minimum:
-            stiff = torch.nn.functional.pad(torch.where(kinds.inside(t), t.z / t.s, 0.0), (0, 1))
-            stiffest = stiff.amax(-1)  # rounding decides where it is too large
-            falls = ~_factors(kinds, part, t, torch.zeros_like(t.shift)).good & (stiffest < 1.0 / how.rounding)
+            falls = ~_factors(kinds, part, t, torch.zeros_like(t.shift)).good
+            falls &= stiffest < 1.0 / how.rounding  # which decides where it is larger
             out["falls"][rows] = falls.to(X.dtype)
         X[rows], U[rows], barrier[rows] = t.X, t.U, t.mu
         found = t.z / column(t.scale)

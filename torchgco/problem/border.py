@@ -21,8 +21,10 @@ from torchgco.base.mixing import foreign, why
 from torchgco.base.options import Seconds, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, check_tensor, describe
 from torchgco.base.tree import is_users
+from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
+from torchgco.costs.function import FunctionCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.dynamics.names import controls_of, states_of
@@ -169,8 +171,8 @@ def _check_stages(dynamics: Dynamics, rows: Tensor, x0: Tensor, N: int) -> None:
         if dynamics.at(k) is dynamics:  # the same at every stage: all states as problems of their own
             ahead = dynamics.take(i.repeat_interleave(len(k))).step(*(part.flatten(0, 1) for part in z))
             return ahead.unflatten(0, (-1, len(k)))
-        each = [dynamics.at(int(j)).take(i).step(*(part[:, at] for part in z)) for at, j in enumerate(k)]
-        return torch.stack(each, dim=1)
+        own = dynamics.take(i)  # once: numbers of all stages, at each of them, would be as many as the horizon squared
+        return torch.stack([own.at(int(j)).step(*(part[:, at] for part in z)) for at, j in enumerate(k)], dim=1)
 
     place = called("dynamics.step", STEP_OF_STAGE, joined_knots, together, alone, rows, k, arguments)
     if place is not None:
@@ -193,13 +195,12 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
-    reads = cost.reads_knots
-    _check_axes("cost.stage", lambda i, k, x, u: stage(i, x, u, k), reads, rows, k, X[:, :-1], U)
-    _check_axes("cost.terminal", lambda i, _, x: cost.take(i).terminal(x), False, rows, k[:1], X[:, -1:])
+    part, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
+    _check_axes("cost.stage", lambda k, x, u: part.stage(x, u, k), takes_k, k, X[:, :-1], U)
+    _check_axes("cost.terminal", lambda _, x: part.terminal(x), False, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
     _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
     _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
-    part = cost.take(rows)
     if type(cost).expand is Cost.expand and type(cost).total is Cost.total:
         _check_slope("cost.stage", lambda x, u: part.stage(x, u, k).sum(-1), X[:, :-1], U)
         _check_slope("cost.terminal", lambda x, u: part.terminal(x), X[:, -1], U[:, -1])
@@ -254,7 +255,8 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
 
     def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         if constraint.reads_knots:
-            each = [together(i, k[at : at + 1], *(part[:, at : at + 1] for part in z)) for at in range(len(k))]
+            own = constraint.take(i)
+            each = [own.rows_at(k[at : at + 1], *(part[:, at : at + 1] for part in z)) for at in range(len(k))]
             return torch.cat(each, dim=1)
         K, single = len(k), (part.flatten(0, 1).unsqueeze(1) for part in z)
         return together(i.repeat_interleave(K), k[:1], *single).squeeze(1).unflatten(0, (-1, K))
@@ -267,7 +269,7 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
     if place is not None:
         got = f"rows of knot {int(knots[place])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
-    _check_axes(field, together, constraint.reads_knots, rows, knots, *arguments)
+    _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
@@ -343,11 +345,9 @@ def _check_apart(field: str, function: Callable[..., Tensor], rows: Tensor, *arg
         raise InputError(field, OWN_ROW, "values that change with those of another problem")
 
 
-def _check_axes(
-    field: str, function: Callable[..., Tensor], reads_k: bool, rows: Tensor, k: Tensor, *arguments: Tensor
-) -> None:
-    """Check that function(rows, k, *arguments) doesn't look at how many axes its arguments have, nor at what k is."""
-    if called(field, ANY_AXES, depends_on_axes, function, rows, k, arguments, reads_k):
+def _check_axes(field: str, function: Callable[..., Tensor], takes_k: bool, k: Tensor, *arguments: Tensor) -> None:
+    """Check that function(k, *arguments) doesn't look at how many axes its arguments have, nor at what k is."""
+    if called(field, ANY_AXES, depends_on_axes, function, k, arguments, takes_k):
         raise InputError(field, ANY_AXES, "others for a state by itself, and its k, than among those of all knots")
 
 

@@ -240,7 +240,7 @@ def _way(problem: Problem, z: Tensor) -> Tensor:
     """The squared lengths (B, S) of a stage's way at states and controls (B, S, n + m)."""
     x, u = z[..., : problem.n], z[..., problem.n :]
     at, dynamics = problem.position, problem.dynamics
-    if getattr(dynamics, "integrator", "none") == "none":
+    if not dynamics.stretches:
         return (dynamics.step(x, u) - x)[..., at].square().sum(-1)
     return (dynamics.dt * dynamics.field(x, u)[..., at]).square().sum(-1)
 

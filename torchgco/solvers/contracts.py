@@ -149,6 +149,9 @@ def check_states(X0: Any, problem: Problem) -> None:
     check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
 
 
+CHOOSING_TIME = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
+
+
 class Solver(Brief):
     """A solver for batches of problems. Its fields are its options; it keeps no state between calls.
 
@@ -239,8 +242,7 @@ class Solver(Brief):
         self.announce(call.problem)
         chooser = self.choosing_time(call.problem)
         if chooser is None:
-            able = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
-            raise InputError("solver", able, type(self).__name__)
+            raise InputError("solver", CHOOSING_TIME, type(self).__name__)
         found = solve_in_time(chooser, problem, call, X0)
         self._check(problem, call, found)
         _, X, U = at_times(problem, found.X, found.U, found.times)

@@ -33,6 +33,7 @@ from torchgco.solvers.unbounded import beyond_rounding
 REPORTED_AT_ONCE = 256  # problems between two reports of progress
 SADDLE_STEPS = 1e-3, 1e-1  # sizes of the controls, by which a solve goes on beside a saddle point or a maximum
 ROUGH, FEW = 1e-2, 60  # tolerance, and iterations, of a trajectory whose time is to be freed next
+DRAWN_ITERATIONS = 30  # iterations of a drawn guess, after which its cost is compared
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 
 
@@ -111,7 +112,8 @@ class InteriorPoint(Solver):
         """This solver; where the time is held, with a tolerance that any trajectory meets, and few iterations."""
         held = replace(self, tolerance=max(self.tolerance, ROUGH), max_iterations=min(self.max_iterations, FEW))
         first = replace(self, max_iterations=held.max_iterations)
-        return Chooser(held, self, self.admitted(problem), first)
+        rough = replace(held, max_iterations=DRAWN_ITERATIONS).solved
+        return Chooser(held, self, self.admitted(problem), first, rough=rough)
 
     def solved(
         self,

@@ -392,12 +392,17 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     return ended;
 }
 
+static V stiffest(const Barrier *t) {
+    V found = SET(0.0);
+    EACH_ROW(t, 0, q) found = most(by_role(t, q, t->z[q] / t->s[q], SET(0.0)), found);
+    return found;
+}
+
 /* Lanes of `ended` from whose iterate the cost falls to second order: the reduced Hessian isn't positive definite. Where
    rows have become so stiff that rounding decides, none. */
 static I find_falls(Barrier *t, I ended) {
-    V shift = t->shift, stiffest = SET(0.0);
-    EACH_ROW(t, 0, q) stiffest = most(by_role(t, q, t->z[q] / t->s[q], SET(0.0)), stiffest);
-    ended &= stiffest < SET(1.0 / t->how->rounding);
+    V shift = t->shift;
+    ended &= stiffest(t) < SET(1.0 / t->how->rounding);
     if (!any(ended)) return ended;
     expand(t);
     t->shift = tgco_choose(ended, SET(0.0), shift);
@@ -422,7 +427,10 @@ static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, 
     t->how->error[e] = error;
     t->how->theta[e] = k->theta[lane];
     p->iterations[e] += (int64_t)k->made[lane];
-    p->status[e] = status == CONVERGED && breaks_rows_left_out(t, lane) ? INFEASIBLE : status;
+    if (status == CONVERGED && breaks_rows_left_out(t, lane)) status = INFEASIBLE;
+    /* The slack of a violated row without slope falls to 0, and its multiplier has no end. */
+    int fails = status == NON_FINITE || status == NOT_POSITIVE_DEFINITE;
+    p->status[e] = fails && stiffest(t)[lane] == INFINITY ? LINE_SEARCH_FAILED : status;
 }
 
 static double seconds_now(void) {

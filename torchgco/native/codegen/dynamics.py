@@ -163,9 +163,11 @@ def computed_entries(jacobian: Any) -> Any:
 
 def elements(column: Any) -> np.ndarray:
     """The scalars of a column, (size,) objects."""
+    import casadi as ca
+
     elements = np.empty(column.numel(), dtype=object)
-    for i in range(column.numel()):
-        elements[i] = column[i]
+    for i, element in enumerate(ca.vertsplit(column)):
+        elements[i] = element
     return elements
 
 
