@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tests.native.lanes import Emitted
+from tests.slow import mostly
 from torchgco.native.codegen.emit import emit, literal
 from torchgco.native.compiler import find_compiler
 from torchgco.tracing.operations import to_single
@@ -127,7 +128,7 @@ def test_single_precision(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*EXACT, *CLOSE])
-@pytest.mark.parametrize("lanes", [1, 4, 16])
+@pytest.mark.parametrize("lanes", mostly([1, 4, 16], 1))
 def test_lanes_do_not_affect_each_other(name: str, lanes: int) -> None:
     function, emitted = functions(name)
     code, size = emit("tgco_made", function), function.numel_out()

@@ -40,7 +40,7 @@ def test_models_that_differ_in_numbers_alone_are_of_one_kin(cache: Path, monkeyp
         model = FunctionDynamics(lambda x, u, f=factor: f * u.expand_as(x) + x * WEIGHTS * f, 2, 1, 0.1)
         rows = FunctionConstraint(lambda x, f=factor: f * x[..., :1] - 1.0)
         problem = Problem(model, QuadraticCost([1, 1], [1], [1, 1]), [rows], [[0.1, 0.2]], 5)
-        interior.InteriorEngine(engine.Engine(problem), 8)
+        interior.InteriorEngine(engine.Engine(problem))
     assert len(set(keys)) == 6
     kinds = Counter(key[:8] for key in (*keys, *(path.name for path in cache.iterdir())))
     assert len(kinds) == 6 and set(kinds.values()) == {3}

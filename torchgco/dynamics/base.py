@@ -12,14 +12,14 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError
-from torchgco.base.options import Count, Seconds, check_options
+from torchgco.base.options import Checked, Count, Seconds
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS
 
 
-class Dynamics(PerElement):
+class Dynamics(PerElement, Checked):
     """x_{k+1} = step(x_k, u_k) on (..., n), (..., m).
 
     A model is a subclass with the numbers `n` and `m`, and one method: `field(x, u)`, the time derivative of x, with
@@ -119,7 +119,7 @@ class WrappedDynamics(Dynamics):
 
 
 @dataclass(frozen=True)
-class FunctionDynamics(Dynamics):
+class FunctionDynamics(Dynamics, named="dynamics"):
     """Dynamics from function(x, u) on (..., n), (..., m): the derivative x', or with integrator="none" the next state.
 
         drag = torch.tensor([0.2, 0.5]).double()  # of two problems
@@ -160,9 +160,6 @@ class FunctionDynamics(Dynamics):
 
     batched: ClassVar[tuple[str, ...]] = ("values",)
     calls_function: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "dynamics")
 
     def bind(self, dims: Dimensions) -> Self:
         values = bound_values(self.values, self.knot_values, (self.function,), dims, "dynamics", knots=dims.N)

@@ -14,30 +14,24 @@ from torchgco.base.status import Status
 from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, KktSolve, RightSides
 from torchgco.native import structures
-from torchgco.native.codegen.source import INTERIOR, LANES
+from torchgco.native.codegen.source import INTERIOR, lanes_for
 from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import Interior, Kkt
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
 
-FEW_LANES = 2, 4  # lanes of libraries for few problems
-
 
 class InteriorEngine:
-    """The library of a form of problems; compiled when it is made.
-
-    Args:
-        B: problems of a solve, all in all. For few of them there are libraries that solve as few side by side: lanes
-            without a problem take time, too.
+    """The library of a form of problems, for as many as `engine` serves; compiled when it is made.
 
     Raises:
         InputError: a part without a counterpart in C.
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(self, engine: Engine, B: int) -> None:
-        self.engine, self.lanes = engine, _lanes(B)
+    def __init__(self, engine: Engine) -> None:
+        self.engine, self.lanes = engine, lanes_for(engine.B)
         units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
         self.library: ctypes.CDLL = engine.further(("interior", self.lanes), units)
 
@@ -101,7 +95,7 @@ class InteriorEngine:
         out = {"status": torch.zeros(problem.B, dtype=torch.int32)}
         out["iterations"] = torch.zeros(problem.B, dtype=torch.int64)
         out["gains"] = X.new_zeros(problem.B, problem.N, problem.m, problem.n + 1)
-        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
+        rows = [constraint.copy() for constraint in self.engine._rows(problem)[1]]
         for row, lam in zip(rows, multipliers, strict=True):
             row.lam = lam
         return self.engine.packed(problem, X=X, U=U, constraint=rows, **out), out
@@ -124,11 +118,7 @@ def free_components(problem: Problem) -> Tensor | None:
     return None if problem.free_start is None else problem.free_start.double().contiguous()
 
 
-def begin_interior(engine: Engine, B: int) -> None:
-    """Start to compile both libraries for B problems of a form of which the first one is about to be loaded."""
+def begin_interior(engine: Engine) -> None:
+    """Start to compile both libraries of a form of which the first one is about to be loaded."""
     with suppress(InputError):
-        begin(engine.form.units(), engine.form.units(INTERIOR, lanes=_lanes(B)))
-
-
-def _lanes(B: int) -> int:
-    return next((lanes for lanes in FEW_LANES if B <= lanes < LANES), LANES)
+        begin(engine.form.units(lanes=engine.lanes), engine.form.units(INTERIOR, lanes=lanes_for(engine.B)))

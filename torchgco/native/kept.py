@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import later
-from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import run
 from torchgco.native.interior import InteriorEngine, interior
 from torchgco.native.kept_problem import KeptProblem
@@ -77,9 +76,9 @@ class Kept(KeptProblem):
         if not math.isfinite(self._gains.sum()):
             np.nan_to_num(self._gains, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         self._rolled[0][:], self._rolled[1][:] = self._moving[:2]
-        run(library.tgco_closed_loop, B, LANES, self._follow)
+        run(library.tgco_closed_loop, B, self.lanes, self._follow)
         if self.engine.measures:
-            run(library.tgco_violation, B, LANES, self._follow)
+            run(library.tgco_violation, B, self.lanes, self._follow)
 
     def begin_with(self, other: Kept) -> None:
         """Take over the iterates of another one of the same shapes."""

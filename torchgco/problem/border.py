@@ -6,20 +6,18 @@ A mistake that broadcasting or autodiff would hide ends here, in one line, and n
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable, Iterable, MutableMapping, Sequence
-from contextlib import suppress
-from typing import Any, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakIdKeyDictionary
 
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
 from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.mixing import foreign, why
 from torchgco.base.options import Seconds, check_value
-from torchgco.base.shapes import MISTAKES, Dimensions, check_tensor, describe
+from torchgco.base.shapes import MISTAKES, check_tensor, describe
 from torchgco.base.tree import is_users
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint
@@ -44,10 +42,6 @@ ONE_KNOT = (
     "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; numbers per knot: "
     "`knot_values`, or an argument k)"
 )
-
-Given: TypeAlias = tuple[Any, Any]  # a part as the user gave it, and bound to a problem
-# The parts that have passed, by identity, and for which problems.
-_passed: MutableMapping[Any, set[Hashable]] = WeakIdKeyDictionary()
 
 
 def check_model(dynamics: Dynamics, x0: Tensor) -> None:
@@ -85,47 +79,6 @@ def _check_parameter(value: object, field: str, x0: Tensor) -> None:
         if value.dtype != x0.dtype or value.device != x0.device:
             raise InputError(field, f"{x0.dtype} on {x0.device} as x0", f"{value.dtype} on {value.device}")
         check_tensor(value, field)
-
-
-def check_code(
-    dims: Dimensions, x0: Tensor, dynamics: Given | None, cost: Given | None, constraints: Iterable[Given]
-) -> None:
-    """Try what the code of a user's parts does, once for each object and problems of these dimensions.
-
-    A part that has passed isn't tried again: the same object has the same code, and a loop that makes a problem per
-    period would spend most of its time here. What the code reads may have changed since, such as captured tensors,
-    attributes, the mode of a module, or x0: a mistake that arises so is found later, where the part is traced again
-    (operations that draw at random or leave PyTorch, other shapes) or by its result (`certify` compares
-    derivatives). All parts are tried again for another number of problems, stages, states or controls, time step,
-    position, dtype or device. Parts without weak references are always tried.
-
-    Args:
-        x0: the starts (B, n).
-        dynamics, cost, constraints: each as the user gave it and bound to the problem; those that are new.
-
-    Raises:
-        InputError: as `check_dynamics`, `check_cost`, `check_constraint`.
-    """
-    where = dims.position and (dims.position.start, dims.position.stop)
-    about = dims.B, dims.N, dims.n, dims.m, dims.dt, where, dims.obstacles_from, x0.dtype, x0.device
-    if dynamics is not None:
-        _check_once(dynamics, about, lambda part: check_dynamics(part, x0, dims.N))
-    if cost is not None:
-        _check_once(cost, about, lambda part: check_cost(part, x0, dims.N, dims.m))
-    for i, constraint in enumerate(constraints):
-        name = getattr(constraint[1], "name", None)
-        field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
-        _check_once(constraint, about, lambda part, field=field: check_constraint(part, field, x0, dims.N, dims.m))
-
-
-def _check_once(part: Given, about: Hashable, check: Callable[[Any], None]) -> None:
-    if not is_users(part[1]):
-        return
-    if not any(one in _passed and about in _passed[one] for one in part):
-        check(part[1])
-    for one in part:
-        with suppress(TypeError):  # no weak reference to it
-            _passed.setdefault(one, set()).add(about)
 
 
 def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:

@@ -1,4 +1,4 @@
-"""Whether a horizon suffices for the way to the goal: said before a solve, where the model has a limit on speed."""
+"""Whether a horizon suffices for the way to the goal: said where a solve misses it, if the model has limits."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from torchgco.base import clock
 from torchgco.base.brief import Brief
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError, StartWarning
-from torchgco.base.options import Seconds, Seed, check_value
+from torchgco.base.options import Checked, Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
@@ -152,7 +152,7 @@ def check_states(X0: Any, problem: Problem) -> None:
 CHOOSING_TIME = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
 
 
-class Solver(Brief):
+class Solver(Brief, Checked):
     """A solver for batches of problems. Its fields are its options; it keeps no state between calls.
 
     Attributes:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.options import Count, Positive
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
@@ -38,7 +38,7 @@ PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a m
 
 
 @dataclass(frozen=True)
-class InteriorPoint(Solver):
+class InteriorPoint(Solver, named="solver"):
     """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
 
     States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
@@ -70,9 +70,6 @@ class InteriorPoint(Solver):
     warm_barrier: Positive = 1e-6
     bound_push: Positive = 1e-2
     acceptable_tolerance: Positive = 1e-10
-
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
 
     def options(self, warm: bool, **changes: float) -> BarrierOptions:
         """What kernels read; `changes` of its fields."""

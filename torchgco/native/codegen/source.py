@@ -19,6 +19,7 @@ from torchgco.native.includes import included, joined
 from torchgco.native.structures import HEADER, constants
 
 LANES = lanes()
+FEW_LANES = 2, 4  # lanes of libraries for few problems: lanes without a problem take time, too
 LIBRARIES_KEPT = 64  # libraries, the most recent ones
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
 LOOPS = """
@@ -44,6 +45,11 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) ADD(g[F_column[e]], entry(e, f), p[F_row[e]]);
 }
 """
+
+
+def lanes_for(B: int, least: int = 1) -> int:
+    """How many lanes a library has that solves B problems, all in all, of which one makes use of `least`."""
+    return next((lanes for lanes in FEW_LANES if max(B, least) <= lanes < LANES), LANES)
 
 
 @dataclass(frozen=True)
