@@ -24,8 +24,7 @@ from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
-from torchgco.native.compiler import Unit
-from torchgco.native.declarations import load
+from torchgco.native.compiler import Unit, build
 from torchgco.native.packing import (
     constraint_of,
     guide_of,
@@ -37,7 +36,7 @@ from torchgco.native.packing import (
     shared_fields,
 )
 from torchgco.native.shared import Captured, Shared
-from torchgco.native.structures import STRUCTURES, Kind, array
+from torchgco.native.structures import Kind, array
 from torchgco.obstacles.spheres import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
@@ -96,7 +95,7 @@ class Engine:
         """A further library of this form, which this engine and those with other shared numbers keep."""
         if name not in self._libraries:
             with setting_up():
-                self._libraries[name] = load(units(), STRUCTURES)
+                self._libraries[name] = build(units())
         return self._libraries[name]
 
     def forget_values(self) -> None:

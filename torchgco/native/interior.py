@@ -5,13 +5,13 @@ from __future__ import annotations
 import ctypes
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, KktSolve, RightSides
 from torchgco.native import structures
 from torchgco.native.codegen.source import INTERIOR, lanes_for
@@ -19,6 +19,7 @@ from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import Interior, Kkt
 from torchgco.problem.problem import Problem
+from torchgco.problem.scale import CostScale
 
 
 class InteriorEngine:
@@ -35,8 +36,9 @@ class InteriorEngine:
         self.library: ctypes.CDLL = engine.further(("interior", self.lanes), units)
 
     def solve(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
-    ) -> dict[str, Tensor]:
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor,
+        scale: CostScale, options: BarrierOptions,
+    ) -> dict[str, Tensor]:  # fmt: skip
         """States, controls, multipliers and barrier parameters in place; X begins with the problem's start, or
         a guess of what is free in it.
 
@@ -44,7 +46,7 @@ class InteriorEngine:
             X, U: (B, N+1, n), (B, N, m), contiguous.
             multipliers: of every constraint, (B, K, p), contiguous.
             barrier: mu (B,).
-            options: the fields of `structures.Interior`.
+            scale: of the costs.
 
         Returns:
             status, iterations (B,); error of the end test, theta, the sum of residuals, and whether the cost falls to
@@ -52,9 +54,7 @@ class InteriorEngine:
         """
         B = problem.B
         packed, out = self._packed(problem, X, U, multipliers)
-        ends = {name: X.new_zeros(B) for name in ("error", "theta", "falls")}
-        free = free_components(problem)
-        how = Interior.complete(of=packed, barrier=barrier, free_start=free, **ends, **options)
+        how, ends = interior(problem, packed, barrier, scale, options)
         run(self.library.tgco_interior, B, self.lanes, how)
         return out | ends
 
@@ -99,6 +99,18 @@ class InteriorEngine:
         for row, lam in zip(rows, multipliers, strict=True):
             row.lam = lam
         return self.engine.packed(problem, X=X, U=U, constraint=rows, **out), out
+
+
+def interior(
+    problem: Problem, packed: structures.Problem, barrier: Tensor, scale: CostScale, options: BarrierOptions
+) -> tuple[Interior, dict[str, Tensor]]:
+    """What C reads of a solve, and the tensors (B,) that it writes error, theta and falls to."""
+    ends = {name: barrier.new_zeros(problem.B) for name in ("error", "theta", "falls")}
+    how = Interior.complete(
+        of=packed, barrier=barrier, free_start=free_components(problem), constant=scale.constant,
+        least_cost=scale.size, **ends, **vars(options),
+    )  # fmt: skip
+    return how, ends
 
 
 def free_components(problem: Problem) -> Tensor | None:
