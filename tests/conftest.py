@@ -15,15 +15,10 @@ import omegaconf.base
 import pytest
 import torch
 import yaml
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.utils import JobRuntime
-from omegaconf import DictConfig
 
 from torchgco import kernels
 from torchgco.experiments.config import build, checks
-from torchgco.experiments.config.groups import config_dir
 from torchgco.native.compiler import find_compiler
-from torchgco.native.store import trim
 
 ROOT = Path(__file__).parents[1]
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
@@ -31,6 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
 # up to twice as long, with the same bits (tests/native/test_units.py).
 os.environ.setdefault("TORCHGCO_CFLAGS", "-Og")
 torch.set_num_threads(1)
+gc.disable()  # until all tests are collected: what is made on the way stays
 # In the background of a shell Ctrl-C is ignored, also by all processes that tests start and interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -52,38 +48,18 @@ def _parse_once() -> None:
 _parse_once()
 
 
-def _compose_once() -> None:
-    """The tests compose some configurations many times: what conf/ alone decides is composed once, and copied."""
-    slow, slow_load = build.compose_config, ConfigLoaderImpl.load_configuration
-
-    @cache
-    def known(words: tuple[str, ...], folder: str) -> dict[str, Any]:
-        return slow(words)
-
-    def quick(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> dict[str, Any]:
-        return slow(overrides, searchpath) if searchpath else deepcopy(known(tuple(overrides), os.getcwd()))
-
-    loaded: dict[tuple[Any, ...], DictConfig] = {}
-
-    def load(self: ConfigLoaderImpl, config_name: str | None, overrides: list[str], *more: Any, **named: Any) -> Any:
-        """What commands compose; folders of a user's own may change from one to the next."""
-        places = tuple(str(entry.path).removeprefix("file://") for entry in self.config_search_path.get_path())
-        own = {place for place in places if "://" not in place} - {str(config_dir())}
-        if own or any("searchpath" in word for word in overrides):
-            return slow_load(self, config_name, overrides, *more, **named)
-        key = (config_name, JobRuntime().get("name"), places, *overrides, *more, *named.items())
-        if key not in loaded:
-            loaded[key] = slow_load(self, config_name, overrides, *more, **named)
-            trim(loaded, 32)  # of some MB each; a test's commands are much alike
-        config = deepcopy(loaded[key])  # with the interpolations, which are resolved later
-        config.hydra.runtime.cwd = os.getcwd()
-        return config
-
-    build.compose_config, ConfigLoaderImpl.load_configuration = quick, load
-    checks._read = cache(checks._read)
+@cache
+def _known(words: tuple[str, ...], folder: str, slow: Any = build.compose_config) -> dict[str, Any]:
+    return slow(words)
 
 
-_compose_once()
+def _composed(overrides: Sequence[str], searchpath: Sequence[str] = (), slow: Any = build.compose_config) -> Any:
+    """What conf/ alone decides is composed once in a process, and copied."""
+    return slow(overrides, searchpath) if searchpath else deepcopy(_known(tuple(overrides), os.getcwd()))
+
+
+build.compose_config = _composed
+checks._read = cache(checks._read)
 # Without a C compiler PyTorch's kernels solve, many times slower: these folders and files, whose tests are of native
 # kernels or of many solves, are skipped then.
 COMPILED = (
@@ -100,6 +76,7 @@ def pytest_collection_finish() -> None:
     """What is there before the first test stays, and is no garbage to look for: a twentieth of all time."""
     gc.collect()
     gc.freeze()
+    gc.enable()
     gc.set_threshold(20_000, 20, 50)
 
 

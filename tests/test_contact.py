@@ -16,10 +16,14 @@ from tests.engines import compiled
 from torchgco import (
     AugmentedLagrangian,
     ContactWarning,
+    ControlBounds,
     Cost,
+    FunctionDynamics,
+    Goal,
     Planar,
     Problem,
     QuadraticCost,
+    RateBounds,
     Solution,
     Spheres,
     Status,
@@ -62,6 +66,26 @@ def test_no_warning_without_contact() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", ContactWarning)
         torchgco.solve(row_of_discs(thin=()), solver=FAST)
+
+
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
+@pytest.mark.parametrize("kind", ["rates", "horizons", "both"])
+def test_statuses_are_the_judges_along_the_models_own_path(kind: str) -> None:
+    """With limited rates and horizons of their own, too: chords of steps of 0.2 s come closer to discs."""
+    field = lambda x, u: torch.cat((x[..., 2:], u), dim=-1)
+    model = FunctionDynamics(field, 4, 2, 0.2, "rk4", position=slice(0, 2))
+    x0 = torch.zeros(12, 4, dtype=torch.float64)
+    x0[:, 1] = torch.linspace(0.0, 0.3, 12)
+    cost = QuadraticCost([0.1, 0.1, 0, 0], [0.1, 0.1], [50, 50, 5, 5], [1.44, 0, 0, 0])
+    parts = [ControlBounds(-4.0, 4.0), Spheres([[0.72, 0.1]], [0.2], vehicle_radius=0.1)]
+    parts += [RateBounds(-3.0, 3.0)] if kind != "horizons" else []
+    horizon = torch.tensor([12, 10] * 6) if kind != "rates" else None
+    problem = Problem(model, cost, parts, x0, 12, goal=Goal([1.44, 0.0], 0.3), horizon=horizon)
+    found = torchgco.solve(problem, solver="interior_point")
+    verdict = judge(problem, found.U)
+    claims = [status in (Status.CONVERGED, Status.FEASIBLE) for status in found.statuses]
+    assert claims == verdict.feasible.tolist() and any(claims)
+    assert all("Result" in str(found.explain(b)) for b in (0, 1))
 
 
 def test_columns_of_the_judge_come_with_the_problem() -> None:

@@ -122,7 +122,7 @@ def test_no_slow_module_is_loaded_before_it_is_needed() -> None:
         "import sys, torch; sys.modules['casadi'] = None  # whoever imports it gets an ImportError\n"
         "loaded = lambda *names: print([m for m in names if m in sys.modules])\n"
         "import torchgco, torchgco.baselines; from torchgco.tracing import Traced\n"
-        "loaded('hydra', 'matplotlib', 'pandas')\n"
+        "loaded('hydra', 'matplotlib', 'pandas', 'scipy.ndimage', 'scipy.optimize', 'scipy.spatial')\n"
         "for model in (torchgco.QuadrotorPlanning(), torchgco.QuadrotorPlant()):\n"
         "    x, u = torch.zeros(1, model.n), torch.zeros(1, model.m)\n"
         "    Traced('step', lambda i, x, u: model.step(x, u), x, u).fingerprint()\n"
@@ -132,18 +132,6 @@ def test_no_slow_module_is_loaded_before_it_is_needed() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert done.stdout.split() == ["[]"] * 3
-
-
-def test_a_constant_means_one_thing() -> None:
-    """Where two modules need one, they share it; `_SENTENCES` are those of an enumeration, by its members."""
-    found: dict[str, set[str]] = {}
-    for path in MODULES:
-        for node in nodes_of(path)[0].body:  # type: ignore[attr-defined]
-            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-            for name in (part for target in targets if target is not None for part in ast.walk(target)):
-                if isinstance(name, ast.Name) and name.id.isupper() and len(name.id) > 1 and name.id != "_SENTENCES":
-                    found.setdefault(name.id, set()).add(ast.unparse(node.value))  # type: ignore[attr-defined]
-    assert not {name: values for name, values in found.items() if len(values) > 1}
 
 
 def test_instantiate_is_called_in_one_place() -> None:

@@ -32,7 +32,6 @@ from torchgco import (
     Goal,
     InputError,
     Planar,
-    Polish,
     Problem,
     QuadraticCost,
     QuadrotorPlanning,
@@ -220,11 +219,10 @@ CASES: dict[str, list[Callable[[], object]]] = {
     ],
     "problem": [
         lambda: LOCAL.solve(5, None), lambda: solve(5), lambda: judge(5, None), lambda: certify(5, None, None),  # type: ignore
-        lambda: plan_batch(5), lambda: Polish().refine(5, None), lambda: Mission(Planner(LOCAL)).fly(5),  # type: ignore
+        lambda: plan_batch(5), lambda: Mission(Planner(LOCAL)).fly(5),  # type: ignore
         lambda: CasADiSolver().prepare(5),  # type: ignore[arg-type]
     ],
     "solver": [lambda: solve(solved()[0], solver="gco2"), lambda: solve(solved()[0], solver=Restarts)],  # type: ignore
-    "solution": [lambda: Polish().refine(solved()[0], None)],  # type: ignore[arg-type]
     "U0": [lambda: call(U0=[[0.0]]), lambda: call(U0=None), lambda: solve(solved()[0], 5)],  # type: ignore[arg-type]
     "seed": [
         *(lambda s=s: call(seed=s) for s in ("x", -1, nan, None, 1.0, True, 2**70)),

@@ -71,7 +71,7 @@ from torchgco.roadmap import Roadmap
 from torchgco.scenarios import Layouts
 from torchgco.search import MultiStart, PathProposals, Restarts
 from torchgco.solution import Solution
-from torchgco.solvers import ILQR, AugmentedLagrangian, InteriorPoint, LineSearch, Polish, plan_batch
+from torchgco.solvers import ILQR, AugmentedLagrangian, InteriorPoint, LineSearch, plan_batch
 
 if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage as HtmlPage
@@ -89,7 +89,7 @@ __all__ = [  # noqa: RUF022
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
     "solve", "MPC", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets",
-    "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish",
+    "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",

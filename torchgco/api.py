@@ -23,6 +23,7 @@ from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
 from torchgco.kernels import current, open_loop
+from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -99,8 +100,6 @@ def solve(
     solver = _solver(solver, problem, check_value(record, bool, "record"))
     (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
-    if warm is None and (told := short_horizons(problem)) is not None:
-        warnings.warn(told, HorizonWarning, stacklevel=2)
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
     more: dict[str, Any] = {"callback": watcher} if watcher.shows else {}
     try:
@@ -109,7 +108,7 @@ def solve(
     finally:
         watcher.close()
     found = replace(found, account=found.account and found.account.asked(asked, name))
-    _warn_of_contact(problem, found)
+    _warn(problem, found, warm is None)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
@@ -209,8 +208,8 @@ def _checked(warm: Any) -> Solution | None:
 
 def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor | None) -> tuple[Problem, Tensor]:
     """Controls (B, N, m) to begin with, where none are given, and the problem with the guess of its free starts."""
-    if U0 is not None:  # traced once, for the solve and for the warnings after it
-        return (current(problem) if for_solvers(problem) is problem else problem), U0
+    if U0 is not None:
+        return current(problem), U0  # traced once, for the solve and for the warnings after it
     if warm is not None:
         if problem.time is not None:
             problem = guessing_times(problem, warm.t)
@@ -220,17 +219,32 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
         return problem, warm.U
     if problem.B == 0:
         return problem, problem.x0.new_zeros(0, problem.N, problem.m)
+    problem = current(problem)  # traced once, for the guess too
     whole = for_solvers(problem)
-    traced = current(whole)
-    solver.announce(traced)
-    problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
-    return problem, _guess(problem, traced)
+    solver.announce(whole)
+    return problem, _guess(problem, whole)
+
+
+def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
+    """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it."""
+    claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    if cold:
+        _warn_of_horizon(problem, solution, claims)
+    _warn_of_scale(problem, solution, claims)
+    _warn_of_steps(problem, solution, claims)
+    _warn_of_contact(problem, solution)
+
+
+def _warn_of_horizon(problem: Problem, solution: Solution, claims: Tensor) -> None:
+    """A HorizonWarning where no feasible trajectory arrives, as none can."""
+    if not ranks_arrival(problem) or bool((claims & has_arrived(problem, solution.X)).all()):
+        return
+    if (told := short_horizons(problem)) is not None:
+        warnings.warn(told, HorizonWarning, stacklevel=4)
 
 
 def _warn_of_contact(problem: Problem, solution: Solution) -> None:
-    """A ContactWarning at the caller's caller where trajectories keep all rows and are INFEASIBLE between the knots."""
-    _warn_of_scale(problem, solution)
-    _warn_of_steps(problem, solution)
+    """A ContactWarning where trajectories keep all rows and are INFEASIBLE between the knots."""
     touching = touches(problem, solution).nonzero().flatten().tolist()
     if touching:
         named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
@@ -239,13 +253,12 @@ def _warn_of_contact(problem: Problem, solution: Solution) -> None:
             f"while all constraints hold at them: problem {named} (to_frame(problem) has their clearance; "
             "shorter time steps help)",
             ContactWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
-def _warn_of_scale(problem: Problem, solution: Solution) -> None:
+def _warn_of_scale(problem: Problem, solution: Solution, claims: Tensor) -> None:
     """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
-    claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
     rows = (claims & (solution.violation > noise(solution.X, solution.U))).nonzero().flatten()
     if rows.numel() == 0:
         return
@@ -266,9 +279,9 @@ def _warn_of_scale(problem: Problem, solution: Solution) -> None:
         )
 
 
-def _warn_of_steps(problem: Problem, solution: Solution) -> None:
+def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None:
     """A StepWarning where a trajectory that counts as feasible takes steps that are too long for the model."""
-    rows = torch.stack([solution.status == status for status in CLAIMS]).any(0).nonzero().flatten()
+    rows = claims.nonzero().flatten()
     if rows.numel() == 0:
         return
     part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]

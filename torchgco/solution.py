@@ -57,7 +57,7 @@ class Solution:
     violation: Tensor  # (B,): largest violation, metres for lengths
     status: Tensor  # (B,) int64, see Status
     # (B,) int64: iterations of all solves made for the problem: inner solves, candidates that guidance solves, every
-    # start of `multistart`, and the Newton steps of a polish.
+    # start of `multistart`.
     iterations: Tensor
     outer_iterations: Tensor  # (B,) int64: of the outermost solver, over all its starts
     guided: Tensor  # (B,) int64, outer iterations with guidance on

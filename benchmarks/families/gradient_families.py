@@ -20,7 +20,7 @@ from benchmarks.lib.page import filed, markdown
 from torchgco import ControlBounds, InteriorPoint, Problem, QuadraticCost, Solution, StateBounds
 from torchgco.base.differentiability import Differentiability
 from torchgco.problem.problem import current_problem
-from torchgco.sensitivity.form import for_systems
+from torchgco.sensitivity.attach import for_systems
 from torchgco.sensitivity.points import points_of
 
 STEPS = 1e-3, 1e-4, 1e-5, 1e-6

@@ -12,7 +12,7 @@ import torchgco
 from tests.engines import compiled
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from tests.slow import mostly
-from torchgco import Cost, FunctionConstraint, FunctionDynamics, Hold, Polish, Problem, certify, judge
+from torchgco import Cost, FunctionConstraint, FunctionDynamics, Hold, Problem, certify, judge
 from torchgco.base.autodiff import gradients
 
 
@@ -52,19 +52,16 @@ MAKERS = {
 
 
 def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
-    """All results of solve, Polish, judge and certify."""
+    """All results of solve, judge and certify."""
     quick = quick_gco(problem)
     solver = replace(quick, local=replace(quick.local, max_outer_iterations=4))
-    solved, held = torchgco.solve(problem, U0, solver), Hold().solve(problem, U0)
-    solution = Polish(iterations=2).refine(problem, solved)
+    solution, held = torchgco.solve(problem, U0, solver), Hold().solve(problem, U0)
     goal = problem.x0.new_zeros(problem.dynamics.position.stop)
     reports = [certify(problem, s.X, s.U) for s in (solution, held)] + [judge(problem, solution.U, goal, 0.3)]
-    refined = Polish(iterations=1).refine(problem, held)
     return [
         solution.X,
         solution.U,
         solution.K,
-        refined.U,
         *(value for report in reports for value in vars(report).values()),
     ]
 

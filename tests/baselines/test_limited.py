@@ -128,7 +128,9 @@ limited(work, 600.0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a child of a killed process ends with its time")
-@pytest.mark.parametrize("number", mostly([signal.SIGINT, signal.SIGTERM, signal.SIGKILL], signal.SIGTERM))
+@pytest.mark.parametrize(
+    "number", mostly([signal.SIGINT, signal.SIGTERM, signal.SIGKILL], signal.SIGINT, signal.SIGTERM)
+)
 def test_no_process_outlives_its_parent(number: signal.Signals) -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as parent:
         assert parent.stdout is not None

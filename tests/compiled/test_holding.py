@@ -227,3 +227,16 @@ def test_a_period_is_the_limit_of_a_step(monkeypatch: pytest.MonkeyPatch) -> Non
             mpc.step(np.zeros(4)), mpc.step(np.zeros(4)), mpc.step(np.zeros(4), max_seconds=0.5)
             assert seen == [*want, 0.5], (more, again)
             mpc.reset()
+
+
+def test_what_comes_to_rest_is_no_faster_than_states_may_be_and_turns_as_before() -> None:
+    problem = drives(2).started_at(torch.tensor([[0.0, 0, 0, -0.25], [0.0, 0, 0, 0.9]]).double(), drives(2).constraints)
+    U = stopping(problem, None)  # (2, C, N, 2)
+    x, found = problem.x0.unsqueeze(1).expand(-1, U.shape[1], -1), []
+    for k in range(N):
+        x = Unicycle(dt=DT).step(x, U[:, :, k])
+        found.append(x)
+    X = torch.stack(found, 2)
+    assert float(X[..., 3].min()) >= -0.3 - 1e-9 and float(X[..., 3].max()) <= 1.0 + 1e-9
+    turned, back = X[0, :, -1, 2].abs() > 0.5, X[0, :, -1, :2].norm(dim=-1) > 0.15  # at 0.3 m/s, for 0.7 s
+    assert bool((turned & back).any()) and bool((X[1, :, -1, 0] > 0.9).any())

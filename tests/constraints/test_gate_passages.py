@@ -1,4 +1,4 @@
-"""Squares and balls drawn all over the sphere: what is solved passes them all, as counted along its knots by hand."""
+"""Squares and balls drawn all over the sphere: what is solved passes them all, as counted along its way by hand."""
 
 from __future__ import annotations
 
@@ -67,10 +67,15 @@ def sides_of(normal: np.ndarray) -> np.ndarray:
     return np.stack((level, np.cross(normal, level)))
 
 
-def nearest(a: np.ndarray, b: np.ndarray) -> float:
-    """The least distance of 0 from the line between two points."""
+def inside(a: np.ndarray, b: np.ndarray, size: float) -> tuple[float, float] | None:
+    """From where to where the line between two points is within a ball about 0, in shares of it; None: nowhere."""
     along = b - a
-    return float(np.linalg.norm(a + np.clip(-(a @ along) / max(along @ along, 1e-300), 0.0, 1.0) * along))
+    if not along.any():
+        return (0.0, 1.0) if np.linalg.norm(a) <= size else None
+    ends = np.sort_complex(np.roots([along @ along, 2.0 * a @ along, a @ a - size**2]))
+    if abs(ends[0].imag) > 0 or ends[1].real < 0 or ends[0].real > 1:
+        return None
+    return max(0.0, float(ends[0].real)), min(1.0, float(ends[1].real))
 
 
 def passed_by_hand(p: np.ndarray, part: Any, b: int) -> int:
@@ -79,8 +84,8 @@ def passed_by_hand(p: np.ndarray, part: Any, b: int) -> int:
     for g in range(part.centers.shape[1]):
         away, size = p - part.centers[b, g].numpy(), float(part.sizes[b, g]) + TOLERANCE
         if not isinstance(part, GateSquares):
-            near = [nearest(a, c) <= size for a, c in pairwise(away)]
-            times = [float(k) for k in np.flatnonzero(near) if k >= since]
+            ways = [(k, inside(a, c, size)) for k, (a, c) in enumerate(pairwise(away))]
+            times = [max(since, k + way[0]) for k, way in ways if way is not None and k + way[1] >= since]
         else:
             n = part.axes[b, g, 0].numpy()
             s, sides, times, behind = away @ n, sides_of(n), [], False
@@ -150,6 +155,27 @@ def test_the_judge_counts_along_all_knots_in_order(d: int, balls: bool) -> None:
         assert (way.when[b, : counts[b]].diff() >= 0).all() and (way.when[b, counts[b] :] == N + 1).all()
         alone = passes(part.take(torch.tensor([b])), X[b : b + 1])
         assert alone is not None and all(torch.equal(mine[0], all_[b]) for mine, all_ in zip(alone, way, strict=True))
+
+
+def test_gates_are_passed_on_the_path_not_on_its_chords() -> None:
+    """Points whose path is a parabola between few knots, and straight lines between these cross other places."""
+    B, count = 32, 400
+    whole, rng = drawn(B, 2, 1, 11), np.random.default_rng(12)
+    normals = rng.normal(size=(B, 1, 2)).tolist()
+    gates = Gates(whole.constraints[0].centers, normals=normals, half_widths=0.04, knots=[2])
+    model = replace(whole.dynamics, dt=0.5)
+    problem = Problem(model, whole.cost, [gates, ControlBounds(-8.0, 8.0)], whole.x0, 6, whole.goal)
+    found = torchgco.solve(problem, solver="interior_point", verbose=False)
+    part, p, v, a = problem.constraints[0], found.X[:, :-1, None, :2], found.X[:, :-1, None, 2:], found.U[:, :, None]
+    t = torch.arange(count, dtype=D).view(-1, 1) * (0.5 / count)
+    dense = torch.cat(((p + t * v + 0.5 * t.square() * a).flatten(1, 2), found.X[:, -1:, :2]), dim=1)
+    counts = [passed_by_hand(dense[b].numpy(), part, b) for b in range(B)]
+    chords = [passed_by_hand(found.X[b, :, :2].numpy(), part, b) for b in range(B)]
+    assert judge(problem, found.U).gates_passed.tolist() == counts and sum(counts) < sum(chords)
+    solved = np.isin(found.status.numpy(), [int(s) for s in SOLVED])
+    assert solved.any() and (np.array(counts)[solved] == 1).all()
+    missed = next(b for b in range(B) if counts[b] < chords[b])
+    assert "gate 1 of 1 isn't passed" in " ".join(found.explain(missed).split())
 
 
 def test_touching_a_plane_and_going_back_is_no_passage() -> None:

@@ -17,6 +17,7 @@ from torchgco import (
     ContactWarning,
     ControlBounds,
     FunctionDynamics,
+    Goal,
     InputError,
     InteriorPoint,
     Problem,
@@ -183,6 +184,19 @@ def test_a_touch_between_knots_is_mended_or_warned_of() -> None:
         mended = torchgco.solve(problem)
     assert mended.statuses == [Status.CONVERGED] and float(chord_clearance(problem, mended.X)) >= 0
     assert mended.to_frame(problem).clearance.min() >= 0
+
+
+@pytest.mark.parametrize("required", [False, True])
+def test_two_that_change_places_head_on_pass_each_other(required: bool) -> None:
+    """Exactly on one line, all that stays on it jumps over the other between two knots."""
+    field = lambda x, u: torch.cat((x[..., 4:], u), dim=-1)
+    model = FunctionDynamics(field, 8, 4, 0.4, "rk4", position=slice(0, 2))
+    x0 = torch.tensor([[0.0, y, 4, 0, 0, 0, 0, 0] for y in (0.0, 0.2)], dtype=D)
+    cost = QuadraticCost([0.1] * 4 + [0] * 4, [0.1] * 4, [50] * 4 + [5] * 4, [4, 0, 0, 0, 0, 0, 0, 0])
+    goal = Goal([4.0, 0.0], 0.3, required=required)
+    problem = Problem(model, cost, [ControlBounds(-4, 4), Separation([[0, 1], [2, 3]], 0.3)], x0, 13, goal=goal)
+    found = torchgco.solve(problem)
+    assert bool(judge(problem, found.U).reached.all()) and float(found.cost[0]) < 1.2 * float(found.cost[1])
 
 
 def test_bodies_that_touch_at_the_start_are_no_valid_start() -> None:

@@ -3,7 +3,6 @@
 import sys
 
 import pytest
-from hydra._internal.hydra import Hydra
 
 from torchgco.experiments import app
 from torchgco.experiments.flying import study
@@ -13,9 +12,6 @@ from torchgco.experiments.results.folder import StudyFolder
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
     """Run torchgco in this process, quicker than in a new one: returns (exit code, stdout, stderr)."""
-
-    # Hydra composes all once more to read hydra.mode, which nobody sets here; None is what it finds.
-    monkeypatch.setattr(Hydra, "get_mode", lambda self, config_name, overrides: None)
 
     def call(*words: str) -> tuple[int, str, str]:
         monkeypatch.chdir(tmp_path)

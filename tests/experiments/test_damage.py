@@ -68,7 +68,7 @@ def same(one: tuple[pd.DataFrame, bytes], other: tuple[pd.DataFrame, bytes]) -> 
 
 
 @pytest.mark.usefixtures("without_report")
-@pytest.mark.parametrize("damage", mostly(DAMAGE, "empty", "text"))
+@pytest.mark.parametrize("damage", mostly(DAMAGE, "empty", "text", "cut"))
 @pytest.mark.parametrize("name", FINISHED)
 def test_a_damaged_file_of_a_finished_study_is_named_and_repaired(name: str, damage: str, run, out) -> None:
     before = results(out)

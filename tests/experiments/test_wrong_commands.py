@@ -35,6 +35,11 @@ WRONG = {
     "baselines": (["study.baselines=3"], "study.baselines: expected a list of solver names, such as [al_ilqr], got 3"),
     "a dict of baselines": (["study.baselines={a:1}"], "study.baselines: "),
     "an unknown baseline": (["study.baselines=[nope]"], "study.baselines: expected one of al_ilqr, fatrop"),
+    "a solver of a fixed time": (["scenario=gates"], "solver: expected interior_point, gco, gco_exact, ipopt or"),
+    "a baseline of a fixed time": (
+        ["scenario=gates", "solver=interior_point", "study.baselines=[al_ilqr]"],
+        "study.baselines: expected interior_point, gco, gco_exact, ipopt or fatrop",
+    ),
     "its own name": (["solver.name=mine", "study.baselines=[mine]"], "study.baselines: expected one of al_ilqr"),
     "threads": (["device.threads=100000"], "device.threads: expected a whole number between 1 and 1024, or null"),
     "layouts": (["study.layouts=abc"], "study.layouts: expected a whole number of at least 1, got 'abc'"),

@@ -251,7 +251,7 @@ def test_a_row_without_a_slope_ends_infeasible_and_is_named() -> None:
     jump = FunctionConstraint(lambda x: (x[..., :1] > 0).to(x.dtype) - 0.5, knots=[-1])
     steep = FunctionConstraint(lambda x: 50.0 - x[..., :1].relu(), knots=[-1])
     for row, is_flat in ((jump, True), (steep, False)):
-        found = torchgco.solve(Problem(cart, cost, [ControlBounds(-3, 3), row], [[0.5, -0.3], [0.8, 0.2]], 20))
+        found = torchgco.solve(Problem(cart, cost, [ControlBounds(-3, 3), row], [[0.5, 0.3], [0.8, 0.2]], 20))
         assert all(status is Status.INFEASIBLE for status in found.statuses)
         told = str(found.explain(1))
         assert ("have no slope" in told and "change smoothly" in told) == is_flat

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.outside.golden import IPOPT, main
+from benchmarks.outside.golden import FINE, IPOPT, main
 from benchmarks.outside.golden_problems import GOLDEN
-from torchgco import Polish, Problem, Solution, Status, certify
+from torchgco import Problem, Solution, Status, certify, solve
 from torchgco.dynamics.rollout import open_loop
 
 # IPOPT's costs from the published starts, the least of several initial guesses (escape: from the solution found here).
@@ -26,7 +26,7 @@ CONTINUED = replace(IPOPT, options={**(IPOPT.options or {}), **NEAR})
 
 def solved(name: str, starts: int) -> tuple[Problem, Solution]:
     problem, U0 = GOLDEN[name].batch(starts)
-    return problem, Polish().refine(problem, GOLDEN[name].solve(problem, U0))
+    return problem, solve(problem, solver=FINE, warm=GOLDEN[name].solve(problem, U0))
 
 
 def assert_solved(problem: Problem, solution: Solution) -> None:
@@ -63,5 +63,5 @@ def test_eight_starts_and_the_costs_of_ipopt(name: str) -> None:
 def test_the_table(capsys) -> None:
     assert main(["--problems", "pendulum", "--starts", "2"]) == 0
     lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    assert [line[2] for line in lines] == ["default", "default, polished", "IPOPT"]
+    assert [line[2] for line in lines] == ["default", "default, refined", "IPOPT"]
     assert lines[1][3] == "2 of 2" and float(lines[1][5]) < 1e-6

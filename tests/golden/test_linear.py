@@ -8,8 +8,9 @@ import pytest
 import torch
 
 import torchgco
+from benchmarks.outside.golden import FINE
 from tests.golden.linear import LinearQuadratic, saddle
-from torchgco import Constraint, ControlBounds, FunctionConstraint, Polish, Solution, StateBounds, Status, certify
+from torchgco import Constraint, ControlBounds, FunctionConstraint, Solution, StateBounds, Status, certify
 from torchgco.dynamics.rollout import open_loop
 
 SIZES = [(1, 1, 1), (4, 2, 13)]  # n, m, N
@@ -19,7 +20,7 @@ CASES = SIZES + [pytest.param(*size, marks=pytest.mark.slow) for size in MORE]
 
 def solved(lq: LinearQuadratic, constraints: list[Constraint]) -> tuple[torchgco.Problem, Solution]:
     problem = lq.problem(constraints)
-    return problem, Polish().refine(problem, torchgco.solve(problem))
+    return problem, torchgco.solve(problem, solver=FINE, warm=torchgco.solve(problem))
 
 
 def goal_of(lq: LinearQuadratic) -> FunctionConstraint:

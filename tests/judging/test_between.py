@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,20 @@ from torch import Tensor
 
 import torchgco
 from tests.engines import compiled
-from torchgco import ControlBounds, FreeTime, FunctionDynamics, Goal, Problem, QuadraticCost, Spheres, Status
+from torchgco import (
+    ControlBounds,
+    FreeTime,
+    FunctionDynamics,
+    Goal,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+    Spheres,
+    Status,
+)
+from torchgco.kernels import open_loop, path_clearance
 from torchgco.maps import Field, OccupancyGrid
+from torchgco.problem.horizons import for_solvers
 
 DOUBLE = torch.float64
 CLAIMS = Status.CONVERGED, Status.FEASIBLE
@@ -40,7 +53,7 @@ def scene(seed: int, B: int = 4, dt: float = 0.3, N: int = 16, speed: float = 0.
     )
 
 
-def dense_clearance(problem: Problem, U: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def dense_clearance(problem: Problem, U: np.ndarray, lengths: Any) -> np.ndarray:
     """The smallest distance to contact (B,) on `POINTS` points of each stage, in closed form."""
     discs = problem.constraints[0]
     least = np.full(problem.B, np.inf)
@@ -67,6 +80,22 @@ def test_clearance_is_that_of_the_path(speed: float) -> None:
         exact = dense_clearance(problem, U.numpy(), np.full((4, 16), 0.3))
         off.append(np.abs(found - exact).max())
     assert max(off) < 1.1e-3, off
+
+
+@pytest.mark.parametrize("speed", [0.0, SPEED])
+def test_clearance_in_the_form_for_solvers_is_that_of_the_path(speed: float) -> None:
+    """How deep it is, of horizons that differ and of bounded rates, which make states of the controls before."""
+    ends, off, touching = [6, 9, 12, 16], [], 0
+    for seed in range(4):
+        given = scene(seed, speed=speed)
+        parts = [given.constraints[0], RateBounds(-9.0, 9.0)]
+        problem = for_solvers(replace(given, constraints=parts, horizon=ends))
+        U = 6.0 * torch.as_tensor(np.random.default_rng(seed + 100).uniform(-1, 1, (4, 16, 2)))
+        found = path_clearance(problem, open_loop(problem, U), U).numpy()
+        exact = dense_clearance(given, U.numpy(), [[0.3] * end for end in ends])
+        off.append(np.abs(found.clip(max=0.0) - exact.clip(max=0.0)).max())
+        touching += int((exact < 0).sum())
+    assert max(off) < 1.1e-3 and touching > 2, off
 
 
 @compiled

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey, words
 from torchgco.native.codegen.dynamics import JACOBIAN, STEP_FUNCTION, DynamicsSource
-from torchgco.native.codegen.emit import PRELUDE, SHARED_AT
-from torchgco.native.codegen.source import C
+from torchgco.native.codegen.emit import SHARED_AT
 from torchgco.native.compiler import build
-from torchgco.native.declarations import head
-from torchgco.native.structures import CONSTANTS
+from torchgco.native.declarations import defines
+from torchgco.native.includes import included, joined
+from torchgco.native.structures import constants
 
 LANES = 8
 
@@ -42,8 +42,8 @@ class Emitted:
         copies += [f"{name}({', '.join(passed)});"]
         copies += [f"memcpy(a{i}, v{i}, sizeof v{i});" for i in range(len(inputs), len(sizes))]
         driver = f"#include <string.h>\nvoid tgco_run({given}) {{ {local} {' '.join(copies)} }}\n"
-        header = f"#define REAL {real}\n#define LANES {lanes}\n"
-        self._run = build(header + PRELUDE + code + driver).tgco_run
+        header = defines({"REAL": real, "LANES": lanes}) + included("functions.h")
+        self._run = build(joined(header + code) + driver).tgco_run
         self._dtype, self._lanes = np.dtype(real.replace("float", "f4")), lanes
         self._outputs, self._sizes, self._shared = outputs, sizes, shared
 
@@ -67,9 +67,7 @@ class Emitted:
 
 def drawn(key: DrawKey, rows: int, samples: int, stream: int = 0) -> Tensor:
     """Standard normal draws (rows, B, samples), float64, of the native sampler."""
-    code = (
-        (C / "normal.c").read_text()
-        + """
+    code = """
 void tgco_draw(uint64_t key, int64_t samples, int64_t rows, double *z) {
     V block[rows];
     for (int64_t first = 0; first < samples; first += LANES) {
@@ -79,8 +77,8 @@ void tgco_draw(uint64_t key, int64_t samples, int64_t rows, double *z) {
     }
 }
 """
-    )
-    library = build(head([], [], {"REAL": "double", "LANES": LANES, **CONSTANTS}) + PRELUDE + code)
+    header = defines({"REAL": "double", "LANES": LANES}) + included("normal.h")
+    library = build(joined(header, given={"constants.h": constants()}) + code)
     made = torch.empty(key.ids.numel(), rows, samples, dtype=torch.float64)
     for z, word in zip(made, words(key, stream).tolist(), strict=True):
         library.tgco_draw(*(ctypes.c_int64(number) for number in (word, samples, rows)), ctypes.c_void_p(z.data_ptr()))

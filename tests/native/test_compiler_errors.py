@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.native.test_compiler import needs_compiler, next_process, source
-from torchgco.native import compiler, store
-from torchgco.native.compiler import NativeError, Unit, build, find_compiler
-from torchgco.native.declarations import Structure, fields, head, load
+from tests.native.test_compiler import needs_compiler
+from torchgco.native.compiler import NativeError, build
 
 pytestmark = pytest.mark.usefixtures("cache")
 
@@ -60,19 +58,3 @@ def test_errors_are_the_compilers_own(cache: Path) -> None:
         build("no_such_type tgco_times;")
     assert len(str(caught.value).splitlines()) <= 6
     assert not cache.exists()
-
-
-@needs_compiler
-def test_a_library_without_our_names_is_an_error_of_its_own(cache: Path) -> None:
-    class Half(Structure):
-        declared = (("double", "x"),)
-        _fields_ = fields(declared)
-
-    text = head([Half], [], {})
-    key = compiler._key(find_compiler(), [Unit(text, own=True)], (*find_compiler().flags, *find_compiler().further))
-    build(source(2))
-    (other,) = cache.iterdir()
-    store.save(key, ".so", other.read_bytes())
-    next_process()
-    with pytest.raises(NativeError, match="isn't compiled from this source: it has no Half"):
-        load(text, [Half])

@@ -90,8 +90,8 @@ SPEED = [FunctionConstraint(lambda x: x[..., 2:3] - 1.0)]
     ("base", "change"),
     [
         (BASE, {"dynamics": Boat(drag=3.0)}),
-        (BASE, {"dynamics": Boat(dt=0.2)}),
-        (BASE, {"dynamics": Boat(integrator="euler")}),
+        pytest.param(BASE, {"dynamics": Boat(dt=0.2)}, marks=pytest.mark.slow),
+        pytest.param(BASE, {"dynamics": Boat(integrator="euler")}, marks=pytest.mark.slow),
         (BASE, {"dynamics": FunctionDynamics(lambda x, u: field(x, u.flip(-1)), 4, 2, 0.1, position=slice(0, 2))}),
         (BASE, {"cost": replace(WEIGHTS, Q=[[2, 1, 0, 0], [1, 2, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])}),
         (BASE, {"cost": Toward(2.0)}),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import astuple, replace
+from dataclasses import replace
 from enum import IntEnum
+from pathlib import Path
 
 import pytest
 import torch
@@ -19,6 +21,7 @@ from tests.slow import mostly
 from torchgco import ILQR, MPPI, LineSearch, Problem, kernels
 from torchgco.base.draws import DrawKey
 from torchgco.base.status import Status
+from torchgco.exploration.sensing.library import C_FOLDER as SENSING
 from torchgco.guidance import mppi
 from torchgco.ilqr import descent, lifted
 from torchgco.ilqr.lifted import lifted_search
@@ -27,11 +30,13 @@ from torchgco.kernels import kernels_of
 from torchgco.kernels.in_c import native_options
 from torchgco.lagrangian.state import State
 from torchgco.native import structures
-from torchgco.native.codegen.source import INTERIOR, LANES, SAMPLER, SOLVER_LIBRARY, C
+from torchgco.native.codegen.source import INTERIOR, LANES, SAMPLER, SOLVER_LIBRARY
 from torchgco.native.compiler import NativeError, build, find_compiler
-from torchgco.native.declarations import Structure, defines, fields, head, load
-from torchgco.native.structures import CONSTANTS, STRUCTURES, End, Options
+from torchgco.native.declarations import Header, Structure, defines, enumerations
+from torchgco.native.includes import C, included, joined
+from torchgco.native.structures import CONSTANTS, End, Options
 from torchgco.roadmap import native as roadmap
+from torchgco.roadmap import native_maps
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 
@@ -44,16 +49,27 @@ def native_again() -> Iterator[None]:
     kernels.use_native(True)
 
 
-class Pair(Structure):
-    """Two numbers and where others lie."""
+PAIR = """
+typedef struct {
+    int32_t count; /* of the others; not double first; */
+    double first, bounds[TWO];
+    const double *others;
+} Pair;
+"""
 
-    declared = (("int32_t", "count"), ("double", "first"), ("const double *", "others"))
-    _fields_ = fields(declared)
+
+def pair_of(text: str) -> tuple[Header, type[Structure]]:
+    class Pair(Structure):
+        """Numbers and where others lie."""
+
+    header = Header(text, {"TWO": 2})
+    header.declare(Pair)
+    return header, Pair
 
 
 SUM = """
 double tgco_sum(const Pair *pair) {
-    double sum = pair->first;
+    double sum = pair->first + pair->bounds[1];
     for (int i = 0; i < pair->count; i++) sum += FACTOR * pair->others[i];
     return sum;
 }
@@ -61,41 +77,53 @@ double tgco_sum(const Pair *pair) {
 
 
 def test_a_structure_of_another_size_is_refused() -> None:
-    source = head([Pair], [], {"FACTOR": 3.0}) + SUM
-    library = load(source, [Pair])
+    (header, Pair), source = pair_of(PAIR), "#include <stdint.h>\n" + defines({"TWO": 2, "FACTOR": 3.0}) + PAIR + SUM
+    library = build(source + header.layout)
     library.tgco_sum.restype = ctypes.c_double
-    others = torch.tensor([1.0, 2.0], dtype=torch.float64)
-    assert library.tgco_sum(ctypes.byref(Pair(count=2, first=0.5, others=others))) == 9.5
-
-    class Longer(Structure):
-        declared = (*Pair.declared, ("int32_t", "one_more"))
-        _fields_ = fields(declared)
-
-    Longer.__name__ = "Pair"
-    with pytest.raises(NativeError, match="Pair has 32 bytes in Python, 24 in the library"):
-        load(source, [Longer])
+    others, bounds = torch.tensor([1.0, 2.0], dtype=torch.float64), (ctypes.c_double * 2)(5.0, 7.0)
+    assert library.tgco_sum(ctypes.byref(Pair(count=2, first=0.5, others=others, bounds=bounds))) == 16.5
+    longer, _ = pair_of(PAIR.replace("} Pair", "    int32_t one_more;\n} Pair"))
+    with pytest.raises(NativeError, match="Pair has another size in Python"):
+        build(source + longer.layout)
 
 
-@pytest.mark.parametrize("structure", [*STRUCTURES, roadmap.Arguments], ids=lambda s: s.__name__)
-def test_the_size_of_each_structure_is_compared(structure: type[Structure], monkeypatch) -> None:
-    """A library that reports one byte more or less is refused where the kernels are loaded."""
-    problem = boxed_batch(2, B=1, N=3)[0]
-    plain = ctypes.sizeof
-    for wrong in (-1, 1):
-        monkeypatch.setattr(ctypes, "sizeof", lambda s: plain(s) + (wrong if s is structure else 0))  # noqa: B023
-        with pytest.raises(NativeError, match=f"{structure.__name__} has"):
-            if structure is roadmap.Arguments:
-                load(head([structure], [], {}), [structure])
-            else:
-                load(head(STRUCTURES, [], CONSTANTS), STRUCTURES)
-        monkeypatch.setattr(ctypes, "sizeof", plain)
-    assert engine_of(problem) is not None
+@pytest.mark.parametrize(
+    ("folder", "name", "header"),
+    [(C, "structures.h", structures.HEADER), (roadmap.C, "search.h", roadmap.SEARCH_HEADER),
+     (roadmap.C, "lattice.h", native_maps.LATTICE_HEADER)],
+)  # fmt: skip
+def test_each_field_lies_where_python_writes_it(folder: Path, name: str, header: Header) -> None:
+    fields = [(kind, field) for kind in header.made.values() for field in kind.declared]
+    places = ", ".join(f"offsetof({kind.__name__}, {field})" for kind, field in fields)
+    code = f"int64_t tgco_place(int i) {{ static const int64_t all[] = {{{places}}}; return all[i]; }}"
+    text = joined("#include <stddef.h>\n" + included(name), folder, {"constants.h": structures.constants()})
+    place = build(text + header.layout + code).tgco_place
+    assert [place(i) for i in range(len(fields))] == [getattr(kind, field).offset for kind, field in fields]
+    assert set(header.made) == set(header._fields)
+
+
+@pytest.mark.parametrize(
+    ("folder", "flags"),
+    [(C, []), (C, ["-UDIM", "-DDIM=0"]), (roadmap.C, []), (roadmap.C, ["-UBOXES", "-DBOXES=0"]), (SENSING, [])],
+)  # fmt: skip
+def test_every_file_of_c_compiles_by_itself(folder: Path, flags: list[str]) -> None:
+    """With the flags that editors read, and others that problems have. Where sizes are known, no array has another."""
+    flags = [*(folder / "compile_flags.txt").read_text().split(), *flags]
+    flags += ["-Werror=implicit-function-declaration", "-Werror=vla", "-Wno-psabi", "-fsyntax-only", "-x", "c"]
+    files = sorted(path.name for path in folder.glob("*.[ch]"))
+    subprocess.run([*find_compiler().command, *flags, *files], cwd=folder, check=True)
+
+
+def test_an_editor_sees_the_constants_of_python() -> None:
+    """Where this fails: write `constants()` there."""
+    assert (C / "editor" / "constants.h").read_text() == structures.constants()
 
 
 def test_no_value_is_lost_by_a_wrong_name_or_type() -> None:
+    _, Pair = pair_of(PAIR)
     with pytest.raises(AttributeError, match="Pair has no field forst"):
         Pair(forst=1.0)
-    with pytest.raises(TypeError, match=r"Pair lacks first, others"):
+    with pytest.raises(TypeError, match=r"Pair lacks bounds, first, others"):
         Pair.complete(count=1)
     for wrong in (torch.zeros(2), torch.zeros(2, dtype=torch.int64), torch.zeros(4, dtype=torch.float64)[::2]):
         with pytest.raises(TypeError, match=r"others: expected a contiguous tensor of torch.float64"):
@@ -119,22 +147,17 @@ def test_a_constant_changes_what_is_compiled(name: str, monkeypatch) -> None:
             patch.setitem(CONSTANTS, name, 7)
             changed = engine.form._written(library, vectors)
         for now, before in zip(changed, usual, strict=True):
-            own = f"#define {name} {written(name)}\n"
+            own = defines({name: CONSTANTS[name]})
             assert now.source == before.source.replace(own, f"#define {name} 7\n") != before.source
-    files = {file for library in (SOLVER_LIBRARY, SAMPLER, INTERIOR) for part in astuple(library) for file in part}
-    assert any(name in (C / file).read_text() for file in files), "no line of C uses it"
+    assert any(name in path.read_text() for path in C.glob("*.[ch]")), "no line of C uses it"
 
 
-def written(name: str) -> str:
-    return defines({name: CONSTANTS[name]}).split()[-1]
-
-
-@pytest.mark.parametrize("kind", [*structures.ENUMERATIONS, structures.Quadratic, structures.TracedCost])
+@pytest.mark.parametrize("kind", structures.ENUMERATIONS)
 def test_an_enumeration_has_the_values_of_python(kind: type[IntEnum]) -> None:
     name = kind.__name__.lower()
     values = ", ".join(member.name for member in kind)
     code = f"int tgco_{name}(int i) {{ static const int all[] = {{{values}}}; return all[i]; }}"
-    function = getattr(build(head([], [kind], {}) + code), f"tgco_{name}")
+    function = getattr(build(enumerations([kind]) + code), f"tgco_{name}")
     assert [function(i) for i in range(len(kind))] == [member.value for member in kind]
 
 
@@ -249,7 +272,7 @@ def test_every_option_reaches_the_library() -> None:
         "regularisation_max": descent.REGULARISATION_MAX, "damping": descent.DAMPING,
         "damping_growth": descent.DAMPING_GROWTH, "damping_decay": descent.DAMPING_DECAY,
     }  # fmt: skip
-    assert {name: getattr(options, name) for name in Options.kinds if name != "ladder"} == want
+    assert {name: getattr(options, name) for name in Options.declared if name != "ladder"} == want
     ladder = (ctypes.c_double * options.rungs).from_address(options.ladder)
     assert list(ladder) == search.ladder(False)
     printed = native_options(replace(inner, as_printed=True).descent)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tests.native.lanes import Emitted
+from tests.slow import mostly
 from torchgco.native.codegen.emit import emit, literal
 from torchgco.native.compiler import find_compiler
 from torchgco.tracing.operations import to_single
@@ -127,7 +128,7 @@ def test_single_precision(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*EXACT, *CLOSE])
-@pytest.mark.parametrize("lanes", [1, 4, 16])
+@pytest.mark.parametrize("lanes", mostly([1, 4, 16], 1))
 def test_lanes_do_not_affect_each_other(name: str, lanes: int) -> None:
     function, emitted = functions(name)
     code, size = emit("tgco_made", function), function.numel_out()
@@ -163,4 +164,4 @@ def test_unsupported_operations_are_named() -> None:
 def test_literals() -> None:
     for value in (0.1, -3.0, 1e-310, 0.0, -0.0):
         assert float.fromhex(literal(value)).hex() == value.hex()
-    assert [literal(v) for v in (inf, -inf, nan)] == ["__builtin_inf()", "-__builtin_inf()", '__builtin_nan("")']
+    assert [literal(v) for v in (inf, -inf, nan)] == ["INFINITY", "-INFINITY", "NAN"]

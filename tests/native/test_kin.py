@@ -10,8 +10,8 @@ import torch
 
 from torchgco import FunctionConstraint, FunctionDynamics, Problem, QuadraticCost
 from torchgco.native import compiler, engine, interior, store
-from torchgco.native.codegen.emit import PRELUDE
 from torchgco.native.compiler import build, find_compiler
+from torchgco.native.includes import joined
 
 pytestmark = pytest.mark.usefixtures("cache")
 
@@ -35,12 +35,12 @@ def test_a_kin_displaces_its_own_oldest_files(cache: Path, monkeypatch) -> None:
 def test_models_that_differ_in_numbers_alone_are_of_one_kin(cache: Path, monkeypatch) -> None:
     """As those of a loop that trains: all files of a solve, the generated ones and the libraries."""
     found, keys = find_compiler(), []
-    monkeypatch.setattr(engine, "load", lambda source, *_: keys.append(compiler._key(found, source, ())))
+    monkeypatch.setattr(engine, "build", lambda source, *_: keys.append(compiler._key(found, source, ())))
     for factor in (0.25, -1.5e-3, 3e5):
         model = FunctionDynamics(lambda x, u, f=factor: f * u.expand_as(x) + x * WEIGHTS * f, 2, 1, 0.1)
         rows = FunctionConstraint(lambda x, f=factor: f * x[..., :1] - 1.0)
         problem = Problem(model, QuadraticCost([1, 1], [1], [1, 1]), [rows], [[0.1, 0.2]], 5)
-        interior.InteriorEngine(engine.Engine(problem), 8)
+        interior.InteriorEngine(engine.Engine(problem))
     assert len(set(keys)) == 6
     kinds = Counter(key[:8] for key in (*keys, *(path.name for path in cache.iterdir())))
     assert len(kinds) == 6 and set(kinds.values()) == {3}
@@ -49,20 +49,20 @@ def test_models_that_differ_in_numbers_alone_are_of_one_kin(cache: Path, monkeyp
 SINES = """
 #define REAL double
 #define LANES 4
-{prelude}
-void tgco_both(const double *x, double *y) {{
+#include "functions.h"
+void tgco_both(const double *x, double *y) {
     V v, s, t;
     for (int i = 0; i < LANES; i++) v[i] = x[i];
     s = tgco_sin(v), t = tgco_exp(v) * s + v;
     for (int i = 0; i < LANES; i++) y[i] = s[i], y[LANES + i] = t[i];
-}}
+}
 """
 
 
 @needs_compiler
 def test_levels_of_optimisation_have_the_same_bits(monkeypatch) -> None:
     monkeypatch.delenv("TORCHGCO_CFLAGS", raising=False)
-    x, source = torch.linspace(-3.0, 3.0, 400, dtype=torch.float64), SINES.format(prelude=PRELUDE)
+    x, source = torch.linspace(-3.0, 3.0, 400, dtype=torch.float64), joined(SINES)
     found = []
     for level in ("-Og", "-O1", "-O3"):
         both, y = build(source, (level,)).tgco_both, torch.empty(100, 8, dtype=torch.float64)

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.native.test_compiler import needs_compiler, next_process, source, times
-from torchgco.native import compiler, store
+from torchgco.base.memory import trim
+from torchgco.native import compiler
 from torchgco.native.compiler import build
 
 pytestmark = pytest.mark.usefixtures("cache")
@@ -80,9 +81,9 @@ def test_libraries_that_nobody_uses_any_more_are_closed(monkeypatch) -> None:
 
 def test_the_first_entries_are_dropped() -> None:
     kept = {name: size for size, name in enumerate("abcdef")}
-    store.trim(kept, 4)
+    trim(kept, 4)
     assert list(kept) == ["c", "d", "e", "f"]
-    store.trim(kept, 4, 9.0, float)
+    trim(kept, 4, 9.0, float)
     assert list(kept) == ["e", "f"]
-    store.trim(kept, 4, 1.0, float)
+    trim(kept, 4, 1.0, float)
     assert list(kept) == ["f"]  # the last one stays, however large

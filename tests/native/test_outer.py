@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tests.problems import planar_batch, quadrotor_batch
 from tests.search.test_finish import brachistochrone, bryson_denham, parking
+from tests.slow import mostly
 from torchgco import ILQR, AugmentedLagrangian, Boxes, Problem, Spheres, StateBounds, presets
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.kernels import chord_clearance, kernels_of, measured, open_loop
@@ -76,7 +77,7 @@ def both(monkeypatch: pytest.MonkeyPatch, solve: Callable[[], SolveEnd]) -> tupl
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.parametrize("stops", [False, True])
+@pytest.mark.parametrize("stops", mostly([False, True], True))
 def test_both_loops_agree(name: str, solver: str, stops: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, U0 = PROBLEMS[name]()
     guidance = StopWhenCaught(3) if stops else None

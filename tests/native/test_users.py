@@ -41,7 +41,7 @@ def blocks(slopes: Tensor, curvatures: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("unit", mostly([False, True], True), ids=["as it is", "in cost units"])
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", mostly(PROBLEMS, *list(PROBLEMS)[1::2]))
 def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> None:
     problem = PROBLEMS[name]()
     problem = problem.in_cost_units() if unit else problem

@@ -114,7 +114,7 @@ def test_marks_tell_how_flights_end() -> None:
 
 def test_contact_is_marked_where_it_is_deepest_and_the_goal_stays_on_top() -> None:
     layouts = plane(centers=np.array([[[0.52, 0.5], [0.9, 1.02]]] * 3), radii=np.full((3, 2), 0.1))
-    figure = layout_grid(layouts, {"mine": straight()}, ENDS)
+    figure = layout_grid(layouts, {"mine": straight()}, trials(*flights("mine", [False] * 3)))
     for ax in figure.axes[::2]:
         (first, second) = marks(ax)["contact"]
         half = 0.5 / (4 * BETWEEN)  # of a piece: four stages from 0 to 1

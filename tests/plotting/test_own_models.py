@@ -1,30 +1,52 @@
 """What a study draws is what was judged, whether a number stands in the layouts or in the vehicle."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 import torchgco
 from tests.trials import flights, trials
-from torchgco.dynamics import Unicycle
+from torchgco.dynamics import Dynamics, Unicycle
 from torchgco.experiments.reports import report
-from torchgco.plotting.layouts import layout_grid
-from torchgco.plotting.scene import contacts, scene_of
+from torchgco.plotting.layouts import flights_of, layout_grid
+from torchgco.plotting.scene import scene_of
 from torchgco.plotting.study_figure import study_figure
-from torchgco.scenarios import Layouts, Vehicle
+from torchgco.scenarios import Layouts, Task, Vehicle
 
 L = 6
 NUMBERS = ("start", "goal", "vehicle_radius", "goal_radius", "dt", "stages")
 
 
+@dataclass(frozen=True)
+class Backwards(Dynamics):
+    """A point whose state begins with its velocity."""
+
+    n, m, integrator, position = 4, 2, "rk4", slice(2, 4)
+    dt: float = 0.1
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((u, x[..., :2]), dim=-1)
+
+
+class Elsewhere(Vehicle):
+    """One whose problems begin and end elsewhere than layouts say."""
+
+    def task(self, layouts: Layouts, *where: Any) -> Task:
+        task = super().task(layouts, *where)
+        return replace(task, problem=replace(task.problem, x0=task.problem.x0 + 0.5), goal=task.goal - 1.5)
+
+
 def drawn(seed: int) -> tuple[Vehicle, Layouts]:
     """A vehicle with numbers of its own, and discs, one of which moves; the layouts have some of the numbers."""
     rng = np.random.default_rng(seed)
-    vehicle = Vehicle(
-        name="own", dynamics=Unicycle(dt=rng.uniform(0.05, 0.3)), state_weight=[1] * 4, control_weight=[1, 1],
+    kind, model = (Vehicle, Unicycle) if seed % 2 == 0 else (Elsewhere, Backwards)
+    vehicle = kind(
+        name="own", dynamics=model(dt=rng.uniform(0.05, 0.3)), state_weight=[1] * 4, control_weight=[1, 1],
         terminal_weight=[1] * 4, control_reference=[0, 0], control_lower=[-2, -2], control_upper=[2, 2],
         start=rng.uniform(-1, 1, 4).tolist(), goal=rng.uniform(4, 6, 4).tolist(), radius=rng.uniform(0.1, 0.5),
         goal_radius=rng.uniform(0.2, 1), stages=int(rng.integers(10, 20)),
@@ -54,14 +76,14 @@ def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: p
 
     layouts.save(tmp_path / "layouts.npz")
     rows = flights("gco", verdict.reached.tolist())
-    trials(*(row | {"feasible": ok} for row, ok in zip(rows, verdict.feasible.tolist(), strict=True))).to_parquet(
-        tmp_path / "trials.parquet", index=False
-    )
+    table = trials(*(row | {"feasible": ok} for row, ok in zip(rows, verdict.feasible.tolist(), strict=True)))
+    table.to_parquet(tmp_path / "trials.parquet", index=False)
     np.savez(tmp_path / "solutions.npz", U=U.numpy()[None], solver=np.array(["gco"]))
     shown = []
     for name, draw in (("layout_grid", layout_grid), ("study_figure", study_figure)):
+
         def keep(arrays: Any, *words: Any, draw: Any = draw, **more: Any) -> Any:
-            shown.append((scene_of(arrays), draw(arrays, *words, **more)))
+            shown.append((scene_of(arrays, position=more["position"]), draw(arrays, *words, **more)))
             return shown[-1][1]
 
         monkeypatch.setattr(report, name, keep)
@@ -69,12 +91,15 @@ def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: p
     report.write_report(tmp_path, lambda flown: states, printed="one", vehicle=vehicle)
 
     assert len(shown) == 3  # one of them as a png and as a pdf
+    at = vehicle.dynamics.position
     for scene, figure in shown:
-        np.testing.assert_array_equal(scene.start, problem.x0[:, :2])
+        np.testing.assert_array_equal(scene.start, problem.x0[:, at])
         np.testing.assert_array_equal(scene.goal, task.goal)
         assert scene.margin == float(spheres.vehicle_radius[0]) and scene.goal_radius == task.goal_radius
         assert scene.dt == problem.dynamics.dt
-        touching = [len(contacts(scene, i, states["gco"][i, :, :2])) > 0 for i in range(L)]
+        (paths,) = flights_of(scene, states, table).values()
+        assert all((flight.path == states["gco"][i, :, at]).all() for i, flight in enumerate(paths))
+        touching = [len(flight.contacts) > 0 for flight in paths]
         assert touching == (verdict.clearance < 0).tolist()
         words = {text.get_text() for box in figure.legends for text in box.get_texts()}
         assert {"start", "goal and its radius", "contact"} <= words or not any(touching)

@@ -1,4 +1,4 @@
-"""A user's code is tried once per object and dimensions; what changes the trial, or the object, has it tried again."""
+"""A user's code is tried once for the same dimensions; what changes the trial, or the code, has it tried again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 import torchgco
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem
-from torchgco.problem import border
+from torchgco.problem import tried
 
 D = torch.float64
 X0 = torch.tensor([[0.0, 0.1]], dtype=D)
@@ -83,6 +83,32 @@ def test_other_objects_are_tried() -> None:
     assert parts.tried(lambda: parts.problem(constraints=[replace(parts.rows)])) == {"constraint"}
 
 
+def doubled(x: Tensor, u: Tensor, by: Tensor) -> Tensor:
+    return torch.cat((x[..., 1:], FACTOR * u * by), dim=-1)
+
+
+FACTOR: Any = 2.0
+
+
+def test_new_parts_over_the_same_functions_are_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also with other numbers of problems; but where something has changed that the functions read."""
+    tried_parts, check = list[Any](), tried.check_dynamics
+    monkeypatch.setattr(tried, "check_dynamics", lambda *given: (tried_parts.append(given[0]), check(*given)))
+
+    def made(by: float) -> int:
+        model = FunctionDynamics(doubled, 2, 1, 0.1, values={"by": torch.full((1, 1), by, dtype=D)})
+        Problem(model, torchgco.QuadraticCost([1, 1], [1], [1, 1]), [], X0, 5)
+        return len(tried_parts)
+
+    assert [made(1.0), made(1.0), made(3.0)] == [1, 1, 1]
+    monkeypatch.setitem(globals(), "FACTOR", 3.0)
+    assert [made(1.0), made(1.0)] == [2, 2]
+    monkeypatch.setitem(globals(), "FACTOR", torch.ones(3, dtype=torch.float32))
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"dynamics"):
+            made(1.0)
+
+
 def test_a_mistake_is_told_each_time_and_a_mended_object_passes() -> None:
     wrong = [True]
     model = FunctionDynamics(lambda x, u: u if wrong[0] else torch.cat((x[..., 1:], u), dim=-1), 2, 1, 0.1)
@@ -106,10 +132,10 @@ def test_a_mistake_that_arises_later_ends_the_solve() -> None:
 
 def test_nothing_is_kept_of_objects_that_are_gone() -> None:
     gc.collect()
-    before = len(border._passed)
+    before = len(tried._passed)
     parts = Parts()
     parts.problem()
-    assert len(border._passed) > before
+    assert len(tried._passed) > before
     del parts
     gc.collect()
-    assert len(border._passed) == before
+    assert len(tried._passed) == before

@@ -203,3 +203,17 @@ def test_numbers_that_depend_on_the_axes_before_a_state_are_refused(field: str) 
     with pytest.raises(InputError, match="whatever axes lie before the last") as told:
         BY_AXES[field]()
     assert told.value.field == field.strip()
+
+
+def test_a_long_horizon_takes_no_more_calls_of_a_cost_than_a_short_one() -> None:
+    """Numbers of each knot come by `knot_values`: only code that takes k is asked at every knot."""
+    calls: list[int] = []
+
+    def stage(x: Tensor, u: Tensor, price: Tensor) -> Tensor:
+        calls[-1] += 1
+        return price * u.square().sum(-1)
+
+    for count in (40, 400):
+        calls.append(0)
+        problem(FunctionCost(stage, knot_values={"price": torch.ones(1, count + 1, dtype=D)}), N=count)
+    assert calls[0] == calls[1]

@@ -23,7 +23,6 @@ from torchgco import (
     InputError,
     IteratedMPPI,
     Layouts,
-    Polish,
     Problem,
     Spheres,
     certify,
@@ -46,7 +45,6 @@ EMPTY = {
     "equality": FunctionConstraint(lambda x, u: x[..., :0], of="xu", sense="equality"),
 }
 GUIDED = quick_gco(planar_batch()[0])
-POLISH = Polish(iterations=2)
 SOLVERS = {
     "gco": GUIDED,
     "multistart": MultiStart(replace(GUIDED.local, guidance=None, max_outer_iterations=2), starts=2),
@@ -79,16 +77,6 @@ def test_empty_constraints_change_nothing(kind: str, solver: str) -> None:
     certificate = certify(problem, got.X, got.U)
     assert certificate.clearance.tolist() == [torch.inf] * 2
     assert certificate.kkt_residual.tolist() == certify(free, got.X, got.U).kkt_residual.tolist()
-    assert torch.equal(POLISH.refine(problem, got).U, POLISH.refine(free, expected).U)
-
-
-def test_polish_needs_no_constraint() -> None:
-    """No constraint, or a constant one: Polish converges in both cases."""
-    free, U0 = planar()
-    constant, _ = planar(FunctionConstraint(lambda x: torch.full_like(x[..., :1], -1.0)))
-    expected, got = (POLISH.refine(p, torchgco.solve(p, U0, GUIDED)) for p in (free, constant))
-    assert float(certify(free, expected.X, expected.U).kkt_residual.max()) < 1e-8
-    torch.testing.assert_close(got.U, expected.U)
 
 
 @pytest.mark.parametrize("kind", ["shared", "absent", "geometric"])

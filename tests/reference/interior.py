@@ -6,7 +6,7 @@ equalities and z of the inequalities c + s = 0, s > 0. Derivatives of all orders
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco import ControlBounds, Problem, StateBounds
+from torchgco.lagrangian.barrier import BarrierOptions
 
 Array = np.ndarray
 
@@ -131,7 +132,7 @@ def residual(at: Linear, point: Point) -> Array:
 
 
 def begin(
-    program: Program, X: Tensor, U: Tensor, mu: float, how: Mapping[str, float], warm: tuple[Array, Array] | None = None
+    program: Program, X: Tensor, U: Tensor, mu: float, how: BarrierOptions, warm: tuple[Array, Array] | None = None
 ) -> Point:
     """The first iterate: slacks, multipliers (of inequalities and equalities, `warm`) and the scale of the cost."""
     w = torch.cat((X[0, 1:].flatten(), U.flatten())).numpy().copy()
@@ -144,18 +145,18 @@ def begin(
         derivatives.hessian(first, program.problem.x0[0]).diagonal(),
     ]  # fmt: skip
     largest = max(float(part.abs().max()) for part in parts)
-    scale = how["steepest"] / largest if largest > 0 else 1.0
-    s = np.maximum(-at.c, how["push"] * room(program))
+    scale = how.nlp_scaling_obj_target_gradient / largest if largest > 0 else 1.0
+    s = np.maximum(-at.c, how.bound_push * room(program))
     z, e = (mu / s, np.zeros_like(at.e)) if warm is None else (scale * warm[0], scale * warm[1])
     if warm is None:
-        z = np.where(loose(program, at, w, scale, s, how["held"]), 1.0, z)
-    z = np.maximum(z, mu / (how["central"] * s))
+        z = np.where(loose(program, at, w, scale, s, how.held), 1.0, z)
+    z = np.maximum(z, mu / (how.kappa_sigma * s))
     point = Point(w, np.zeros_like(at.gap), e, z, s, mu, scale)
     at = linear(program, w, scale)
     # The costates make the Lagrangian stationary in the states.
     states = slice(0, program.problem.N * program.problem.n)
     y = np.linalg.solve(at.G[:, states].T, -residual(at, point)[states])
-    return replace(point, y=y if abs(y).max() <= how["largest_multiplier"] else 0 * y)
+    return replace(point, y=y if abs(y).max() <= how.constr_mult_init_max else 0 * y)
 
 
 def loose(program: Program, at: Linear, w: Array, scale: float, s: Array, held: float) -> Array:
@@ -204,23 +205,23 @@ def _stage_cost(program: Program, x: Tensor, u: Tensor) -> Tensor:
     return program.problem.cost.stage(x.unsqueeze(0), u.unsqueeze(0), 0)[0]
 
 
-def next_barrier(at: Linear, point: Point, how: Mapping[str, float]) -> float:
+def next_barrier(at: Linear, point: Point, how: BarrierOptions) -> float:
     """mu of the step at an iterate, smaller where its barrier problem is solved well enough."""
-    usual, rows = how["usual_multiplier"], len(point.e) + len(point.z)
+    usual, rows = how.s_max, len(point.e) + len(point.z)
     sum_z = abs(point.e).sum() + abs(point.z).sum()
     mean = (abs(point.y).sum() + sum_z) / (len(point.y) + rows)
     dual = abs(residual(at, point)).max() * usual / max(usual, mean)
     primal = max(abs(np.concatenate((at.gap, at.e, at.c + point.s))).max(), 0.0)
-    factor, mu, smallest = usual / max(usual, sum_z / max(rows, 1)), point.mu, how["tolerance"] * how["barrier_floor"]
+    factor, mu, smallest = usual / max(usual, sum_z / max(rows, 1)), point.mu, how.tol * how.mu_floor
     for _ in range(100):
         off = abs(point.s * point.z - mu).max() * factor if len(point.z) else 0.0
-        if max(dual, primal, off) > how["barrier_error"] * mu or mu <= smallest:
+        if max(dual, primal, off) > how.barrier_tol_factor * mu or mu <= smallest:
             break
-        mu = max(smallest, min(how["barrier_share"] * mu, mu**1.5))
+        mu = max(smallest, min(how.mu_linear_decrease_factor * mu, mu**1.5))
     return mu
 
 
-def shifted(K: Array, variables: int, last: float, how: Mapping[str, float]) -> tuple[Array, float]:
+def shifted(K: Array, variables: int, last: float, how: BarrierOptions) -> tuple[Array, float]:
     """The KKT matrix with the least shift of the ladder that gives it its inertia, and that shift."""
     shift = 0.0
     while True:
@@ -229,17 +230,18 @@ def shifted(K: Array, variables: int, last: float, how: Mapping[str, float]) -> 
         if int((np.linalg.eigvalsh(whole) < 0).sum()) == len(K) - variables:
             return whole, shift
         if shift == 0:
-            shift = how["shift_first"] if last == 0 else max(how["shift_least"], how["shift_decay"] * last)
+            less = max(how.min_hessian_perturbation, how.perturb_dec_fact * last)
+            shift = how.first_hessian_perturbation if last == 0 else less
         else:
-            shift *= how["shift_growth_first"] if last == 0 else how["shift_growth"]
+            shift *= how.perturb_inc_fact_first if last == 0 else how.perturb_inc_fact
 
 
-def newton_step(program: Program, point: Point, how: Mapping[str, float]) -> Step:
+def newton_step(program: Program, point: Point, how: BarrierOptions) -> Step:
     """The step of an iterate: one linear system for the variables and all multipliers."""
     at = linear(program, point.w, point.scale)
     mu = next_barrier(at, point, how)
     A = np.concatenate((at.G, at.E, at.C))
-    soft = np.concatenate((0 * point.y, how["soft"] + 0 * point.e, point.s / point.z))
+    soft = np.concatenate((0 * point.y, how.jacobian_regularization_value + 0 * point.e, point.s / point.z))
     K = np.block([[curvature(program, point), A.T], [A, -np.diag(soft)]])
     K, shift = shifted(K, len(point.w), point.last, how)
     # Of the inequalities: C dw + ds = -(c + s) and s dz + z ds = mu - s z, without ds.
@@ -249,7 +251,7 @@ def newton_step(program: Program, point: Point, how: Mapping[str, float]) -> Ste
     ends = np.cumsum([len(part) for part in (point.w, point.y, point.e)])
     dw, dy, de, dz = np.split(step, ends)
     ds = -(at.c + point.s) - at.C @ dw
-    tau = max(how["boundary"], 1 - mu)
+    tau = max(how.tau_min, 1 - mu)
     return Step(dw, dy, de, dz, ds, _longest(point.s, ds, tau), _longest(point.z, dz, tau), mu, shift)
 
 
@@ -259,12 +261,12 @@ def _longest(values: Array, change: Array, tau: float) -> float:
     return min([1.0, *(-tau * values[falling] / change[falling])])
 
 
-def moved(program: Program, point: Point, step: Step, alpha: float, how: Mapping[str, float]) -> Point:
+def moved(program: Program, point: Point, step: Step, alpha: float, how: BarrierOptions) -> Point:
     """The iterate after a step of length alpha."""
     w = point.w + alpha * step.w
     c = program.inequalities(torch.from_numpy(w)).numpy()
     s = np.maximum(-c, point.s + alpha * step.s)
-    z = np.clip(point.z + step.dual * step.z, step.mu / s / how["central"], step.mu / s * how["central"])
+    z = np.clip(point.z + step.dual * step.z, step.mu / s / how.kappa_sigma, step.mu / s * how.kappa_sigma)
     return Point(
         w, point.y + alpha * step.y, point.e + alpha * step.e, z, s, step.mu, point.scale,
         step.shift if step.shift > 0 else point.last,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import html
-from dataclasses import fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from tests.search.gates import LOCAL, PASSES, PATHS, SAMPLING, SHORT, gates
 from tests.search.rows import closer, restarts, thorough, varied
 from tests.search.test_chords import corners
 from tests.search.test_finish import brachistochrone, parking
+from tests.slow import mostly
 from torchgco import (
     AugmentedLagrangian,
     Field,
@@ -105,30 +107,48 @@ def around_corners(*passes: Row) -> Solution:
 
 AGAIN, FIRST = Starts(2, "all"), (Converge("free"), Solve())
 ALONG = (Solve(), PATHS, FromProposal())
-# For every field: the problems, the rows before, the row, another value, the rows after.
-FIELDS: dict[tuple[type, str], tuple[Any, tuple[Row, ...], Row, Any, tuple[Row, ...]]] = {
-    (Solve, "until"): (at_gates, (), Solve(), "end", (DRAWN,)),
-    (Solve, "among"): (at_gates, (Solve("end"),), Solve(), "pathless", (DRAWN,)),
-    (Solve, "single_contact_after"): (around_one, (), Solve(), 1, (DRAWN,)),
-    (PathProposals, "when"): (at_gates, ALONG, PATHS, "far", (FromProposal(),)),
-    (PathProposals, "max_gap"): (at_gates, (Solve(), PATHS), COSTLY, 1e9, (FromProposal(),)),
-    (FromSamples, "when"): (at_gates, ALONG, FromSamples("unproposed", redraws=1), "caught", ()),
-    (IntoGoal, "among"): (at_gates, ALONG, IntoGoal(), "pathless", ()),
-    (FromSamples, "redraws"): (at_gates, (Solve(),), DRAWN, 2, ()),
-    (Starts, "count"): (parked, FIRST, AGAIN, 3, ()),
-    (Starts, "when"): (unfinished, FIRST, AGAIN, "unsolved", ()),
-    (Starts, "bend"): (unfinished, FIRST, AGAIN, 0.3, ()),
-    (Starts, "change"): (parked, FIRST, AGAIN, 0.2, ()),
-    (Converge, "among"): (unfinished, (Solve(),), Converge(), "free", ()),
-    (Direct, "gap"): (around_one, (Solve(single_contact_after=1),), Direct(), 1e9, (DRAWN,)),
-    (Direct, "most"): (around_one, (Solve(single_contact_after=1),), Direct(), 0, (DRAWN, Join())),
-    (Tube, "among"): (at_gates, (Solve(),), Tube(num_paths=2), "maps", ()),
-    (Tube, "num_paths"): (at_gates, (Solve(),), Tube(num_paths=1), 3, ()),
-    (FirstSolve, "single_contact_after"): (around_one, (), FirstSolve(), 1, (DRAWN,)),
-    (Samples, "redraws"): (at_gates, (Solve(),), Samples(1), 2, ()),
-    (Tighten, "starts"): (parked_once, FIRST, Tighten(1), 3, ()),
-    (ClearChords, "rounds"): (around_corners, (Solve("end"),), ClearChords(), 1, ()),
-}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A field of a row, problems on which it matters, another value for it, and the rows around it in the table."""
+
+    field: str
+    solved: Callable[..., Solution]
+    row: Row
+    value: Any
+    before: tuple[Row, ...] = ()
+    after: tuple[Row, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{type(self.row).__name__}.{self.field}"
+
+
+HELD = (Solve(),)
+ALONE = (Solve(single_contact_after=1),)
+CASES = [
+    Case("until", at_gates, Solve(), "end", after=(DRAWN,)),
+    Case("among", at_gates, Solve(), "pathless", before=(Solve("end"),), after=(DRAWN,)),
+    Case("single_contact_after", around_one, Solve(), 1, after=(DRAWN,)),
+    Case("when", at_gates, PATHS, "far", before=ALONG, after=(FromProposal(),)),
+    Case("max_gap", at_gates, COSTLY, 1e9, before=(Solve(), PATHS), after=(FromProposal(),)),
+    Case("when", at_gates, FromSamples("unproposed", redraws=1), "caught", before=ALONG),
+    Case("among", at_gates, IntoGoal(), "pathless", before=ALONG),
+    Case("redraws", at_gates, DRAWN, 2, before=HELD),
+    Case("count", parked, AGAIN, 3, before=FIRST),
+    Case("when", unfinished, AGAIN, "unsolved", before=FIRST),
+    Case("bend", unfinished, AGAIN, 0.3, before=FIRST),
+    Case("change", parked, AGAIN, 0.2, before=FIRST),
+    Case("among", unfinished, Converge(), "free", before=HELD),
+    Case("gap", around_one, Direct(), 1e9, before=ALONE, after=(DRAWN,)),
+    Case("most", around_one, Direct(), 0, before=ALONE, after=(DRAWN, Join())),
+    Case("among", at_gates, Tube(num_paths=2), "maps", before=HELD),
+    Case("num_paths", at_gates, Tube(num_paths=1), 3, before=HELD),
+    Case("single_contact_after", around_one, FirstSolve(), 1, after=(DRAWN,)),
+    Case("redraws", at_gates, Samples(1), 2, before=HELD),
+    Case("starts", parked_once, Tighten(1), 3, before=FIRST),
+    Case("rounds", around_corners, ClearChords(), 1, before=(Solve("end"),)),
+]
 
 
 # Another value of every field of `Paths`, and what it changes among the fields of its steps.
@@ -178,18 +198,11 @@ def test_rows_solve_by_the_interior_point_of_their_table() -> None:
     assert differ(solver.solve(problem, U0), other.solve(problem, U0))
 
 
-LONGEST = ((ClearChords, "rounds"),)
-
-
-@pytest.mark.parametrize(
-    ("kind", "name"), [pytest.param(*f, marks=[pytest.mark.slow] * (f in LONGEST)) for f in FIELDS],
-    ids=lambda part: part if isinstance(part, str) else part.__name__,
-)  # fmt: skip
-def test_every_field_is_read(kind: type, name: str) -> None:
-    flown, before, row, other, after = FIELDS[kind, name]
-    assert isinstance(row, kind) and getattr(row, name) != other
-    one, two = (flown(*before, r, *after) for r in (row, replace(row, **{name: other})))
-    assert differ(one, two)
+@pytest.mark.parametrize("case", mostly(CASES, CASES[-1]), ids=str)
+def test_every_field_is_read(case: Case) -> None:
+    assert getattr(case.row, case.field) != case.value
+    other = replace(case.row, **{case.field: case.value})  # type: ignore[type-var]
+    assert differ(*(case.solved(*case.before, row, *case.after) for row in (case.row, other)))
 
 
 def test_a_first_solve_runs_to_its_end_where_no_path_can_be_sought_alone() -> None:
@@ -204,7 +217,9 @@ def test_no_field_is_forgotten_above() -> None:
     there = {field.name for field in fields(PathProposals)} - {"when", "max_gap"}
     every = {(kind, field.name) for kind in KINDS for field in fields(kind)}
     handed_on = {(Paths, field.name) for field in fields(Paths)}  # to its steps; see below
-    assert set(FIELDS) == every - {(PathProposals, name) for name in there} - handed_on
+    assert {(type(case.row), case.field) for case in CASES} == every - {
+        (PathProposals, name) for name in there
+    } - handed_on
 
 
 @pytest.mark.parametrize(

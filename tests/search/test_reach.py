@@ -17,7 +17,9 @@ from torchgco import (
     OccupancyGrid,
     Problem,
     QuadraticCost,
+    RateBounds,
     StateBounds,
+    Status,
     Unicycle,
 )
 from torchgco.dynamics import Dynamics
@@ -41,6 +43,26 @@ def test_the_number_of_stages_that_would_do_is_named() -> None:
         said = short_horizons(task(POINT, [SPEED], N, starts, Goal([8.0, 1.0], 0.3)))
         assert (said is not None) == bool(count)
         assert said is None or (said.startswith("1 of 2 horizons") and "N = 57 would do" in said and "6 m long" in said)
+
+
+class Stepped(Dynamics):
+    """A model that has a whole step alone."""
+
+    n, m, dt, position = 4, 2, 0.1, slice(0, 2)
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((x[..., :2] + 0.1 * x[..., 2:] + 0.005 * u, x[..., 2:] + 0.1 * u), dim=-1)
+
+
+@pytest.mark.parametrize("more", [[], [RateBounds(-1.0, 1.0)]])
+def test_a_model_with_a_step_alone_and_bounded_rates_are_looked_at(more: list) -> None:
+    """A step may begin at 1 m/s along x and along y, and end at 1.1 m/s: it is 1.05 times as long."""
+    held = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4", slice(0, 2))
+    parts = [ControlBounds(-1.0, 1.0), StateBounds([-99.0, -99.0, -1.0, -1.0], [99.0, 99.0, 1.0, 1.0]), *more]
+    for model, stages in ((held, 41), (Stepped(), 39)):
+        problem = task(model, parts, 20, [[2.0, 1.0, 0.0, 0.0]], Goal([8.0, 1.0], 0.3))
+        with pytest.warns(HorizonWarning, match=f"N = {stages} "):
+            assert torchgco.solve(problem).statuses == [Status.CONVERGED]
 
 
 def test_it_is_said_among_tangents_of_many_directions() -> None:

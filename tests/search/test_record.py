@@ -9,7 +9,7 @@ import torch
 
 from tests.problems import quick_gco
 from tests.search.gates import CLOSED, FREE, PASSES, SHORT, gates
-from torchgco import Polish, Restarts, Solution
+from torchgco import Restarts, Solution
 from torchgco.solution import Fate
 
 
@@ -84,6 +84,5 @@ def test_the_problems_of_a_batch_have_the_record_of_each_alone(solver: Restarts,
         assert torch.equal(one.tracked[place].nan_to_num(0), other.tracked[0].nan_to_num(0))
 
 
-def test_a_polish_keeps_the_record_and_rows_leave_it_behind(recorded: Solution) -> None:
-    assert Polish(iterations=1).refine(gates()[0], recorded).search is recorded.search
+def test_rows_leave_the_record_behind(recorded: Solution) -> None:
     assert recorded.take(torch.tensor([0])).search is None

@@ -36,6 +36,7 @@ from torchgco import (
 )
 from torchgco.dynamics.rollout import open_loop
 from torchgco.problem.in_time import fitting_factors, in_time, states_in_time
+from torchgco.solvers.convexity import looks_convex
 
 D = torch.float64
 INF = float("inf")
@@ -155,10 +156,10 @@ def test_a_held_time_that_is_optimal_has_no_slope_in_time() -> None:
 def test_a_problem_has_the_same_bits_in_any_batch(segments: int | None) -> None:
     problem = carts(N=30, segments=segments)
     whole = torchgco.solve(problem)
-    order = torch.tensor([5, 2, 7])
-    part = torchgco.solve(problem.take(order), ids=order)
-    assert_same_bits(part, whole.take(order))
-    assert torch.equal(part.t, whole.t[order])
+    for order in map(torch.tensor, ([5, 2, 7], [1], [4])):
+        part = torchgco.solve(problem.take(order), ids=order)
+        assert_same_bits(part, whole.take(order))
+        assert torch.equal(part.t, whole.t[order])
 
 
 def test_limits_on_rates_are_per_second() -> None:
@@ -445,10 +446,25 @@ def test_the_states_and_controls_of_a_solution_are_kept_without_its_time() -> No
 
 
 def test_drawn_guesses_find_shorter_times() -> None:
-    """Of the default none where the first solve converges; eight of `gco_max`, in any batch the same."""
-    problem = braking(4, 5)
-    once = torchgco.solve(problem, verbose=False)
-    most = torchgco.solve(problem, solver="gco_max", verbose=False)
-    assert bool((most.cost <= once.cost).all()) and bool((most.cost < 0.99 * once.cost).any())
-    alone = torchgco.solve(problem.take(torch.tensor([2])), solver="gco_max", ids=torch.tensor([2]), verbose=False)
-    assert_same_bits(alone, most.take([2]))
+    """Of the default roughly, side by side, where a problem isn't convex; in any batch the same."""
+    problem = braking(6, 5)
+    once, found = (torchgco.solve(problem, solver=name, verbose=False) for name in ("interior_point", "gco"))
+    assert bool((found.cost <= once.cost).all()) and int((found.cost < 0.99 * once.cost).sum()) >= 2
+    assert bool((found.violation <= 1e-6).all()) and bool((found.iterations > once.iterations).all())
+    for solver in ("gco", "gco_max"):
+        whole = torchgco.solve(problem, solver=solver, verbose=False)
+        alone = torchgco.solve(problem.take(torch.tensor([2])), solver=solver, ids=torch.tensor([2]), verbose=False)
+        assert_same_bits(alone, whole.take([2]))
+
+
+def test_what_looks_convex_at_a_held_time_is_solved_once() -> None:
+    """A linear model with convex rows isn't tried from other guesses; a row that curves the other way is seen."""
+    problem = carts(B=3)
+    once, found = (torchgco.solve(problem, solver=name) for name in ("interior_point", "gco"))
+    assert torch.equal(found.iterations, once.iterations) and torch.equal(found.U, once.U)
+    X, U = found.X, found.U
+    rows = [lambda x: x[..., :1].square() - 50.0, lambda x: 0.01 - x[..., :1].square(), lambda x: x[..., :1].sin()]
+    for row, convex in zip(rows, (True, False, False), strict=True):
+        one = replace(problem, constraints=[*problem.constraints, FunctionConstraint(row)])
+        assert looks_convex(one, X, U).tolist() == [convex] * 3
+    assert not bool(looks_convex(braking(3, 1), torch.zeros(3, 41, 4, dtype=D), torch.zeros(3, 40, 1, dtype=D)).any())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -33,6 +34,7 @@ from torchgco.base.tree import take
 from torchgco.baselines import CasADiSolver
 from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import interior_of
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.native.codegen.source import LANES
 from torchgco.native.compiler import find_compiler
 from torchgco.native.interior import InteriorEngine
@@ -188,7 +190,7 @@ def test_full_steps_near_the_circle_of_maratos(monkeypatch) -> None:
     torch.testing.assert_close(solution.cost, torch.full((16,), -1.0, dtype=D), rtol=1e-9, atol=0)
     ends = solution.multipliers.lam[0].flatten()
     torch.testing.assert_close(ends, torch.full((16,), -1.5, dtype=D), rtol=1e-7, atol=0)
-    monkeypatch.setitem(interior.FILTER, "corrects", 0)
+    monkeypatch.setattr(interior, "BarrierOptions", partial(BarrierOptions, max_soc=0))
     plain = solved(problem, U0, tolerance=1e-9)
     assert int(solution.iterations.max()) <= 15 and int(solution.iterations.sum()) < 0.95 * int(plain.iterations.sum())
 
@@ -204,9 +206,23 @@ def test_convergence_with_equalities_alone_is_quadratic(monkeypatch) -> None:
     assert len(pairs) >= 2 and all(b <= 5 * a * a for a, b in pairs) and errors[-1] < 1e-12
 
 
+@pytest.mark.parametrize("native", [True, False])
+def test_options_of_ipopt_reach_the_kernels(native: bool) -> None:
+    problem, U0 = circle(torch.tensor([0.8], dtype=D))
+    kernels.use_native(native)
+    try:
+        call, limit = Session(Call.checked(problem, U0), own_units=True).call, int(solved(problem, U0).iterations) - 1
+        ends = [InteriorPoint(max_iterations=limit, acceptable_tolerance=error).solved(call) for error in (1e-10, 1.0)]
+        assert [int(end.status) for end in ends] == [Status.MAX_ITERATIONS, interior.SOLVED]
+        once = [solved(linear_quadratic(), max_iterations=1, bound_push=push).X for push in (1e-2, 0.3)]
+    finally:
+        kernels.use_native(True)
+    assert not torch.allclose(*once, rtol=1e-3)
+
+
 def test_a_step_that_gains_too_little_is_halved() -> None:
     """A full Newton step of length 1 lowers the costs -u + u^2 / 2 + a u^3 by half and by twice what Armijo asks."""
-    share = interior.FILTER["armijo"]
+    share = BarrierOptions.eta_phi
     a = 0.5 - share * torch.tensor([0.5, 2.0], dtype=D)
     cost = FunctionCost(lambda x, u, a: (u * (u * (0.5 + a.unsqueeze(-1) * u) - 1)).sum(-1), values={"a": a})
     dynamics = FunctionDynamics(lambda x, u: x + 0 * u, 1, 1, 1.0, "none")

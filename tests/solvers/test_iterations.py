@@ -9,14 +9,11 @@ import torchgco
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from tests.search.rows import varied
 from torchgco import (
-    ILQR,
     MPPI,
-    AugmentedLagrangian,
     ControlBounds,
     FunctionDynamics,
     MultiStart,
     PathProposals,
-    Polish,
     Problem,
     QuadraticCost,
     Restarts,
@@ -67,13 +64,6 @@ def made(monkeypatch) -> list[int]:
 
     monkeypatch.setattr(NativeOuter, "_run", passes)
 
-    def step(self, *point, real=Polish._step):
-        moved = real(self, *point)
-        made.append(moved is not None)
-        return moved
-
-    monkeypatch.setattr(Polish, "_step", step)
-
     def interior(self, *arguments, real=InteriorEngine.solve, **options):
         out = real(self, *arguments, **options)
         made.append(int(out["iterations"].sum()))
@@ -107,15 +97,6 @@ def test_candidates_take_most_iterations_and_are_not_in_the_trace() -> None:
     assert bool((solution.iterations[caught] > 2 * torch.tensor(rows.tolist())[caught]).any())
     for _, history in solution.trace.groupby(["element", "attempt"]):
         assert history["iteration"].tolist() == list(range(len(history)))
-
-
-def test_steps_of_a_polish_count_without_an_improvement_too(made: list[int], monkeypatch) -> None:
-    problem, U0 = BATCHES["planar"]()
-    before = AugmentedLagrangian(inner=ILQR(max_iterations=20), max_outer_iterations=6).solve(problem, U0)
-    monkeypatch.setattr(Polish, "_is_better", lambda self, new, old, first: False)
-    made.clear()
-    after = Polish(iterations=2, reach=10.0).refine(problem, before)
-    assert torch.equal(after.U, before.U) and int((after.iterations - before.iterations).sum()) == sum(made) > 0
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.3])

@@ -8,6 +8,7 @@ import scipy.sparse as sp
 import torch
 from scipy.optimize import linprog
 
+from tests.slow import mostly
 from torchgco import ControlBounds, FunctionConstraint, FunctionCost, FunctionDynamics, Problem, StateBounds, Status
 from torchgco.kernels import use_native
 from torchgco.solvers.interior import InteriorPoint
@@ -49,7 +50,7 @@ def best_of(numbers: torch.Tensor, N: int, grid: bool) -> float:
     return linprog(np.r_[0 * price, price, -price], A_eq=steps, b_eq=np.zeros(N), bounds=bounds, **limits).fun
 
 
-@pytest.mark.parametrize("grid", [False, True])
+@pytest.mark.parametrize("grid", mostly([False, True], False))
 @pytest.mark.parametrize(("N", "most", "weight"), [(24, 40, 0.0), (480, 70, TINY)])
 def test_drawn_programmes(N: int, most: int, weight: float, grid: bool) -> None:
     """64 in all. From multipliers of the central path they take several hundred iterations at N = 480."""

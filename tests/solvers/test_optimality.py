@@ -16,7 +16,6 @@ from torchgco import (
     FunctionDynamics,
     PathProposals,
     Planar,
-    Polish,
     Problem,
     QuadraticCost,
     Restarts,
@@ -134,14 +133,6 @@ def test_the_status_is_one_of_four_by_stationarity_and_violation() -> None:
     assert done.statuses == [Status.CONVERGED] * 2
     lagrangian = Lagrangian(problem, done.multipliers, None, True)
     assert bool((optimality(lagrangian, done.X, done.U).left <= STATIONARY).all())
-
-
-def test_a_polished_trajectory_has_its_own_status() -> None:
-    problem, U0 = planar_batch(B=2, N=30, obstacles=1, seed=1)
-    short = AugmentedLagrangian(inner=ILQR(max_iterations=6), max_outer_iterations=2, initial_penalty=1e-4)
-    rough = short.solve(problem, U0)
-    assert Status.CONVERGED not in rough.statuses
-    assert Polish(reach=10.0).refine(problem, rough).statuses == [Status.CONVERGED] * 2
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")

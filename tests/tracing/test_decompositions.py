@@ -68,7 +68,7 @@ SMOOTH: dict[str, Function] = {
     "unfold": lambda x: x.square().unfold(-1, 2, 1).flatten(1),
     "exp2": lambda x: torch.exp2(x) + torch.ldexp(x, A[0]),
     "xlogy": lambda x: torch.xlogy(x, x.square()) + torch.special.xlog1py(x, x.abs()),
-    "copysign": lambda x: torch.copysign(x, x.flip(-1)),
+    "copysign": lambda x: torch.copysign(x, x.flip(-1)) + torch.copysign(x.square(), -2.0),
     "fmax": lambda x: torch.fmax(x, x.square()) + torch.fmin(x.sin(), x),
     "fraction": lambda x: x.frac() * x,
     "jvp": lambda x: torch.func.jvp(lambda z: z.sin() * z.flip(-1), (x,), (x.square(),))[1],

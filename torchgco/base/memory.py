@@ -1,12 +1,14 @@
-"""How much memory is left, before anything large is read or solved."""
+"""How much memory is left, before anything large is read or solved, and how much of what was found is kept."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 def free_memory() -> int:
@@ -39,3 +41,14 @@ def limited(size: float) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def trim(
+    kept: dict[Any, Any], most: int, total: float = math.inf, size: Callable[[Any], float] = lambda _: 0.0
+) -> None:
+    """Drop the first entries beyond so many, or while the sizes of several add up to more; other threads may, too."""
+    pairs = list(kept.items())  # at once: no thread changes it meanwhile
+    sums = list(itertools.accumulate(size(value) for _, value in reversed(pairs)))[::-1]
+    for (key, _), left, after in zip(pairs, range(len(pairs), 1, -1), sums, strict=False):
+        if left > most or after > total:
+            kept.pop(key, None)

@@ -1,12 +1,9 @@
 """Types and ranges of options, written as annotations of dataclass fields and checked in one place.
 
     @dataclass(frozen=True)
-    class Sampler:
+    class Sampler(Checked, named="sampler"):
         samples: Count = 100
         spread: Annotated[float, Above(0, "m")] = 0.25
-
-        def __post_init__(self) -> None:
-            check_options(self, "sampler")
 
 A bool is no number, 5.0 is no whole number, and a number is finite unless its annotation says `UNBOUNDED`. Annotations
 that can't be checked (`Any`, a name that isn't known at run time) admit everything. The library annotated-types has
@@ -22,7 +19,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, reduce
 from itertools import pairwise
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from torch import Tensor
@@ -99,7 +96,7 @@ class Rule(NamedTuple):
 
 
 def check_options(options: Any, prefix: str) -> None:
-    """Check every field of a dataclass against its annotation; call it first in `__post_init__`.
+    """Check every field of a dataclass against its annotation: what `Checked` does, where `__post_init__` does more.
 
     NumPy's numbers become Python's.
 
@@ -110,6 +107,21 @@ def check_options(options: Any, prefix: str) -> None:
         value = getattr(options, name)
         if not rule.fits(value):
             object.__setattr__(options, name, _plain(value, rule, f"{prefix}.{name}"))
+
+
+class Checked:
+    """Base of dataclasses: those made with `named`, and their subclasses, are checked with this prefix."""
+
+    _named: ClassVar[str | None] = None
+
+    def __init_subclass__(cls, named: str | None = None, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        if named is not None:
+            cls._named = named
+
+    def __post_init__(self) -> None:
+        if self._named is not None:
+            check_options(self, self._named)
 
 
 def check_value(value: Any, kind: Any, field: str) -> Any:

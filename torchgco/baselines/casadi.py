@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchgco.base.clock import setting_up
 from torchgco.base.errors import InputError
-from torchgco.base.options import Count, Positive, Seconds, check_options
+from torchgco.base.options import Count, Positive, Seconds
 from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
 from torchgco.baselines.limited import limited
@@ -36,7 +36,7 @@ _End = tuple[Status, int]  # how the solver ended, and its iterations
 
 
 @dataclass(frozen=True)
-class CasADiSolver(Solver):
+class CasADiSolver(Solver, named="solver"):
     """An interior-point solver on the multiple-shooting program, one problem of the batch after the other.
 
     Args:
@@ -60,9 +60,6 @@ class CasADiSolver(Solver):
     violation_tolerance: Positive = ADMITTED
     max_seconds: Seconds | None = None
     options: Mapping[str, Any] | None = None
-
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
 
     def prepare(self, problem: Problem) -> Solver:
         """The program and the solver built for one batch, so that a solve takes the plugin's time alone.

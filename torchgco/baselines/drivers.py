@@ -78,8 +78,7 @@ def is_point(problem: Problem) -> bool:
     model = own_model(one.dynamics.at(0))
     x = one.x0[:, : model.n].nan_to_num(0.0, 0.0, 0.0)  # a bad start says nothing about the model
     u = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
-    integrated = getattr(model, "integrator", "none") != "none"
-    A, B = jacobian(model.field if integrated else model.step, x, u)
+    A, B = jacobian(model.field if model.stretches else model.step, x, u)
     at = one.position
     orders = [_numbers(part[0, at]) for part in (B, A @ B)]
     first = next((push for push in orders if push.any()), orders[0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Positive, check_options
+from torchgco.base.options import Positive
 from torchgco.base.status import Status
 from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import measured
@@ -19,7 +19,7 @@ from torchgco.solvers.contracts import Call, Solver
 
 
 @dataclass(frozen=True)
-class Hold(Solver):
+class Hold(Solver, named="solver"):
     """Solves nothing: returns the trajectory of U0.
 
     Args:
@@ -30,9 +30,6 @@ class Hold(Solver):
     """
 
     violation_tolerance: Positive = ADMITTED
-
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
 
     def run(self, call: Call) -> Solution:
         """U0 rolled out."""

@@ -9,7 +9,7 @@ import torch
 
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import GuidanceWarning, InputError
-from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.options import Count, Positive
 from torchgco.baselines.hold import rolled_out
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_sampler
@@ -21,7 +21,7 @@ from torchgco.solvers.contracts import Call, Solver
 
 
 @dataclass(frozen=True)
-class IteratedMPPI(Solver):
+class IteratedMPPI(Solver, named="solver"):
     """Algorithm 3 repeated, each time around its last mean; the best iterate is kept.
 
     Feasible before infeasible; of feasible iterates the cheapest, of infeasible ones the least violated. The initial
@@ -39,9 +39,6 @@ class IteratedMPPI(Solver):
     sampler: MPPI = MPPI()
     iterations: Count = 20
     violation_tolerance: Positive = ADMITTED
-
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
 
     def run(self, call: Call) -> Solution:
         """Sample around U0; draws are keyed by (seed, id, iteration).

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive, check_options
+from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_model
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -40,7 +40,7 @@ GRID_REACH = 4.0  # radii that the grid reaches beyond start, goal and obstacles
 
 
 @dataclass(frozen=True)
-class PathPursuit(Solver):
+class PathPursuit(Solver, named="solver"):
     """The shortest way over a grid, pursued, and the result solved by the interior point with a small barrier.
 
     Where the trajectory touches an obstacle between two knots, obstacles grow by what is missing and the interior point
@@ -69,9 +69,6 @@ class PathPursuit(Solver):
     share: Annotated[float, Above(0), AtMost(1)] = 0.75
     solver: InteriorPoint = InteriorPoint(max_iterations=3000, initial_barrier=1e-3, warm_barrier=1e-4)
     rounds: Natural = 4
-
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
 
     def announce(self, problem: Problem) -> None:
         """As the interior point."""

@@ -37,7 +37,7 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
-from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
+from torchgco.solvers.interior import PENALTY, InteriorPoint
 from torchgco.tracing import traced_like
 
 Begin: TypeAlias = Callable[[Problem, Tensor], tuple[Tensor, Tensor]]
@@ -146,7 +146,7 @@ class Compiled:
         if problem.free_start is not None or problem.B == 0:
             return
         if problem.time is not None:
-            self._kept = kept_in_time(problem, self._options)
+            self._kept = kept_in_time(problem, self.interior.options(warm=True))
             self._unit = self._unit if self._kept is None else cost_unit(self._kept.whole)
             return
         form = current(for_solvers(problem))
@@ -155,15 +155,7 @@ class Compiled:
             # What Python has read of a problem's own numbers stays in the code.
             if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
                 self._problem, self._unit = form, cost_unit(form)
-                self._kept = Kept(kernels, form, **self._options(form))
-
-    def _options(self, problem: Problem) -> dict[str, Any]:
-        interior, scale = self.interior, cost_scale(problem)
-        return FILTER | {
-            "push": interior.warm_barrier, "warm": 1, "max_iterations": interior.max_iterations,
-            "tolerance": interior.tolerance, "violation": interior.violation_tolerance, "seconds": math.inf,
-            "constant": scale.constant, "least_cost": scale.size,
-        }  # fmt: skip
+                self._kept = Kept(kernels, form, cost_scale(form), self.interior.options(warm=True))
 
     def __call__(
         self,

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers
-from torchgco.kernels import cost_unit, current, interior_of
+from torchgco.kernels import cost_scale, cost_unit, current, interior_of
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
@@ -33,9 +34,9 @@ class KeptInTime(Kept):
         options: see `Kept`.
     """
 
-    def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, **options: Any) -> None:
+    def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, options: BarrierOptions) -> None:
         self.user, self.whole, self.unit = user, whole, cost_unit(whole)
-        super().__init__(kernels, whole.in_cost_units(), **options)
+        super().__init__(kernels, whole.in_cost_units(), cost_scale(whole), options)
         self._given = user.x0.numpy()
         pairs = zip(user.constraints, whole.constraints, strict=False)
         self._copied_parts = {i for i, (a, b) in enumerate(pairs) if a.joins_knots or _differ(a, b)}
@@ -107,17 +108,17 @@ class KeptInTime(Kept):
         return changed
 
 
-def kept_in_time(problem: Problem, options: Any) -> KeptInTime | None:
+def kept_in_time(problem: Problem, options: BarrierOptions) -> KeptInTime | None:
     """Problems with a free time, packed; None where C can't serve them.
 
     Args:
-        options: gives the options of `Kept` for a problem.
+        options: see `Kept`.
     """
     whole = current(in_time(problem))
     kernels = interior_of(whole)
     if not isinstance(kernels, InteriorEngine) or kernels.engine.captured.reads_own:
         return None
-    return KeptInTime(kernels, problem, whole, **options(whole))
+    return KeptInTime(kernels, problem, whole, options)
 
 
 def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:

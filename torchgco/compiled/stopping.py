@@ -12,6 +12,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.kernels import current, open_loop
@@ -108,6 +109,7 @@ def _braked(problem: Problem, rest: Tensor, bases: Tensor, delays: Tensor, ahead
     many, steady = problem.take(each), problem.along is problem.dynamics
     varied = problem.take(each.repeat(m + 2)).dynamics
     U, calm, bounds = bases.flatten(0, 1).clone(), rest.repeat_interleave(C, dim=0), limits(many)
+    _keep_states_within(many, U, calm, first)
     x, u = open_loop(current(for_solvers(many)), U)[rows, first, : problem.n], U[rows, (first - 1).clamp(min=0)]
     rests = torch.zeros(B * C, dtype=torch.bool)
     for k in range(N - int(delays.min())):
@@ -128,6 +130,29 @@ def _braked(problem: Problem, rest: Tensor, bases: Tensor, delays: Tensor, ahead
     after = torch.arange(N) > (first + k).unsqueeze(-1)
     U = torch.where((after & rests.unsqueeze(-1)).unsqueeze(-1), calm, U)
     return U.view(B, C, N, m), rests.view(B, C)
+
+
+def _keep_states_within(problem: Problem, U: Tensor, rest: Tensor, first: Tensor) -> None:
+    """Bring controls U (R, N, m) of the stages before `first` (R,) towards rest, each as far as bounds of states ask of
+    it alone, in place: a vehicle that is as fast as it may be goes on so, and turns as before."""
+    bounds, (R, N, m), last = bounds_of(problem.constraints, "x"), U.shape, int(first.max())
+    if not bounds or last == 0:
+        return
+    lower, upper = (
+        torch.stack(torch.broadcast_tensors(*sides)) for sides in zip(*(b.over(N + 1) for b in bounds), strict=True)
+    )
+    lower, upper = (side.expand(-1, R, N + 1, -1) for side in (lower.amax(0, True), upper.amin(0, True)))
+    x = problem.x0
+    for k in range(last):
+        away = torch.diag_embed(U[:, k] - rest[:, k]).transpose(0, 1)  # (m, R, m)
+        tried = torch.cat((rest[:, k].unsqueeze(0), rest[:, k] + away))
+        still, *moved = problem.dynamics.step(x.repeat(m + 1, 1), tried.flatten(0, 1)).view(m + 1, R, -1)
+        change = torch.stack(moved) - still
+        room = torch.where(change > 0, upper[:, :, k + 1] - still, lower[:, :, k + 1] - still)
+        share = torch.where(change == 0, 1.0, (room / change).nan_to_num(1.0)).clamp(0.0, 1.0).amin(-1)
+        runs = k < first
+        U[runs, k] = (rest[:, k] + share.T * (U[:, k] - rest[:, k]))[runs]
+        x = problem.dynamics.step(x, U[:, k])
 
 
 def _toward_rest(

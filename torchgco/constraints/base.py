@@ -179,6 +179,10 @@ class Constraint(PerElement):
         """Whether the constraint admits a start at x0 (B, n), (B,) bool."""
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)
 
+    def on_the_way(self, X: Tensor) -> Tensor | None:
+        """Points (B, K, P, d) of states X (B, K, n) whose way between the knots counts, too; None without any."""
+        return None
+
 
 class Distance(Constraint):
     """A constraint that keeps bodies apart: obstacles, and positions that keep a distance from each other.
@@ -191,6 +195,9 @@ class Distance(Constraint):
     def places(self, X: Tensor) -> Tensor:
         """The places (B, K, P, d), m, of states X (B, K, n)."""
         raise undefined(self, "places")
+
+    def on_the_way(self, X: Tensor) -> Tensor:
+        return self.places(X)
 
     def even_bulge(self, X: Tensor) -> Tensor:
         """How far places leave their straight lines, m, (B|1, K-1|1, P), where states X (B, K, n) change evenly."""

@@ -115,6 +115,9 @@ class GateBalls(NormBounds):
         fields = {"centers": (centers, finite), "radius": (radii, above_zero)}
         return numbers("gates", fields, place, after=lambda: self.write(centers, radii))
 
+    def on_the_way(self, X: Tensor) -> Tensor:
+        return X[..., self.components].unsqueeze(-2)
+
     def write(self, centers: Tensor, sizes: Tensor) -> None:
         """Put other gates (B, G, d) of other radii (B, G) in the places of these, in this memory."""
         self.center.scatter_(1, (self.places - 1).unsqueeze(-1).expand_as(centers), centers)
@@ -191,6 +194,9 @@ class GateSquares(Vectors):
         knots = self.places + (2 if ahead else -1)
         b, g = (~own.gather(1, knots)).nonzero(as_tuple=True)
         return b, g, knots[b, g]
+
+    def on_the_way(self, X: Tensor) -> Tensor:
+        return X[..., self.components].unsqueeze(-2)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return (self.slopes * self._vectors(X, U).unsqueeze(-2)).sum(-1) - self.limits

@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 from dataclasses import field as hidden
 from typing import Any, ClassVar, Literal, Self
 
+import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError
-from torchgco.base.options import Count, Seconds, check_options
+from torchgco.base.options import Checked, Count, Seconds
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS
 
 
-class Dynamics(PerElement):
+class Dynamics(PerElement, Checked):
     """x_{k+1} = step(x_k, u_k) on (..., n), (..., m).
 
     A model is a subclass with the numbers `n` and `m`, and one method: `field(x, u)`, the time derivative of x, with
@@ -100,16 +101,25 @@ class Dynamics(PerElement):
 
 @dataclass(frozen=True)
 class WrappedDynamics(Dynamics):
-    """A model with sizes, time step and position of another one, in a form of the problem with other steps."""
+    """A model with sizes, time step and position of another one, in a form of the problem with other steps.
+
+    Its `field` is that of the other one's states between two knots, which come first, and 0 of the further ones.
+    """
 
     model: Dynamics
 
-    n, m, dt, position = passed_on("model", "n", "m", "dt", "position")
+    n, m, dt, position, integrator, stretches = passed_on(
+        "model", "n", "m", "dt", "position", "integrator", "stretches"
+    )
     calls_function = property(lambda self: is_users(self.model))
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        rates = self.model.field(x[..., : self.model.n], u)
+        return torch.nn.functional.pad(rates, (0, self.n - self.model.n))
 
 
 @dataclass(frozen=True)
-class FunctionDynamics(Dynamics):
+class FunctionDynamics(Dynamics, named="dynamics"):
     """Dynamics from function(x, u) on (..., n), (..., m): the derivative x', or with integrator="none" the next state.
 
         drag = torch.tensor([0.2, 0.5]).double()  # of two problems
@@ -150,9 +160,6 @@ class FunctionDynamics(Dynamics):
 
     batched: ClassVar[tuple[str, ...]] = ("values",)
     calls_function: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_options(self, "dynamics")
 
     def bind(self, dims: Dimensions) -> Self:
         values = bound_values(self.values, self.knot_values, (self.function,), dims, "dynamics", knots=dims.N)

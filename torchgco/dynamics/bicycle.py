@@ -8,14 +8,14 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Above, Seconds, check_options
+from torchgco.base.options import Above, Seconds
 from torchgco.base.shapes import components, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 
 
 @dataclass(frozen=True)
-class Bicycle(Dynamics):
+class Bicycle(Dynamics, named="bicycle"):
     """Kinematic bicycle: x = [p (2, m), heading (rad), speed (m/s), steering (rad)], u = [acceleration (m/s^2),
     steering rate (rad/s)].
 
@@ -44,9 +44,6 @@ class Bicycle(Dynamics):
     state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "m/s", "rad")
     control_names: ClassVar[tuple[str, ...]] = ("acceleration", "steering rate")
     control_units: ClassVar[tuple[str, ...]] = ("m/s^2", "rad/s")
-
-    def __post_init__(self) -> None:
-        check_options(self, "bicycle")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, _, heading, speed, steering = components(x)

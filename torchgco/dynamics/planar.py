@@ -8,14 +8,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Seconds, check_options
+from torchgco.base.options import Seconds
 from torchgco.base.shapes import components, lead, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 
 
 @dataclass(frozen=True)
-class Planar(Dynamics):
+class Planar(Dynamics, named="planar"):
     """Planar vehicle: x = [p (2, m), theta (rad), p' (2, m/s), theta' (rad/s)], u = [a_left, a_right] (m/s^2).
 
         p''     = -k1 p' + k2 [cos theta, sin theta] (a_left + a_right)
@@ -42,9 +42,6 @@ class Planar(Dynamics):
     control_names: ClassVar[tuple[str, ...]] = ("left", "right")
     control_units: ClassVar[tuple[str, ...]] = ("m/s^2", "m/s^2")
     per_element: ClassVar[tuple[str, ...]] = ("drag", "thrust_gain", "turn_drag", "turn_gain")
-
-    def __post_init__(self) -> None:
-        check_options(self, "planar")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, _, theta, vx, vy, turning = components(x)

@@ -173,7 +173,7 @@ def pose_rates(v: Components, q: Components, w: Components, a: Tensor, gravity: 
 
 
 @dataclass(frozen=True)
-class QuadrotorPlanning(Dynamics):
+class QuadrotorPlanning(Dynamics, named="quadrotor"):
     """Planning model: x = [p (m), v (m/s), q, w (rad/s), a (m/s^2)], u = [w_c, a_c], n = 14, m = 4 (section 5.2).
 
         p' = v,  v' = a R(q) e3 - g e3,  q' = 1/2 Qx(w) q,  w' = (w_c - w)/T_w,  a' = (a_c - a)/T_a
@@ -201,9 +201,6 @@ class QuadrotorPlanning(Dynamics):
     control_units: ClassVar[Texts] = ("rad/s", "rad/s", "rad/s", "m/s^2")
     per_element: ClassVar[tuple[str, ...]] = ("rate_time_constant", "thrust_time_constant")
 
-    def __post_init__(self) -> None:
-        check_options(self, "quadrotor")
-
     @property
     def control_limits(self) -> tuple[Limits, Limits]:
         """The least and greatest controls that the vehicle can follow, None where there is no limit."""
@@ -227,7 +224,7 @@ class QuadrotorPlanning(Dynamics):
 
 
 @dataclass(frozen=True)
-class QuadrotorPlant(Dynamics):
+class QuadrotorPlant(Dynamics, named="plant"):
     """Full quadrotor: x = [p, v, q, w, F (N)], u = commanded rotor speeds (rpm), n = 17, m = 4 (section 2).
 
     A step ends by limiting the thrusts to [f_min, f_max] and renormalising the quaternion. Derivatives include both:
@@ -248,9 +245,6 @@ class QuadrotorPlant(Dynamics):
     state_units: ClassVar[Texts] = (*POSE_UNITS, *["N"] * 4)
     control_names: ClassVar[Texts] = ROTORS
     control_units: ClassVar[Texts] = ("rpm",) * 4
-
-    def __post_init__(self) -> None:
-        check_options(self, "plant")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
@@ -284,7 +278,7 @@ def with_unit_quaternion(x: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class RotorTracking(Dynamics):
+class RotorTracking(Dynamics, named="rotors"):
     """Tracking model: x = [w (rad/s), F (N)], u = rotor speeds (rpm), n = 7, m = 4 (section 5.2, Table 5).
 
     Raises:
@@ -301,9 +295,6 @@ class RotorTracking(Dynamics):
     state_units: ClassVar[Texts] = (*["rad/s"] * 3, *["N"] * 4)
     control_names: ClassVar[Texts] = ROTORS
     control_units: ClassVar[Texts] = ("rpm",) * 4
-
-    def __post_init__(self) -> None:
-        check_options(self, "rotors")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         w, F = x[..., :3], x[..., 3:]

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Seconds, check_options
+from torchgco.base.options import Seconds
 from torchgco.base.shapes import components, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
@@ -16,7 +16,7 @@ from torchgco.dynamics.quadrotor import POSE, POSE_UNITS, THRUSTS, Airframe, Lim
 
 
 @dataclass(frozen=True)
-class QuadrotorThrusts(Dynamics):
+class QuadrotorThrusts(Dynamics, named="quadrotor"):
     """x = [p (m), v (m/s), q, w (rad/s)], u = [F_1, ..., F_4] (N), n = 13, m = 4: `QuadrotorPlant` with instant rotors.
 
         p' = v,  v' = sum(F) / m R(q) e3 / |q|^2 - g e3,  q' = 1/2 Qx(w) q,  w' = J^-1 (T F - w x (J w) - D w)
@@ -38,9 +38,6 @@ class QuadrotorThrusts(Dynamics):
     state_units: ClassVar[Texts] = POSE_UNITS
     control_names: ClassVar[Texts] = THRUSTS
     control_units: ClassVar[Texts] = ("N",) * 4
-
-    def __post_init__(self) -> None:
-        check_options(self, "quadrotor")
 
     @property
     def control_limits(self) -> tuple[Limits, Limits]:

@@ -8,14 +8,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Seconds, check_options
+from torchgco.base.options import Seconds
 from torchgco.base.shapes import components, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 
 
 @dataclass(frozen=True)
-class Unicycle(Dynamics):
+class Unicycle(Dynamics, named="unicycle"):
     """Unicycle: x = [p (2, m), heading (rad), speed (m/s)], u = [acceleration (m/s^2), turn rate (rad/s)].
 
         p' = speed [cos heading, sin heading],  heading' = turn rate,  speed' = acceleration
@@ -38,9 +38,6 @@ class Unicycle(Dynamics):
     state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "m/s")
     control_names: ClassVar[tuple[str, ...]] = ("acceleration", "turn rate")
     control_units: ClassVar[tuple[str, ...]] = ("m/s^2", "rad/s")
-
-    def __post_init__(self) -> None:
-        check_options(self, "unicycle")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, _, heading, speed = components(x)

@@ -75,7 +75,7 @@ def _pairs(group: Group) -> Iterator[tuple[int, int]]:
 
 def _tight(kinds: Kinds, group: Group, t: State) -> Tensor:
     """Rows (b, K, p) with less room than a slack is given at first, or than a guess is moved inside of its bounds."""
-    c, room = group.place.of(t.c), torch.full_like(t.mu, kinds.how.push).view(-1, 1, 1)
+    c, room = group.place.of(t.c), torch.full_like(t.mu, kinds.how.bound_push).view(-1, 1, 1)
     if group.is_bound:
         of = (t.U if group.of_controls else t.X)[:, group.place.knots]
         above, below = group.variables(0)
@@ -155,7 +155,7 @@ def readmit(kinds: Kinds, model: Model, t: State, of: Tensor, admitted: float) -
     some, part = t.take(rows), model.take(rows)
     come = _is_broken(some, admitted) & _moves(part, some)
     some.out = some.out & ~come
-    some.s = torch.where(come, kinds.how.push, some.s)
+    some.s = torch.where(come, kinds.how.bound_push, some.s)
     t.out[rows], t.s[rows] = some.out, some.s
     rows = rows[come.any(-1)]
     if rows.numel() == 0:
@@ -185,7 +185,7 @@ def relax(kinds: Kinds, model: Model, t: State) -> None:
     some.rows_relaxed = torch.ones_like(some.rows_relaxed)
     at: Derivatives = part.slopes(some.X, some.U)
     change = at.push(_responses(at.F, *_changes(part, some)), some.c)
-    room = kinds.how.relaxes * kinds.how.violation * torch.minimum(change.abs(), some.room)
+    room = kinds.how.relaxes * kinds.how.constr_viol_tol * torch.minimum(change.abs(), some.room)
     some.relaxed = torch.where(kinds.inside(some) & torch.isfinite(room), room, 0.0)
     some.s = some.s + some.relaxed
     settle(kinds, part, some)
@@ -195,7 +195,7 @@ def relax(kinds: Kinds, model: Model, t: State) -> None:
 
 def breaks_rows_left_out(kinds: Kinds, t: State) -> Tensor:
     """Whether rows that were left out are violated, (b,)."""
-    return (t.out & ~t.fixes & ~kinds.equality & ~(t.c <= kinds.how.violation)).any(-1)
+    return (t.out & ~t.fixes & ~kinds.equality & ~(t.c <= kinds.how.constr_viol_tol)).any(-1)
 
 
 def split_multipliers(model: Model, t: State, lam: Tensor) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,10 +14,12 @@ from torchgco.eager.kkt import kkt
 from torchgco.eager.loop import solve
 from torchgco.eager.model import Model
 from torchgco.eager.rows import is_function, joined
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.problem.border import ONE_KNOT
 from torchgco.problem.joined import scattered
 from torchgco.problem.problem import Problem
+from torchgco.problem.scale import CostScale
 
 STATE_OFFSET = 1e-3  # of the states at which rows are looked at, as a share of 1 + |x|
 LEAST_VIOLATION = 100.0  # units of the last bit of lengths of 1 m, below which a rollout doesn't meet rows
@@ -48,12 +49,13 @@ class EagerInterior:
         return cls(Model.of(problem))
 
     def solve(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
-    ) -> dict[str, Tensor]:
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor,
+        scale: CostScale, options: BarrierOptions,
+    ) -> dict[str, Tensor]:  # fmt: skip
         """As `native.interior.InteriorEngine.solve`; options that rounding in the problem's dtype can't meet are raised
         to what it can (`fitted`).
         """
-        return solve(self.model.among(problem), X, U, multipliers, barrier, **options | fitted(options, X.dtype))
+        return solve(self.model.among(problem), X, U, multipliers, barrier, scale, fitted(options, X.dtype))
 
     def kkt(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
@@ -63,7 +65,7 @@ class EagerInterior:
         return kkt(self.model.among(problem), X, U, multipliers, active, right, give, K)
 
 
-def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:
+def fitted(options: BarrierOptions, dtype: torch.dtype) -> BarrierOptions:
     """Options for a precision: as they are in float64.
 
     Shares of rounding (pivots) grow with the unit of the last bit, by 2^29 in float32, and the dual regularisation,
@@ -73,15 +75,18 @@ def fitted(options: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:
     """
     coarser = torch.finfo(dtype).eps / torch.finfo(torch.float64).eps
     if coarser == 1.0:
-        return {}
-    return {
-        "pivot": options["pivot"] * coarser,
-        "closest": 1.0 - (1.0 - options["closest"]) * coarser,
-        "soft": options["soft"] * coarser**0.5,
-        "tolerance": options["tolerance"] * coarser ** (1.0 / 3.0),
-        "rounding": options["tolerance"] * coarser**0.5,
-        "violation": least_violation(options["violation"], dtype),
-    }
+        return options
+    rounding = options.tol * coarser**0.5
+    return replace(
+        options,
+        pivot=options.pivot * coarser,
+        tau_max=1.0 - (1.0 - options.tau_max) * coarser,
+        jacobian_regularization_value=options.jacobian_regularization_value * coarser**0.5,
+        tol=options.tol * coarser ** (1.0 / 3.0),
+        rounding=rounding,
+        acceptable_tol=max(options.acceptable_tol, rounding),
+        constr_viol_tol=least_violation(options.constr_viol_tol, dtype),
+    )
 
 
 def least_violation(tolerance: float, dtype: torch.dtype) -> float:

@@ -1,13 +1,12 @@
 """The interior point of Waechter and Biegler (2006) in PyTorch's kernels, for a batch of problems at once.
 
-The algorithm is that of native/c/interior.c, step by step; solvers/interior says what its options mean. Problems that
-have ended leave the batch.
+The algorithm is that of native/c/interior.c, step by step; lagrangian/barrier.py says what its options mean.
+Problems that have ended leave the batch.
 """
 
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,7 +27,6 @@ from torchgco.eager.search import Step, curvature, go_back, search, stepped
 from torchgco.eager.sizes import steepest
 from torchgco.eager.softness import gives_of
 from torchgco.eager.state import (
-    How,
     Kinds,
     State,
     adjoin,
@@ -43,18 +41,20 @@ from torchgco.eager.state import (
     residuals,
     settle,
 )
+from torchgco.lagrangian.barrier import BarrierOptions
+from torchgco.problem.scale import CostScale
 
 
 def solve(
-    model: Model, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+    model: Model, X: Tensor, U: Tensor, lam: tuple[Tensor, ...], barrier: Tensor, scale: CostScale, how: BarrierOptions
 ) -> dict[str, Tensor]:
     """As `native.interior.InteriorEngine.solve`, for any device and dtype."""
-    problem, how = model.problem, How(**options)
-    flat = torch.cat([X.new_zeros(problem.B, 0), *(lam.flatten(1) for lam in multipliers)], dim=-1)  # (B, R)
+    problem = model.problem
+    flat = torch.cat([X.new_zeros(problem.B, 0), *(part.flatten(1) for part in lam)], dim=-1)  # (B, R)
     equality = torch.zeros(flat.shape[1], dtype=torch.bool, device=X.device)
     for group in model.groups:
         equality[group.place.rows] = group.part.sense == "equality"
-    kinds = Kinds(equality, how, how.constant, how.least_cost, barrier.clone(), problem.N, problem.n)
+    kinds = Kinds(equality, how, scale, barrier.clone(), problem.N, problem.n)
     B, until = problem.B, time.monotonic() + how.seconds
     out = {
         "status": torch.zeros(B, dtype=torch.int32, device=X.device),
@@ -74,35 +74,37 @@ def solve(
             continue
         t, part = loop.t.take(ended), loop.model.take(ended)
         rows = t.rows
-        end = torch.where((status[ended] == Status.CONVERGED) & breaks_rows_left_out(kinds, t), int(Status.INFEASIBLE),
-                          status[ended])  # fmt: skip
+        stiffest = torch.nn.functional.pad(torch.where(kinds.inside(t), t.z / t.s, 0.0), (0, 1)).amax(-1)
+        end = status[ended]
+        end = torch.where((end == Status.CONVERGED) & breaks_rows_left_out(kinds, t), int(Status.INFEASIBLE), end)
+        # The slack of a violated row without slope falls to 0, and its multiplier has no end.
+        fails = (end == Status.NON_FINITE) | (end == Status.NOT_POSITIVE_DEFINITE)
+        end = torch.where(fails & torch.isposinf(stiffest), int(Status.LINE_SEARCH_FAILED), end)
         out["status"][rows], out["iterations"][rows] = end.to(torch.int32), t.made
         out["error"][rows], out["theta"][rows] = error[ended], t.theta
         out["gains"][rows, ..., : problem.n] = gains(kinds, part, t)
         if how.minimum:
-            stiffest = torch.nn.functional.pad(torch.where(kinds.inside(t), t.z / t.s, 0.0), (0, 1)).amax(
-                -1
-            )  # rounding decides where it is too large
-            falls = ~_factors(kinds, part, t, torch.zeros_like(t.shift)).good & (stiffest < 1.0 / how.rounding)
+            falls = ~_factors(kinds, part, t, torch.zeros_like(t.shift)).good
+            falls &= stiffest < 1.0 / how.rounding  # which decides where it is larger
             out["falls"][rows] = falls.to(X.dtype)
         X[rows], U[rows], barrier[rows] = t.X, t.U, t.mu
-        lam = t.z / column(t.scale)
-        split_multipliers(part, t, lam)
-        flat[rows] = lam
+        found = t.z / column(t.scale)
+        split_multipliers(part, t, found)
+        flat[rows] = found
         loop.keep((status == Status.RUNNING).nonzero().flatten())
     sizes = [knots * rows for knots, rows in problem.row_shapes]
-    for lam, part in zip(multipliers, flat.split(sizes, dim=-1), strict=True):
-        lam.copy_(part.view_as(lam))
+    for own, part in zip(lam, flat.split(sizes, dim=-1), strict=True):
+        own.copy_(part.view_as(own))
     return out
 
 
 def begin(kinds: Kinds, model: Model, t: State) -> None:
     """The scale of the cost, slacks and multipliers."""
     how = kinds.how
-    t.soft = torch.full_like(t.mu, how.soft)
+    t.soft = torch.full_like(t.mu, how.jacobian_regularization_value)
     slopes, H = model.cost_model(t.X, t.U)
     largest, plain = steepest(model, t.X, t.U, slopes, H)
-    scale = how.steepest / largest
+    scale = how.nlp_scaling_obj_target_gradient / largest
     scaled = torch.isfinite(scale) & (largest > 0.0)
     t.scale, t.raised = torch.where(scaled, scale, t.scale), torch.where(scaled, plain / largest, t.raised)
     t.mu = first_barrier(kinds, t)
@@ -112,7 +114,7 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
     if bool(kinds.equality.any()):
         share, rows = torch.full_like(t.mu, how.slight), kinds.equality.expand_as(t.out)
         t.gives = gives_of(model, model.slopes(t.X, t.U), diagonal, share, rows)
-    t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.push * t.room), 1.0)
+    t.s = torch.where(kinds.inside(t), torch.maximum(-t.c, how.bound_push * t.room), 1.0)
     remeasure(kinds, t)
     if not how.warm:
         renew(kinds, model, t)
@@ -120,7 +122,7 @@ def begin(kinds: Kinds, model: Model, t: State) -> None:
         return
     join_multipliers(model, t)
     z = column(t.scale) * t.z
-    inside = torch.maximum(z, column(t.mu) / (how.central * t.s))
+    inside = torch.maximum(z, column(t.mu) / (how.kappa_sigma * t.s))
     t.z = torch.where(kinds.inside(t), inside, torch.where(kinds.fixed(t), z, 0.0))
     adjoin(kinds, model.slopes(t.X, t.U), t)
 
@@ -157,20 +159,20 @@ class _Loop:
         """One iteration; the statuses (b,) of the problems that end, RUNNING for others, and the errors (b,)."""
         kinds, model, t, how = self.kinds, self.model, self.t, self.kinds.how
         every = torch.ones_like(t.watching)
-        readmit(kinds, model, t, every, how.highest)  # beyond which no residual is accepted
+        readmit(kinds, model, t, every, how.theta_max_fact)  # beyond which no residual is accepted
         relax(kinds, model, t)
         at, r = _expanded(model, t), residuals(kinds, t, t.c, t.s)
         test = errors(kinds, at, t, r, model.problem.free_start)
         status = torch.full_like(t.made, int(Status.RUNNING))
         astray = t.watching & ~torch.isfinite(test.whole)
-        small = (test.whole <= max(how.tolerance, how.rounding)) & (test.primal <= how.violation) & ~t.restoring
+        small = (test.whole <= max(how.tol, how.acceptable_tol)) & (test.primal <= how.constr_viol_tol) & ~t.restoring
         if bool(astray.any()):
             go_back(t, astray)
         solved = find_solved(kinds, t, test, ~astray)
-        again = readmit(kinds, model, t, solved, how.violation)
+        again = readmit(kinds, model, t, solved, how.constr_viol_tol)
         if bool(again.any()):
             at, r = _expanded(model, t), residuals(kinds, t, t.c, t.s)
-        over = t.made >= how.max_iterations
+        over = t.made >= how.max_iter
         limit = torch.where(small, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
         ended = torch.where(over, limit, status)
         ended = torch.where(torch.isfinite(test.whole), ended, int(Status.NON_FINITE))
@@ -193,11 +195,11 @@ class _Loop:
         lost = running & ~moving & ~astray
         indefinite = torch.where(small, int(Status.CONVERGED), int(Status.NOT_POSITIVE_DEFINITE))
         status[:] = torch.where(lost, indefinite, status)
-        tau = torch.clamp(1.0 - t.mu, min=how.boundary, max=how.closest)
+        tau = torch.clamp(1.0 - t.mu, min=how.tau_min, max=how.tau_max)
         won = search(kinds, self.model, t, step, moving, tau)
         t.made = t.made + running.to(t.made.dtype)
         self._remember_shift(won)
-        t.soft = torch.where(won, (how.soft_decay * t.soft).clamp(min=how.soft), t.soft)
+        t.soft = torch.where(won, (how.soft_decay * t.soft).clamp(min=how.jacobian_regularization_value), t.soft)
         t.failures = torch.where(won & ~t.restoring & (t.forced == 0.0), 0, t.failures)
         status[:] = torch.where(moving & ~won & small, int(Status.CONVERGED), status)
         lost = self._recover(moving & ~won & ~small)
@@ -254,11 +256,12 @@ class _Loop:
             bad = of & ~lost & ~step.factors.good
             if not bool(bad.any()):
                 return of & ~lost
-            first = torch.where(never, how.shift_first, (how.shift_decay * t.last).clamp(min=how.shift_least))
-            growth = torch.where(never, how.shift_growth_first, torch.full_like(t.last, how.shift_growth))
+            less = (how.perturb_dec_fact * t.last).clamp(min=how.min_hessian_perturbation)
+            first = torch.where(never, how.first_hessian_perturbation, less)
+            growth = torch.where(never, how.perturb_inc_fact_first, torch.full_like(t.last, how.perturb_inc_fact))
             following = torch.where(t.shift == 0.0, first, growth * t.shift)
             t.shift = torch.where(bad, following, t.shift)
-            lost = lost | (bad & ~(t.shift <= how.shift_max))
+            lost = lost | (bad & ~(t.shift <= how.max_hessian_perturbation))
             self._factor(step, bad.nonzero().flatten())
 
     # Feasibility alone ----------------------------------------------------------------------------------------------
@@ -274,7 +277,7 @@ class _Loop:
         t.failures = t.failures + failed.to(t.failures.dtype)
         lost = failed & (t.failures > how.failures)
         renewed = failed & ~lost
-        seeks = renewed & (t.theta > how.violation) & ~t.restoring
+        seeks = renewed & (t.theta > how.constr_viol_tol) & ~t.restoring
         t.forced = torch.where(renewed, (how.forced_growth * t.forced).clamp(min=how.shift_recovery), t.forced)
         t.entered = torch.where(seeks, t.theta, t.entered)
         t.restoring = torch.where(renewed, seeks, t.restoring)
@@ -285,7 +288,8 @@ class _Loop:
     def _resume(self, of: Tensor) -> None:
         """Problems that have become feasible enough go on with the cost."""
         t, how = self.t, self.kinds.how
-        done = of & t.restoring & ((t.theta <= how.restored * t.entered) | (t.theta <= how.violation))
+        less = t.theta <= how.required_infeasibility_reduction * t.entered
+        done = of & t.restoring & (less | (t.theta <= how.constr_viol_tol))
         t.restoring = t.restoring & ~done
         t.objective = torch.where(done, 1.0, t.objective)
         self._anew(done)

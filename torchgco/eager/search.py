@@ -87,7 +87,7 @@ def _refused(t: State, theta: Tensor, phi: Tensor) -> Tensor:
 def _remember(kinds: Kinds, t: State, of: Tensor) -> None:
     """Add the iterates of the problems `of` to their filters, without what they dominate; the oldest is given up."""
     how = kinds.how
-    pair = torch.stack(((1.0 - how.gain_theta) * t.theta, t.phi - how.gain_phi * t.theta), dim=-1).unsqueeze(1)
+    pair = torch.stack(((1.0 - how.gamma_theta) * t.theta, t.phi - how.gamma_phi * t.theta), dim=-1).unsqueeze(1)
     stays = (t.filter < pair).any(-1)
     order = (~stays).to(torch.int64).argsort(dim=1, stable=True)
     kept = torch.where(stays.unsqueeze(-1), t.filter, torch.inf)
@@ -106,12 +106,12 @@ def _good(kinds: Kinds, t: State, alpha: Tensor, slope: Tensor, theta: Tensor, p
     how, old = kinds.how, t.theta
     noise = how.noise * torch.finfo(phi.dtype).eps * t.phi.abs()
     finite = torch.isfinite(theta) & torch.isfinite(phi)
-    gain = torch.where(slope < 0.0, alpha * (-slope).clamp(min=0.0).pow(how.power_phi), 0.0)
-    descends = (old <= t.lowest) & (gain > how.switching * old.pow(how.power_theta)) & ~t.restoring
-    falls = phi - t.phi - noise <= how.armijo * alpha * slope
-    less = (theta <= (1.0 - how.gain_theta) * old) | (phi - noise <= t.phi - how.gain_phi * old)
+    gain = torch.where(slope < 0.0, alpha * (-slope).clamp(min=0.0).pow(how.s_phi), 0.0)
+    descends = (old <= t.lowest) & (gain > how.delta * old.pow(how.s_theta)) & ~t.restoring
+    falls = phi - t.phi - noise <= how.eta_phi * alpha * slope
+    less = (theta <= (1.0 - how.gamma_theta) * old) | (phi - noise <= t.phi - how.gamma_phi * old)
     usual = ~_refused(t, theta, phi) & torch.where(descends, falls, less)
-    good = torch.where(t.restoring, theta <= (1.0 - how.armijo * alpha) * old, usual)
+    good = torch.where(t.restoring, theta <= (1.0 - how.eta_phi * alpha) * old, usual)
     descends = descends & finite & ~_refused(t, theta, phi)
     return good & finite, descends
 
@@ -165,7 +165,7 @@ def _descent(kinds: Kinds, t: State, step: Step) -> Tensor:
 
 def _accept(kinds: Kinds, t: State, step: Step, trial: Trial, won: Tensor, alpha: Tensor, dual: Tensor) -> None:
     """Move the problems `won` to their trials."""
-    by, bound = alpha.view(-1, 1, 1), kinds.how.central
+    by, bound = alpha.view(-1, 1, 1), kinds.how.kappa_sigma
     center = column(t.mu) / trial.s
     z = torch.minimum(t.z + column(dual) * step.dz, bound * center)
     z = torch.where(kinds.inside(t), torch.maximum(z, center / bound), t.z + column(alpha) * step.dz)
@@ -198,7 +198,7 @@ def go_back(t: State, of: Tensor) -> None:
 
 def _watch(kinds: Kinds, t: State, moving: Tensor, slope: Tensor, full: Tensor) -> None:
     """Problems whose steps have been short for long take some full ones on trial (the paper's watchdog)."""
-    begins = moving & ~t.watching & ~t.restoring & (t.shortened >= kinds.how.patience)
+    begins = moving & ~t.watching & ~t.restoring & (t.shortened >= kinds.how.watchdog_shortened_iter_trigger)
     if not bool(begins.any()):
         return
     t.watching = t.watching | begins
@@ -225,7 +225,7 @@ def _judged(
     begun = torch.where(watching, t.slope, slope), torch.where(watching, t.alpha, alpha)
     accepted, descends = _good(kinds, t, begun[1], begun[0], trial.theta, trial.phi)
     sound = watching & ~accepted & (trial.theta <= t.highest) & torch.isfinite(trial.phi)
-    ahead = sound & (t.ahead < how.trials)
+    ahead = sound & (t.ahead < how.watchdog_trial_iter_max)
     t.ahead = t.ahead + sound.to(t.ahead.dtype)
     back = watching & ~accepted & ~ahead
     t.watching = watching & ~accepted
@@ -234,7 +234,7 @@ def _judged(
         _remember(kinds, t, noted)
     refused = ~accepted & ~watching
     again = torch.zeros_like(refused)
-    if first and how.corrects:
+    if first and how.max_soc:
         again = refused & ~t.restoring & (trial.theta >= t.theta)
     t.theta, t.phi = torch.where(accepted, trial.theta, t.theta), torch.where(accepted, trial.phi, t.phi)
     short = accepted & ~watching
@@ -279,7 +279,7 @@ def search(kinds: Kinds, model: Model, t: State, step: Step, moving: Tensor, tau
         alpha[open_], dual[open_] = a, d
         won[open_] = done
         corrected[open_] = found.again
-        open_ = open_[~done & (found.again | (a >= how.smallest))]
+        open_ = open_[~done & (found.again | (a >= how.alpha_min))]
         first = False
     return won
 

@@ -8,7 +8,6 @@ that coincide. Rows without a part in either stay out (`fixed.py`). s is 1 where
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -16,12 +15,12 @@ from torch import Tensor
 from torchgco.base.tree import put as put_rows
 from torchgco.base.tree import take as take_rows
 from torchgco.eager.model import Derivatives, Model, Values
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.problem.problem import Problem
+from torchgco.problem.scale import CostScale
 
 FILTERED = 64  # entries of a filter; the oldest are forgotten
 LONGEST_FALL = 50  # reductions of the barrier parameter in one iteration
-
-How = SimpleNamespace  # the options: see solvers.interior.FILTER
 
 
 @dataclass
@@ -89,9 +88,8 @@ class Kinds:
     """What does not differ between problems of a form."""
 
     equality: Tensor  # (R,) bool
-    how: How
-    constant: Tensor  # (B,): what of the cost does not count
-    least_cost: Tensor  # (B,)
+    how: BarrierOptions
+    costs: CostScale
     barrier: Tensor  # (B,): mu at the start
     N: int
     n: int
@@ -173,7 +171,7 @@ def remeasure(kinds: Kinds, t: State) -> None:
     t.theta = theta_of(t.gap, residuals(kinds, t, t.c, t.s))
     t.phi = t.cost - t.mu * logarithms(t.s)
     base = torch.maximum(t.theta, torch.ones_like(t.theta))
-    t.highest, t.lowest = how.highest * base, how.lowest * base
+    t.highest, t.lowest = how.theta_max_fact * base, how.theta_min_fact * base
     t.filter = torch.full_like(t.filter, torch.inf)
 
 
@@ -192,7 +190,7 @@ def adjoin(kinds: Kinds, at: Derivatives, t: State) -> None:
     for k in range(kinds.N - 1, 0, -1):
         y.append(torch.baddbmm(g[k], fx[k].mT, y[-1]))
     found = torch.stack([torch.zeros_like(g[0]), *y[::-1]]).squeeze(-1).transpose(0, 1)
-    sound = found.abs().flatten(1).amax(-1) <= kinds.how.largest_multiplier * t.raised
+    sound = found.abs().flatten(1).amax(-1) <= kinds.how.constr_mult_init_max * t.raised
     t.y = torch.where(sound.view(-1, 1, 1), found, 0.0)
 
 
@@ -219,7 +217,7 @@ def errors(kinds: Kinds, at: Derivatives, t: State, r: Tensor, free: Tensor | No
         gap = torch.maximum(gap, r.abs().amax(-1))
     sum_y, sum_z = t.y.abs().flatten(1).sum(-1), torch.minimum(t.z.abs(), column(how.explodes * t.raised)).sum(-1)
     mean = (sum_y + sum_z) / (kinds.N * n + t.z.shape[1])
-    usual = torch.full_like(mean, how.usual_multiplier)
+    usual = torch.full_like(mean, how.s_max)
     dual = slope.abs().flatten(1).amax(-1) * usual / torch.maximum(mean, usual)
     scale_z = usual / torch.maximum(sum_z / max(t.z.shape[1], 1), usual)
     whole = torch.maximum(torch.maximum(dual, gap), complementarity(kinds, t, how.smoothing * t.scale) * scale_z)
@@ -236,16 +234,16 @@ def complementarity(kinds: Kinds, t: State, mu: Tensor) -> Tensor:
 def lower_barrier(kinds: Kinds, t: State, test: Errors, running: Tensor) -> None:
     """The next mu where the barrier problem is solved well enough; the filter begins again there."""
     how = kinds.how
-    base, usual = torch.maximum(test.dual, test.primal), how.tolerance * how.barrier_floor
-    smallest = torch.where(t.presses, how.barrier_least, torch.full_like(t.mu, usual))
+    base, usual = torch.maximum(test.dual, test.primal), how.tol * how.mu_floor
+    smallest = torch.where(t.presses, how.mu_min, torch.full_like(t.mu, usual))
     smallest = how.smoothing * t.scale if how.smoothing > 0 else smallest
     lowered = torch.zeros_like(t.presses)
     for _ in range(LONGEST_FALL):
         error = torch.maximum(base, complementarity(kinds, t, t.mu) * test.scale_z)
-        low = (error <= how.barrier_error * t.mu) & (t.mu > smallest) & running & ~t.restoring & ~t.watching
+        low = (error <= how.barrier_tol_factor * t.mu) & (t.mu > smallest) & running & ~t.restoring & ~t.watching
         if not bool(low.any()):
             break
-        following = torch.maximum(smallest, torch.minimum(how.barrier_share * t.mu, t.mu * t.mu.sqrt()))
+        following = torch.maximum(smallest, torch.minimum(how.mu_linear_decrease_factor * t.mu, t.mu * t.mu.sqrt()))
         t.mu = torch.where(low, following, t.mu)
         lowered = lowered | low
     t.phi = torch.where(lowered, t.cost - t.mu * logarithms(t.s), t.phi)
@@ -262,17 +260,17 @@ def find_solved(kinds: Kinds, t: State, test: Errors, running: Tensor) -> Tensor
     how, error = kinds.how, test.whole
     t.idle = torch.where(running, torch.where(error <= 0.5 * t.least, 0, t.idle + 1), t.idle)
     t.least = torch.where(running & (error < t.least), error, t.least)
-    feasible = running & ~t.restoring & (test.primal <= how.violation)
-    met = feasible & (error <= how.tolerance)
+    feasible = running & ~t.restoring & (test.primal <= how.constr_viol_tol)
+    met = feasible & (error <= how.tol)
     left, size = left_over(kinds, t)
     counts = met & (left > how.counts * size) & (how.smoothing == 0)
     t.idle = torch.where(counts & (left <= 0.5 * t.left), 0, t.idle)
     t.left = torch.where(counts, torch.minimum(left, t.left), t.left)
-    t.presses, rests = t.presses | counts, t.idle >= how.idle
+    t.presses, rests = t.presses | counts, t.idle >= how.acceptable_iter
     met = met & (~counts | rests)
-    loose = ~t.presses if how.tolerance >= how.rounding else torch.zeros_like(met)
+    loose = ~t.presses if how.tol >= how.rounding else torch.zeros_like(met)
     met = met & (loose | (error <= 2.0 * t.mu) | (t.idle >= 1))
-    return met | (feasible & rests & (error <= how.rounding))
+    return met | (feasible & rests & (error <= how.acceptable_tol))
 
 
 def left_over(kinds: Kinds, t: State) -> tuple[Tensor, Tensor]:
@@ -281,5 +279,5 @@ def left_over(kinds: Kinds, t: State) -> tuple[Tensor, Tensor]:
     Where the units are small, neither need be small beside the cost where its tolerance is met.
     """
     left = torch.where(kinds.inside(t), t.s * t.z, 0.0).sum(-1) + (t.z * residuals(kinds, t, t.c, t.s)).abs().sum(-1)
-    constant, size = kinds.constant[t.rows], kinds.least_cost[t.rows]
+    constant, size = kinds.costs.constant[t.rows], kinds.costs.size[t.rows]
     return left, (t.cost - t.scale * constant).abs() + t.scale * size

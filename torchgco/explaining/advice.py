@@ -15,7 +15,7 @@ MANY = 3  # limits that are named
 
 BY_STATUS = {
     Status.FEASIBLE: "More iterations lower the cost: torchgco.solve(problem, warm=solution), or higher "
-    "limits{limits}; torchgco.Polish() refines float64 solutions.",
+    'limits{limits}; solver="interior_point" with it goes on to the last digits.',
     Status.MAX_ITERATIONS: "Higher limits{limits}, or torchgco.solve(problem, warm=solution), which goes on from here.",
     Status.LINE_SEARCH_FAILED: "Units in which states, controls and costs are of similar size; no kinks (abs, clamp) "
     "in dynamics, cost and constraints.",

@@ -181,7 +181,7 @@ def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]
     lines += _duration(solved, b, one)
     worst = place_told(one.problem, one.X, one.U, one.t)
     lines.append("no constraint is violated" if worst is None else f"violated most: {worst}")
-    lines += gates_told(one.held, one.full_X)
+    lines += gates_told(one.held, one.full_X, one.full_U)
     if facts.steps is not None:
         lines.append(f"steps are too long for the model: {facts.steps}")
     if facts.clearance is not None and facts.clearance < float("inf"):

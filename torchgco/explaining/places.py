@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.gates import GateBalls, GateSquares
-from torchgco.judging.gates import passes
+from torchgco.constraints.gates import GateSquares
+from torchgco.judging.gates import passages
 from torchgco.judging.worst import NO_PLACE, kind_of, worst_rows
 from torchgco.problem.problem import Problem
 
@@ -88,12 +89,12 @@ def constraint_told(constraint: Constraint, i: int) -> str:
     return f"constraints[{i}] ({kind_of(constraint)})"
 
 
-def gates_told(problem: Problem, X: Tensor) -> list[str]:
-    """The first of each constraint's gates that X (1, N+1, n) doesn't pass after those before it, and why."""
+def gates_told(problem: Problem, X: Tensor, U: Tensor) -> list[str]:
+    """The first of each constraint's gates that X (1, N+1, n), U (1, N, m) don't pass after others, and why."""
     lines = []
-    for part in problem.constraints:
-        gates, way = part.bare, passes(part, X)
-        if way is None or bool(way.passed.all()) or not isinstance(gates, GateBalls | GateSquares):
+    for i, way in passages(problem, X, U).items():
+        gates: Any = problem.constraints[i].bare
+        if bool(way.passed.all()):
             continue
         g = int((~way.passed[0]).nonzero()[0])
         away, size, square = float(way.distance[0, g]), float(gates.sizes[0, g]), isinstance(gates, GateSquares)

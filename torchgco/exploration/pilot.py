@@ -27,9 +27,8 @@ from torchgco.exploration.explorer import (
     Unknown,
     unflyable,
 )
-from torchgco.exploration.former import braking, ends_at_rest, former_plans
 from torchgco.exploration.movers import Known, Movers, Tracks, Unaware
-from torchgco.exploration.safety import AT_REST
+from torchgco.exploration.safety import AT_REST, braking, ends_at_rest, former_plans
 from torchgco.exploration.scout import DRIFT, SEARCH_OPTIONS, SPARE, Scout
 from torchgco.exploration.sensing.grid import NOT_FREE, SEEN_OCCUPIED
 from torchgco.exploration.sensing.search import Search

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey
-from torchgco.base.options import AtLeast, Positive, check_options
+from torchgco.base.options import AtLeast, Checked, Positive
 from torchgco.base.tree import put, take
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
@@ -24,7 +24,7 @@ DIVERGED = 1e3  # times the cost of staying at the start: a costlier sample mean
 
 
 @dataclass(frozen=True)
-class GCO:
+class GCO(Checked, named="gco"):
     """Where a solved trajectory is caught between obstacles, attract it to a region that MPPI found.
 
     r_guide is the vehicle's radius, or without spheres and boxes `R_GUIDE` times the distance from start to goal
@@ -49,9 +49,6 @@ class GCO:
     start_from_sample: bool = False
     sample_from_rest: bool = False
     single_contact_after: ClassVar[int | None] = None  # as of `Solve`, whose rule `in_search` takes over
-
-    def __post_init__(self) -> None:
-        check_options(self, "gco")
 
     def suited(self, problem: Problem) -> GCO | None:
         """This guidance where it can serve a problem; None where it can't, which a GuidanceWarning explains.

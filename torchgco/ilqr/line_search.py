@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Natural, check_options
+from torchgco.base.options import Checked, Natural
 from torchgco.dynamics.rollout import closed_loop
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.lagrangian.lagrangian import Lagrangian
@@ -34,7 +34,7 @@ class Rollouts:
 
 
 @dataclass(frozen=True)
-class LineSearch:
+class LineSearch(Checked, named="line_search"):
     """Backtracking on the ratio of actual to expected change of L_M, with the constants of the paper.
 
     Args:
@@ -51,9 +51,6 @@ class LineSearch:
     ratio_min: ClassVar[float] = 1e-4  # accepted range of the ratio
     ratio_max: ClassVar[float] = 10.0
     smallest: ClassVar[float] = 1e-4  # no shorter step is tried, but for one as printed: the first below this
-
-    def __post_init__(self) -> None:
-        check_options(self, "line_search")
 
     def ladder(self, accept_last: bool) -> list[float]:
         """1, phi, phi^2, ... down to `smallest`, and with `accept_last` the first one below."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients, slope_along
@@ -290,7 +290,7 @@ def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
     rest = g
     if len(cone):
         try:
-            lam = nnls(cone.T, -g, maxiter=10 * len(cone))[0]
+            lam = scipy.optimize.nnls(cone.T, -g, maxiter=10 * len(cone))[0]
         except RuntimeError:  # no convergence (nearly dependent rows): the clipped free fit is an upper bound too
             lam = np.linalg.lstsq(cone.T, -g, rcond=None)[0].clip(min=0.0)
         rest = g + lam @ cone

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -12,6 +12,8 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.obstacles.base import ADMITTED
 from torchgco.obstacles.measured import segment_distance
+from torchgco.problem.between import Paths, paths
+from torchgco.problem.problem import Problem
 
 
 class Passes(NamedTuple):
@@ -27,10 +29,35 @@ class Passes(NamedTuple):
 class Meetings(NamedTuple):
     """What a trajectory does at one gate on its way to each knot from 1 to N, (B, N)."""
 
-    time: Tensor  # in knots
-    next: Tensor  # the time from which on the gate after it may be passed
+    time: Tensor  # in knots: until which the gate may be passed on this way
+    next: Tensor  # the time from which on the gate after it may be passed, if that before this one was passed earlier
     distance: Tensor  # m; see `Passes`
     passes: Tensor  # bool
+
+
+def passages(problem: Problem, X: Tensor, U: Tensor, along: Sequence[Paths] | None = None) -> dict[int, Passes]:
+    """How trajectories X (B, N+1, n), U (B, N, m) pass gates on the paths that the integrator takes.
+
+    Args:
+        along: these paths, where they are known.
+
+    Returns:
+        By the places of the constraints that are gates.
+    """
+    held = [i for i, part in enumerate(problem.constraints) if isinstance(part.bare, GateBalls | GateSquares)]
+    if not held:
+        return {}
+    along = paths(problem, X, U) if along is None else along
+    order = torch.cat([path.rows for path in along]).argsort()
+    found = {}
+    for i in held:
+        ways = []
+        for path in along:
+            way = passes(problem.constraints[i].take(path.rows), path.X)
+            assert way is not None
+            ways.append(way._replace(when=-(-way.when // path.pieces)))
+        found[i] = Passes(*(torch.cat(column)[order] for column in zip(*ways, strict=True)))
+    return found
 
 
 def passes(constraint: Constraint, X: Tensor) -> Passes | None:
@@ -43,12 +70,19 @@ def passes(constraint: Constraint, X: Tensor) -> Passes | None:
 
 def through_balls(centers: Tensor, radii: Tensor, p: Tensor) -> Passes:
     """How positions p (B, N+1, d) pass balls (B, G, d) of radii (B, G): where lines come within these, and 1e-3 m."""
+    k, move = torch.arange(p.shape[1] - 1, dtype=p.dtype, device=p.device), p.diff(dim=1)
+    square = move.square().sum(-1).clamp(min=torch.finfo(p.dtype).tiny)
 
     def meetings(g: int) -> Meetings:
-        center = centers[:, g].unsqueeze(1)
-        away = segment_distance(p[:, :-1] - center, p[:, 1:] - center)
-        time = torch.arange(p.shape[1] - 1, dtype=p.dtype, device=p.device).expand_as(away)
-        return Meetings(time, time, away, away <= radii[:, g : g + 1] + ADMITTED)
+        center, reach = centers[:, g].unsqueeze(1), radii[:, g : g + 1] + ADMITTED
+        a = p[:, :-1] - center
+        away = segment_distance(a, p[:, 1:] - center)
+        # Where on the line it is within the ball: |a + share move| <= reach.
+        middle = -(a * move).sum(-1) / square
+        half = (middle.square() - (a.square().sum(-1) - reach.square()) / square).clamp(min=0.0).sqrt()
+        enters, leaves = ((middle + part).clamp(0.0, 1.0) for part in (-half, half))
+        meets = away <= reach
+        return Meetings(k + torch.where(meets, leaves, 1.0), k + enters, away, meets)
 
     return _in_order(p, map(meetings, range(centers.shape[1])))
 
@@ -90,5 +124,5 @@ def _in_order(p: Tensor, gates: Iterable[Meetings]) -> Passes:
         until = torch.where(~passes & (k > first), k, K - 1).amin(-1, keepdim=True)
         way = later & (left | ((k >= first) & (k < until)))
         found.append((~left, first + 1, torch.where(way, away, torch.inf).amin(-1, keepdim=True)))
-        since = torch.where(left, since, next_.gather(1, first.clamp(max=K - 2)))
+        since = torch.where(left, since, torch.maximum(since, next_.gather(1, first.clamp(max=K - 2))))
     return Passes(*(torch.cat(column, dim=1) for column in zip(*found, strict=True)))

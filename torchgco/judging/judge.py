@@ -17,7 +17,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_finite, check_shape, check_tensor, computing_on, tensor
 from torchgco.constraints.base import ADMITTED, Constraint, Distance
 from torchgco.constraints.gates import has_gates
-from torchgco.judging.gates import passes
+from torchgco.judging.gates import passages
 from torchgco.judging.steps import StepErrors, step_errors
 from torchgco.problem.alone import row_by_row
 from torchgco.problem.between import Paths, paths
@@ -210,9 +210,8 @@ def _verdict(
         else:
             others = torch.maximum(others, worst)
     passed, gates = torch.zeros_like(problem.stages), 0
-    for way in (passes(part, X) for part in problem.constraints):
-        if way is not None:
-            passed, gates = passed + way.passed.sum(-1), gates + way.passed.shape[-1]
+    for way in passages(problem, X, U, along).values():
+        passed, gates = passed + way.passed.sum(-1), gates + way.passed.shape[-1]
     finite = torch.isfinite(X).flatten(1).all(-1) & (moved == 0)
     clear_95 = finite & (clearance_knots >= 0) & (others <= ADMITTED)
     feasible = finite & (violation <= ADMITTED) & (clearance >= 0) & (passed == gates)

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable
-from functools import partial
 
 import torch
 
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import is_forward
+from torchgco.base.memory import trim
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import begin_interior
-from torchgco.native.store import trim
 from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
-from torchgco.tracing import Facts
+from torchgco.tracing import CAPTURED, Facts
 
 ENGINES_KEPT = 64  # engines, the most recent ones
-CAPTURED = 1 << 26  # bytes of tensors that these have captured: each is held four times, as it was read and for C, too
 
 
 _uses_native = True
@@ -81,7 +79,7 @@ def kernels_of(problem: Problem) -> Kernels:
 def _natively(problem: Problem) -> NativeKernels | None:
     warned = problem.known.warned
     try:
-        return NativeKernels(_engine(problem), problem.B, lambda error: _warn(warned, error))
+        return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
     except (InputError, NativeError) as error:
         _check_eager(problem)
         _warn(warned, error)
@@ -117,14 +115,16 @@ def expect_interior(problem: Problem) -> None:
 def _engine(problem: Problem) -> Engine:
     """The engine of an earlier solve where nothing that its code depends on has changed, else a new one."""
     before, expects = signature(problem), problem.known.expects_interior
-    ahead = partial(begin_interior, B=problem.B) if expects else None
+    ahead = begin_interior if expects else None
     if before is None:
         return Engine(problem, ahead)
     key = before.key, find_compiler()
     known = _engines.pop(key, None)
     if known is not None and known[1].hold and (shared := known[0].captured.read()) is not None:
         _engines[key] = known  # the most recent one is the last
-        return known[0].with_shared(shared.copy())
+        engine = known[0].with_shared(shared.copy())
+        engine.serve(problem.B, ahead)
+        return engine
     engine, after = Engine(problem, ahead), signature(problem)
     # Code that has changed what it reads, a counter for instance, does so at every solve.
     if after is not None and after.key == before.key and after.covers(engine.captured.traces):

@@ -21,7 +21,7 @@ from torchgco.kernels.in_pytorch import InteriorKernels, Kernels, clearance_of
 from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.state import InnerState, PassEnd, State
-from torchgco.native.engine import Engine, replicas_of
+from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
@@ -40,15 +40,14 @@ class NativeKernels(Kernels):
 
     Args:
         engine: the library of the problems' form.
-        B: problems of a solve, all in all; see `InteriorEngine`.
         warn: is called with the reason why something is left to PyTorch's kernels.
     """
 
     name = "native"
     compiled = True
 
-    def __init__(self, engine: Engine, B: int, warn: Callable[[Exception], None]) -> None:
-        self.engine, self.B, self._warn, self.affine = engine, B, warn, engine.model.affine
+    def __init__(self, engine: Engine, warn: Callable[[Exception], None]) -> None:
+        self.engine, self._warn, self.affine = engine, warn, engine.model.affine
         self._samplers: dict[Hashable, Sampler] = {}
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
@@ -97,7 +96,7 @@ class NativeKernels(Kernels):
         if not self.engine.measures:
             return super().violation(problem, X, U, obstacles)
         worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
-        self.engine.run(name, problem.B, self.engine.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
+        self.engine.run(name, problem.B, self.engine.placed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
         return worst
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
@@ -107,7 +106,7 @@ class NativeKernels(Kernels):
             return clearance_of(others, X, share)
         U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
         contact = 1.0 - (TOUCH if share is None else share)
-        packed = self.engine.packed(problem, X=X.contiguous(), U=U, merit=least, gain=contact)
+        packed = self.engine.placed(problem, X=X.contiguous(), U=U, merit=least, gain=contact)
         self.engine.run("tgco_chords", problem.B, packed)
         return clearance_of(others, X, share, least)
 
@@ -139,8 +138,9 @@ class NativeKernels(Kernels):
         out = {name: _flags(B) for name in END_FLAGS} | {name: s.merit.new_zeros(B) for name in END_NUMBERS}
         state = {name: getattr(s, name) for name in ITERATED}
         packed = self.engine.terms(
-            lagrangian, None, **state, **out, options=native_options(how), limit=limit, replicas=replicas_of(B)
-        )
+            lagrangian, None, **state, **out, options=native_options(how), limit=limit,
+            replicas=self.engine.replicas_of(B),
+        )  # fmt: skip
         self.engine.run("tgco_ilqr", B, packed)
         end = pass_end(out)
         if out["lost"].any():
@@ -170,7 +170,7 @@ class NativeKernels(Kernels):
 
     def interior(self, problem: Problem) -> InteriorKernels:
         try:
-            return InteriorEngine(self.engine, self.B)
+            return InteriorEngine(self.engine)
         except InputError as error:  # second derivatives whose code would be too long
             self._warn(error)
             return super().interior(problem)

@@ -12,7 +12,6 @@ from torchgco.ilqr import lifted
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
 from torchgco.lagrangian.state import PassEnd, State
-from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import End, Options, Outer
 from torchgco.problem.problem import Problem
@@ -73,10 +72,10 @@ class NativeOuter:
         self._run(passes=passes, solves=1, updates=1)
 
     def run_half(self, at_once: int) -> None:
-        """Passes until half of the problems have an outcome, of up to LANES all; at most `at_once` of them a call."""
+        """Passes until half of the problems have an outcome, or all if lanes suffice; at most `at_once` in a call."""
         while True:
             running = int((self.outcome.numpy() == Status.RUNNING).sum())
-            if running == 0 or (self.b > LANES and 2 * running <= self.b):
+            if running == 0 or (self.b > self.engine.lanes and 2 * running <= self.b):
                 return
             self.run(max(1, at_once // running))
 
@@ -98,7 +97,7 @@ class NativeOuter:
     def _run(self, **fields: int) -> None:
         for name, value in fields.items():
             setattr(self.outer, name, value)
-        run(self.engine.library.tgco_outer, self.b, LANES, self.outer)
+        run(self.engine.library.tgco_outer, self.b, self.engine.lanes, self.outer)
 
 
 def pass_end(out: Mapping[str, Tensor]) -> PassEnd:

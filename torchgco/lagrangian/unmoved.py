@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import scattered
+from torchgco.constraints.bounds import RateBounds
 from torchgco.dynamics.rollout import open_loop
 from torchgco.problem.problem import Problem
 
@@ -45,12 +46,17 @@ def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
 def without_slope(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
     """Whether rows are violated by more than `tolerance`, and none of these has a slope at X, U, (B,).
 
-    A comparison, a sign or a rounding has none: no step by derivatives lowers such a row.
+    A comparison, a sign or a rounding has none: no step by derivatives lowers such a row. Bounds on rates have one.
     """
     s = problem.n + 1 + problem.m
-    H, broken = X.new_zeros(*X.shape[:2], s, s), torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    H = X.new_zeros(*X.shape[:2], s, s)
+    broken = sloped = torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
     for part in problem.constraints:
         bad = part.violation(X, U) > tolerance
-        part.accumulate(X, U, bad.to(X.dtype) * part.value(X, U), bad.to(X.dtype), H)
-        broken |= bad.flatten(1).any(-1)
-    return broken & (H == 0).flatten(1).all(-1)
+        some = bad.flatten(1).any(-1)
+        broken = broken | some
+        if isinstance(part, RateBounds):  # rows of two knots
+            sloped = sloped | some
+        elif bool(some.any()):
+            part.accumulate(X, U, bad.to(X.dtype) * part.value(X, U), bad.to(X.dtype), H)
+    return broken & ~sloped & (H == 0).flatten(1).all(-1)

@@ -159,7 +159,7 @@ class BoundField(OwnKind):
         return replace(super().in_pieces(count), pieces=count * self.pieces)
 
     def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
-        """The numbers that field.c reads, and the map itself, which isn't copied."""
+        """The numbers that field.h reads, and the map itself, which isn't copied."""
         nodes = self.field.nodes(self.origins.device)
         x, y, z = (*nodes.shape[1:], 1)[:3]
         bound = torch.cat([ball._lowered() for ball in (self, *others)], dim=-1)

@@ -12,7 +12,7 @@ quadratic B-splines (three nodes per axis; G has continuous first derivatives), 
 from it: this is no larger than the true distance either, as everything occupied lies in the lattice.
 
 Nearer than a core r the square is replaced by its tangent at r, which lies below it: G then goes on falling inside of
-obstacles, with the same slope. native/c/field.c does the same.
+obstacles, with the same slope. native/c/field.h does the same.
 """
 
 from __future__ import annotations

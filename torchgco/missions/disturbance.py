@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.base.options import NonNegative, Seconds, check_options
+from torchgco.base.options import Checked, NonNegative, Seconds
 
 NOISY = slice(0, 13)  # position, velocity, quaternion and body rates are measured with noise, thrusts without
 
 
 @dataclass(frozen=True)
-class Disturbance:
+class Disturbance(Checked, named="disturbance"):
     """Wind and noise, drawn for each mission from (seed, mission).
 
     Args:
@@ -36,9 +36,6 @@ class Disturbance:
     velocity_noise: NonNegative = 0.0
     attitude_noise: NonNegative = 0.0
     rate_noise: NonNegative = 0.0
-
-    def __post_init__(self) -> None:
-        check_options(self, "disturbance")
 
     def draw(self, seed: int, ids: Sequence[int], steps: int, period: float) -> tuple[Tensor, Tensor]:
         """Forces (B, steps, 3), N, and noise (B, steps, 13) of every control step."""

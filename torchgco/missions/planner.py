@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base import clock
-from torchgco.base.options import NonNegative, PositiveOrInfinite, Seconds, Share, check_options
+from torchgco.base.options import Checked, NonNegative, PositiveOrInfinite, Seconds, Share
 from torchgco.base.tree import Rows, put, take
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
@@ -93,7 +93,7 @@ MIN_SECONDS = 1e-4  # s, of a time limit
 
 
 @dataclass(frozen=True)
-class Planner:
+class Planner(Checked, named="planner"):
     """Solves the planning problem from every measured state.
 
     A first plan is the solver's. Later, where the solver makes attempts around a local solver (`gco`), the local solver
@@ -132,9 +132,6 @@ class Planner:
     margin_growth: NonNegative = 0.0
     first_step: bool = True
     estimation: Share = 0.2
-
-    def __post_init__(self) -> None:
-        check_options(self, "planner")
 
     @cached_property
     def solvers(self) -> tuple[Solver, Solver]:

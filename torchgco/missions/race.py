@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchgco.base import clock
 from torchgco.base.errors import InputError
-from torchgco.base.options import Count, Meters, NonNegative, Within, check_options
+from torchgco.base.options import Checked, Count, Meters, NonNegative, Within
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of
 from torchgco.constraints.gates import GateBalls, Gates, gates_of
@@ -43,7 +43,7 @@ FOLLOWED = 1e-3  # violation, m for lengths, up to which a plan is flown
 
 
 @dataclass(frozen=True)
-class RacePlanner:
+class RacePlanner(Checked, named="planner"):
     """Plans a race again from every measured state; where that finds none, the plan before is flown on.
 
     Args:
@@ -62,9 +62,6 @@ class RacePlanner:
     ahead: Count = 5
     margin: NonNegative = 0.05
     reserve: Annotated[float, Within(0, 0.4)] = 0.05
-
-    def __post_init__(self) -> None:
-        check_options(self, "planner")
 
     def posed(self, whole: Problem, passed: int, legs: int) -> Problem:
         """The problems that are left of whole races once some gates are passed, through so many legs at most."""

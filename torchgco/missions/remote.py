@@ -31,19 +31,19 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Seconds, Within, check_options
+from torchgco.base.options import Checked, Seconds, Within
 from torchgco.base.tree import Rows
 
 HEAD = struct.Struct("<4sHHQd")
 LETTERS, PROTOCOL = b"TGCO", 1
 AT_ONCE = 32  # vehicles in a datagram: 6.4 kB, which every system sends in one piece
-SENT, ANSWERED = 25, 17  # numbers of a row
+ANSWERED = 17  # numbers of a row
 LARGEST = 65_536  # bytes of a datagram
 _numbers = count(1)
 
 
 @dataclass(frozen=True)
-class RemotePlant:
+class RemotePlant(Checked, named="plant"):
     """A simulator that answers at an address, as a `Plant`; the module says with what.
 
     The simulator may hold vehicles by their numbers, or compute each step from the state that it is sent. What it knows
@@ -64,9 +64,6 @@ class RemotePlant:
     dt: Seconds = 0.01
     timeout: Seconds = 1.0
     vehicles: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        check_options(self, "plant")
 
     def take(self, index: Rows) -> Self:
         """See `Plant`."""

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from torchgco.base.options import AtLeast, Count, NonNegative, Positive, Seconds, check_options
+from torchgco.base.options import AtLeast, Checked, Count, NonNegative, Positive, Seconds
 from torchgco.base.tree import Rows, take
 from torchgco.constraints import StateBounds
 from torchgco.costs import QuadraticCost
@@ -20,8 +20,7 @@ from torchgco.lagrangian.lagrangian import Multipliers, shifted, update_and_rais
 from torchgco.missions.constraints import RotorLimits, ThrustSum
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
-from torchgco.solvers.ilqr import ILQR
-from torchgco.solvers.repeated import RepeatedDescent
+from torchgco.solvers.ilqr import ILQR, RepeatedDescent
 
 RATES, THRUST = slice(10, 13), 13  # in the planning model's state: w and a
 FIRST_ROUNDS = 3  # inner solves of the first call
@@ -80,7 +79,7 @@ class Tracking:
 
 
 @dataclass(frozen=True)
-class Tracker:
+class Tracker(Checked, named="tracker"):
     """AL-iLQR on the rotor model: rates follow the plan, thrusts sum up to its acceleration, rotors keep their limits.
 
     Successive tracking problems are alike, so by default the augmented Lagrangian goes on from call to call: one inner
@@ -114,9 +113,6 @@ class Tracker:
     outer_iterations: Count = 10
     dt: Seconds = 0.01
     stages: Count = 6
-
-    def __post_init__(self) -> None:
-        check_options(self, "tracker")
 
     def track(self, x: Tensor, reference: Reference, offset: float, before: Tracking | None = None) -> Tracking:
         """Commands for plants x (B, 17), `offset` s after the plan's first knot; `before` is the last result."""

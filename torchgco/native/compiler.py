@@ -24,6 +24,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 from torchgco.base.clock import setting_up
+from torchgco.base.memory import trim
 from torchgco.base.notices import notice
 from torchgco.base.signals import handled
 from torchgco.native import store
@@ -115,7 +116,7 @@ def build(source: str | Sequence[Unit], flags: Sequence[str] = ()) -> ctypes.CDL
             library = _load(compiler, units, (*compiler.flags, *flags, *compiler.further))
         weakref.finalize(library, _ctypes.dlclose, library._handle).atexit = False  # functions of it hold it, too
     _loaded[known] = library  # the most recent one is the last
-    store.trim(_loaded, _KEPT)
+    trim(_loaded, _KEPT)
     return library
 
 
@@ -239,7 +240,7 @@ def _known(key: str, unit: Unit) -> bytes | None:
 
 def _remember(key: str, content: bytes) -> None:
     _objects[key] = content
-    store.trim(_objects, _OBJECTS)
+    trim(_objects, _OBJECTS)
 
 
 def _object(compiler: Compiler, unit: Unit, flags: tuple[str, ...]) -> bytes:

@@ -22,10 +22,9 @@ from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
-from torchgco.native.codegen.source import LANES, Form
+from torchgco.native.codegen.source import Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
-from torchgco.native.compiler import Unit
-from torchgco.native.declarations import load
+from torchgco.native.compiler import Unit, build
 from torchgco.native.packing import (
     constraint_of,
     guide_of,
@@ -37,11 +36,12 @@ from torchgco.native.packing import (
     shared_fields,
 )
 from torchgco.native.shared import Captured, Shared
-from torchgco.native.structures import STRUCTURES, Kind, array
+from torchgco.native.structures import Kind, array
 from torchgco.obstacles.spheres import SpheresInFreeTime
 from torchgco.problem.problem import Problem
 
 NO_MEMORY = "native kernels: no memory"
+LANES_OF_ONE = 4  # that a problem alone makes use of: for steps of a line search, and candidates along several paths
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -49,7 +49,7 @@ class Engine:
     """The library of a form of problems.
 
     Args:
-        ahead: is called when the form is known, before the library is compiled.
+        ahead: see `serve`.
         compiles: without it there is the form alone.
 
     Raises:
@@ -80,17 +80,22 @@ class Engine:
         self.shared = first
         lifted = frozenset(i for i in self.functions if is_lifted(parts[i]))
         self.form = Form(self.model, at, self.cost, dense, functions, lifted)
-        if ahead is not None:
-            ahead(self)
         self._libraries: dict[Hashable, ctypes.CDLL] = {}
         if compiles:
-            self.library = load(self.form.units(), STRUCTURES)
+            self.serve(problem.B, ahead)
+
+    def serve(self, B: int, ahead: Callable[[Engine], None] | None = None) -> None:
+        """Have the library that suits solves of B problems, all in all; `ahead` is called before it is compiled."""
+        self.B, self.lanes = B, lanes_for(B, LANES_OF_ONE)
+        if ahead is not None and self.lanes not in self._libraries:
+            ahead(self)
+        self.library = self.further(self.lanes, lambda: self.form.units(lanes=self.lanes))
 
     def further(self, name: Hashable, units: Callable[[], Sequence[Unit]]) -> ctypes.CDLL:
         """A further library of this form, which this engine and those with other shared numbers keep."""
         if name not in self._libraries:
             with setting_up():
-                self._libraries[name] = load(units(), STRUCTURES)
+                self._libraries[name] = build(units())
         return self._libraries[name]
 
     def forget_values(self) -> None:
@@ -118,14 +123,23 @@ class Engine:
         functions = self.functions.items()
         return found + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
 
+    def replicas_of(self, B: int) -> int:
+        """How many lanes share the line search of each of B problems."""
+        return self.lanes // 2 ** (B - 1).bit_length() if self.lanes >= B else 1
+
     def run(self, name: str, B: int, packed: c.Problem) -> None:
         """Call a function of the library on B problems."""
-        run(getattr(self.library, name), B, LANES, packed)
+        run(getattr(self.library, name), B, self.lanes, packed)
 
     def packed(self, problem: Problem, **values: Any) -> c.Problem:
         """A problem without multipliers or a guide, and further fields, in the form that the library reads."""
-        fixed, _ = self._fixed(problem)
-        packed = fixed.copy()
+        packed = self._fixed(problem).copy()
+        packed.fill(values)
+        return packed
+
+    def placed(self, problem: Problem, **values: Any) -> c.Problem:
+        """The same without the cost: what measures read."""
+        packed = self._rows(problem)[0].copy()
         packed.fill(values)
         return packed
 
@@ -153,28 +167,43 @@ class Engine:
         multipliers = lagrangian.multipliers
         own: dict[str, Any] = {"mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
         if best is not None or not multipliers.blank:
-            own["constraint"] = rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
+            own["constraint"] = rows = [constraint.copy() for constraint in self._rows(lagrangian.problem)[1]]
             for row, lam in zip(rows, () if multipliers.blank else multipliers.lam, strict=not multipliers.blank):
                 row.lam = lam.contiguous()
             for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
                 row.best = lam
         return self.packed(lagrangian.problem, **own, **guide_of(lagrangian.penalty))
 
-    def _fixed(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
+    def _fixed(self, problem: Problem) -> c.Problem:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
         if "packed" not in vars(problem):
-            made = None if problem.one is None else self._fixed(problem.one)
+            rows, one = self._rows(problem), problem.one
+            if one is not None and rows is self._rows(one):
+                packed = self._fixed(one)
+            else:
+                packed = rows[0].copy()
+                make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
+                if problem.B > 0:
+                    of_each = self.cost is not None
+                    packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, of_each, make)
+            object.__setattr__(problem, "packed", packed)
+        return vars(problem)["packed"]
+
+    def _rows(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
+        """Model and constraints, and the latter alone."""
+        if "rows_packed" not in vars(problem):
+            made = None if problem.one is None else self._rows(problem.one)
             if made is None or any(row.map_of for row in made[1]):  # which maps C reads is a number of each problem
                 made = self._made(problem)
-            object.__setattr__(problem, "packed", made)
-        return vars(problem)["packed"]
+            object.__setattr__(problem, "rows_packed", made)
+        return vars(problem)["rows_packed"]
 
     def _model(self, problem: Problem) -> c.Problem:
         """The model's part of it."""
         if problem.one is not None:
             return self._model(problem.one)
         if "model_packed" not in vars(problem):
-            packed = _of_last(problem, "dynamics", problem.dynamics, lambda: self._model_made(problem))
+            packed = _of_last(problem, "dynamics", problem.dynamics, True, lambda: self._model_made(problem))
             object.__setattr__(problem, "model_packed", packed)
         return vars(problem)["model_packed"]
 
@@ -193,8 +222,6 @@ class Engine:
         rows = [self._row(problem, i) for i in range(len(problem.constraints))]
         packed = self._model(problem).copy()
         packed.constraints, packed.constraint = len(rows), rows
-        make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
-        packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, make)
         return packed, rows
 
     def cost_numbers(self, problem: Problem) -> list[c.Array]:
@@ -206,7 +233,7 @@ class Engine:
     def _row(self, problem: Problem, i: int) -> c.Constraint:
         """Constraint i without multipliers."""
         make = lambda: constraint_of(problem, i, self.row_numbers(problem, i))
-        return _of_last(problem, i, problem.constraints[i], make)
+        return _of_last(problem, i, problem.constraints[i], i in self.functions, make)
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
         """The fields of a `Constraint` in C that hold the numbers of constraint i."""
@@ -218,21 +245,16 @@ class Engine:
         return {**own, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
 
 
-def _of_last(problem: Problem, name: str | int, part: Any, make: Callable[[], Any]) -> Any:
+def _of_last(problem: Problem, name: str | int, part: Any, of_each: bool, make: Callable[[], Any]) -> Any:
     """What was made of a part for the last problem of the form, where this one has the same part, else made now.
 
-    What problems share stays the same object in a subset.
+    What problems share stays the same object in a subset; where `of_each`, numbers are computed for each of them.
     """
     known, B, made = problem.known.packed.get(name, (None, 0, None))
-    if known is not part or B != problem.B:
+    if known is not part or (of_each and B != problem.B):
         made = make()
         problem.known.packed[name] = part, problem.B, made
     return made
-
-
-def replicas_of(B: int) -> int:
-    """How many lanes share the line search of each of B problems."""
-    return LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:

@@ -5,44 +5,40 @@ from __future__ import annotations
 import ctypes
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, KktSolve, RightSides
 from torchgco.native import structures
-from torchgco.native.codegen.source import INTERIOR, LANES
+from torchgco.native.codegen.source import INTERIOR, lanes_for
 from torchgco.native.compiler import begin
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import Interior, Kkt
 from torchgco.problem.problem import Problem
-
-FEW_LANES = 2, 4  # lanes of libraries for few problems
+from torchgco.problem.scale import CostScale
 
 
 class InteriorEngine:
-    """The library of a form of problems; compiled when it is made.
-
-    Args:
-        B: problems of a solve, all in all. For few of them there are libraries that solve as few side by side: lanes
-            without a problem take time, too.
+    """The library of a form of problems, for as many as `engine` serves; compiled when it is made.
 
     Raises:
         InputError: a part without a counterpart in C.
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(self, engine: Engine, B: int) -> None:
-        self.engine, self.lanes = engine, _lanes(B)
+    def __init__(self, engine: Engine) -> None:
+        self.engine, self.lanes = engine, lanes_for(engine.B)
         units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
         self.library: ctypes.CDLL = engine.further(("interior", self.lanes), units)
 
     def solve(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
-    ) -> dict[str, Tensor]:
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor,
+        scale: CostScale, options: BarrierOptions,
+    ) -> dict[str, Tensor]:  # fmt: skip
         """States, controls, multipliers and barrier parameters in place; X begins with the problem's start, or
         a guess of what is free in it.
 
@@ -50,7 +46,7 @@ class InteriorEngine:
             X, U: (B, N+1, n), (B, N, m), contiguous.
             multipliers: of every constraint, (B, K, p), contiguous.
             barrier: mu (B,).
-            options: the fields of `structures.Interior`.
+            scale: of the costs.
 
         Returns:
             status, iterations (B,); error of the end test, theta, the sum of residuals, and whether the cost falls to
@@ -58,9 +54,7 @@ class InteriorEngine:
         """
         B = problem.B
         packed, out = self._packed(problem, X, U, multipliers)
-        ends = {name: X.new_zeros(B) for name in ("error", "theta", "falls")}
-        free = free_components(problem)
-        how = Interior.complete(of=packed, barrier=barrier, free_start=free, **ends, **options)
+        how, ends = interior(problem, packed, barrier, scale, options)
         run(self.library.tgco_interior, B, self.lanes, how)
         return out | ends
 
@@ -101,10 +95,22 @@ class InteriorEngine:
         out = {"status": torch.zeros(problem.B, dtype=torch.int32)}
         out["iterations"] = torch.zeros(problem.B, dtype=torch.int64)
         out["gains"] = X.new_zeros(problem.B, problem.N, problem.m, problem.n + 1)
-        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
+        rows = [constraint.copy() for constraint in self.engine._rows(problem)[1]]
         for row, lam in zip(rows, multipliers, strict=True):
             row.lam = lam
         return self.engine.packed(problem, X=X, U=U, constraint=rows, **out), out
+
+
+def interior(
+    problem: Problem, packed: structures.Problem, barrier: Tensor, scale: CostScale, options: BarrierOptions
+) -> tuple[Interior, dict[str, Tensor]]:
+    """What C reads of a solve, and the tensors (B,) that it writes error, theta and falls to."""
+    ends = {name: barrier.new_zeros(problem.B) for name in ("error", "theta", "falls")}
+    how = Interior.complete(
+        of=packed, barrier=barrier, free_start=free_components(problem), constant=scale.constant,
+        least_cost=scale.size, **ends, **vars(options),
+    )  # fmt: skip
+    return how, ends
 
 
 def free_components(problem: Problem) -> Tensor | None:
@@ -112,11 +118,7 @@ def free_components(problem: Problem) -> Tensor | None:
     return None if problem.free_start is None else problem.free_start.double().contiguous()
 
 
-def begin_interior(engine: Engine, B: int) -> None:
-    """Start to compile both libraries for B problems of a form of which the first one is about to be loaded."""
+def begin_interior(engine: Engine) -> None:
+    """Start to compile both libraries of a form of which the first one is about to be loaded."""
     with suppress(InputError):
-        begin(engine.form.units(), engine.form.units(INTERIOR, lanes=_lanes(B)))
-
-
-def _lanes(B: int) -> int:
-    return next((lanes for lanes in FEW_LANES if B <= lanes < LANES), LANES)
+        begin(engine.form.units(lanes=engine.lanes), engine.form.units(INTERIOR, lanes=lanes_for(engine.B)))

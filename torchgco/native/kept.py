@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import later
-from torchgco.native import structures as c
-from torchgco.native.codegen.source import LANES
 from torchgco.native.engine import run
-from torchgco.native.interior import InteriorEngine, free_components
+from torchgco.native.interior import InteriorEngine, interior
 from torchgco.native.kept_problem import KeptProblem
 from torchgco.problem.problem import Problem
+from torchgco.problem.scale import CostScale
 
 
 class Kept(KeptProblem):
@@ -26,10 +26,11 @@ class Kept(KeptProblem):
     Args:
         kernels: of the problems' form.
         problem: see `KeptProblem`.
-        options: the fields of `structures.Interior` that don't change.
+        scale: of the costs.
+        options: with which problems are solved.
     """
 
-    def __init__(self, kernels: InteriorEngine, problem: Problem, **options: Any) -> None:
+    def __init__(self, kernels: InteriorEngine, problem: Problem, scale: CostScale, options: BarrierOptions) -> None:
         super().__init__(kernels.engine, problem)
         B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
         self.library, self.lanes = kernels.library, kernels.lanes
@@ -52,19 +53,17 @@ class Kept(KeptProblem):
         self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
         self._follow = self.packed.copy()
         self._follow.fill({"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst})
-        ends = {name: like.new_zeros(B) for name in ("error", "theta", "falls")}
-        free = free_components(problem)
-        self.how = c.Interior.complete(of=self.packed, barrier=self.barrier, free_start=free, **ends, **options)
+        self.how, _ = interior(problem, self.packed, self.barrier, scale, options)
 
-    def solve(self, rows: np.ndarray, mu: float, **options: float) -> None:
+    def solve(self, rows: np.ndarray, mu: float, seconds: float) -> None:
         """Solve the problems that `rows` (B,) marks, from X, U and `lam`, in place, with `mu` as the first barrier.
 
-        `options` are fields of `structures.Interior`. `rolled` then holds the rollouts that follow the solution by its
+        They take `seconds` at most. `rolled` then holds the rollouts that follow the solution by its
         feedback, and `worst` (B,) their violation.
         """
         B, library = self.problem.B, self.engine.library
-        until = time.monotonic() + options.get("seconds", math.inf)
-        self.how.fill(options)
+        until = time.monotonic() + seconds
+        self.how.seconds = seconds
         self._barrier[:] = mu
         self.statuses[:] = 0
         self._iterations[:] = 0
@@ -73,13 +72,13 @@ class Kept(KeptProblem):
             self._gains[first:last] = 0.0  # of problems that a deadline leaves no time for
         for first, last in spans:
             run(self.library.tgco_interior, last - first, self.lanes, self.how, first)
-            self.how.fill({"seconds": max(0.0, until - time.monotonic())})
+            self.how.seconds = max(0.0, until - time.monotonic())
         if not math.isfinite(self._gains.sum()):
             np.nan_to_num(self._gains, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         self._rolled[0][:], self._rolled[1][:] = self._moving[:2]
-        run(library.tgco_closed_loop, B, LANES, self._follow)
+        run(library.tgco_closed_loop, B, self.lanes, self._follow)
         if self.engine.measures:
-            run(library.tgco_violation, B, LANES, self._follow)
+            run(library.tgco_violation, B, self.lanes, self._follow)
 
     def begin_with(self, other: Kept) -> None:
         """Take over the iterates of another one of the same shapes."""

@@ -9,8 +9,7 @@ import torch
 from torchgco.base.status import Status
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native import structures as c
-from torchgco.native.codegen.source import LANES
-from torchgco.native.engine import Engine, replicas_of, run
+from torchgco.native.engine import Engine, run
 from torchgco.native.kept_problem import KeptProblem
 from torchgco.native.packing import is_bounded
 from torchgco.problem.problem import Problem
@@ -38,7 +37,7 @@ class KeptDescent(KeptProblem):
         state = {name: torch.zeros(B, dtype=STATE_TYPES.get(name, torch.float64)) for name in names}
         bounded = int(engine.cost is None and is_bounded(problem.cost))
         self.packed.fill({"mu": self.mu, "phr": phr, "bounded": bounded, "options": options, **state})
-        self.packed.fill({"limit": options.max_iterations, "replicas": replicas_of(B)})
+        self.packed.fill({"limit": options.max_iterations, "replicas": engine.replicas_of(B)})
         self.worst = like.new_zeros(B)
         self._measured = self.packed.copy()
         self._measured.fill({"merit": self.worst})
@@ -58,14 +57,14 @@ class KeptDescent(KeptProblem):
             own[:] = lam.numpy()
         for name in ZEROED:
             state[name][:] = 0
-        run(library.tgco_open_loop, B, LANES, self.packed)
-        run(library.tgco_value, B, LANES, self.packed)
+        run(library.tgco_open_loop, B, self.engine.lanes, self.packed)
+        run(library.tgco_value, B, self.engine.lanes, self.packed)
         if not math.isfinite(state["merit"].sum() + self._X.sum()):  # what overflows is left to others, too
             return False
-        run(library.tgco_ilqr, B, LANES, self.packed)
+        run(library.tgco_ilqr, B, self.engine.lanes, self.packed)
         return not ((state["status"] == Status.RUNNING).any() or state["lost"].any())
 
     def violation(self) -> torch.Tensor:
         """The largest violation (B,) of `X` and `U`, of problems that the library `measures`."""
-        run(self.engine.library.tgco_violation, self.problem.B, LANES, self._measured)
+        run(self.engine.library.tgco_violation, self.problem.B, self.engine.lanes, self._measured)
         return self.worst.clone()

@@ -14,7 +14,6 @@ write to is not used, which a CacheWarning says; root's own are, as on a cluster
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import math
 import os
@@ -28,6 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgco.base.files import PART, write_whole
+from torchgco.base.memory import trim
 
 FILES = 1000  # at most, some 150 MB; the least recently used are removed
 OBJECT, OBJECTS = ".o", 200  # objects of the solvers, further 20 MB: no loop over models removes any
@@ -65,17 +65,6 @@ def made(parts: Sequence[str], make: Callable[[], dict[str, Any]], kin: str = ""
         _made[key, place] = Made(key, json.loads(known))
         trim(_made, FILES)
     return _made[key, place]
-
-
-def trim(
-    kept: dict[Any, Any], most: int, total: float = math.inf, size: Callable[[Any], float] = lambda _: 0.0
-) -> None:
-    """Drop the first entries beyond so many, or while the sizes of several add up to more; other threads may, too."""
-    pairs = list(kept.items())  # at once: no thread changes it meanwhile
-    sums = list(itertools.accumulate(size(value) for _, value in reversed(pairs)))[::-1]
-    for (key, _), left, after in zip(pairs, range(len(pairs), 1, -1), sums, strict=False):
-        if left > most or after > total:
-            kept.pop(key, None)
 
 
 def folder() -> Path:

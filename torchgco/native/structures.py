@@ -1,4 +1,4 @@
-"""The structures and enumerations of the solver's library in C. E counts problems."""
+"""The structures, enumerations and constants of the solver's library in C."""
 
 from __future__ import annotations
 
@@ -11,19 +11,11 @@ from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.eager.fixed import GOLDEN, NUDGE, ROUNDINGS
 from torchgco.eager.sizes import LEAST_SIZE, ORDINARY
 from torchgco.eager.state import FILTERED, LONGEST_FALL
-from torchgco.native.declarations import Structure, fields
+from torchgco.native.declarations import Header, Structure, defines, enumerations
+from torchgco.native.includes import C
 from torchgco.obstacles.base import ABSENT
 
 NOWHERE = -1  # the place of a knot at which a constraint has no rows
-CONSTANTS = {
-    "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": FILTERED, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
-    "NUDGE": NUDGE, "GOLDEN": GOLDEN, "ROUNDINGS": ROUNDINGS, "ORDINARY": ORDINARY, "LEAST_SIZE": LEAST_SIZE,
-    "STOPPED": STOPPED, "STALLED": STALLED,
-    **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
-        ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
-    )},
-}  # fmt: skip
-
 
 # How a constraint's rows are computed, FUNCTION: by traced code, BODY: as rows of the kind of its balls; the penalty of
 # guidance, if any.
@@ -39,168 +31,37 @@ QUADRATIC = {
 }  # fmt: skip
 Quadratic = IntEnum("Quadratic", list(QUADRATIC), start=0)
 TracedCost = IntEnum("TracedCost", "FACTOR STAGE LAST", start=0)
-COST_ARRAYS = len(Quadratic)
+ENUMERATIONS = Kind, Guide, Status, End, Quadratic, TracedCost
+CONSTANTS = {
+    "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": FILTERED, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
+    "COST_ARRAYS": len(Quadratic),
+    "NUDGE": NUDGE, "GOLDEN": GOLDEN, "ROUNDINGS": ROUNDINGS, "ORDINARY": ORDINARY, "LEAST_SIZE": LEAST_SIZE,
+    "STOPPED": STOPPED, "STALLED": STALLED,
+    **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
+        ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
+    )},
+}  # fmt: skip
 
 
-class Array(Structure):
-    """An array over (problems, knots, numbers); a stride of 0 stands for an axis of length 1."""
-
-    declared = (("const double *", "data"), ("int64_t", "element knot size"))
-    _fields_ = fields(declared)
-
-
-class Constraint(Structure):
-    declared = (
-        ("int32_t", "kind equality geometric rows"),  # rows of a knot
-        ("const int32_t *", "place"),  # (N+1): index among the constraint's knots, or NOWHERE
-        ("int64_t", "knots"),
-        # (E, knots, rows): multipliers, NULL where all are 0, and those of the best iterate of an outer loop
-        ("double *", "lam best"),
-        ("const int32_t *", "variable"),  # BOUNDS: (rows) index into [x, u]
-        ("const double *", "sign"),  # BOUNDS: (rows) +1 for an upper bound, -1 for a lower one
-        # BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES, FIELD: see
-        # boxes.c, field.c.
-        (Array, "bound"),
-        (Array, "squares"),  # SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none
-        (Array, "velocities"),  # SPHERES: as centres, or NULL
-        (Array, "radii"),  # FUNCTION: see Constraint.row_radii (E, knots, rows), or NULL
-        (Array, "stops"),  # SPHERES, BOXES, FIELD: the last knot at which they count (E, 1, 1), or NULL
-        ("double", "dt"),
-        ("const double *", "shared"),  # FUNCTION: numbers w that all problems share
-        ("const float *", "map"),  # FIELD: distances at the nodes of all maps (G, map_x, map_y, map_z)
-        ("const int64_t *", "map_of"),  # FIELD: (E)
-        ("int64_t", "map_x map_y map_z"),
-        ("int32_t", "smooth"),  # FIELD: three nodes per axis, or two
-        # BODY: its balls, each with an equal share of rows and numbers, and the kind that all of them are; the function
-        # that places them is traced, with p as of a FUNCTION (E, knots, ...).
-        ("int32_t", "balls kind_of_balls"),
-        (Array, "lift"),
-    )
-    _fields_ = fields(declared)
+# fmt: off
+class Array(Structure): ...
+class Constraint(Structure): ...
+class Options(Structure): ...
+class Problem(Structure): ...
+class Outer(Structure): ...
+class Sampling(Structure): ...
+class Interior(Structure): ...
+class Kkt(Structure): ...
+# fmt: on
 
 
-class Options(Structure):
-    """The options of iLQR and its line search (see ILQR and LineSearch)."""
-
-    declared = (
-        ("const double *", "ladder"),  # (rungs): step lengths
-        ("int64_t", "rungs back max_iterations"),  # back: -1 where each search begins with a full step
-        ("int32_t", "accept_last"),
-        ("double", "tolerance absolute_tolerance ratio_min ratio_max smallest damp_below rounding lost"),
-        ("double", "regularisation_first regularisation_growth regularisation_max"),
-        ("double", "damping damping_growth damping_decay"),
-    )
-    _fields_ = fields(declared)
+HEADER = Header((C / "structures.h").read_text(), CONSTANTS)
+HEADER.declare(Array, Constraint, Options, Problem, Outer, Sampling, Interior, Kkt)
 
 
-class Problem(Structure):
-    """Problems of one form with their iterates, and where results are written."""
-
-    declared = (
-        ("int64_t", "N constraints limit"),
-        ("double *", "X U cost merit regularisation"),  # (E, ...) in and out
-        ("double *", "alpha used"),  # (E): step length and mu_r of the last iteration
-        ("double *", "gains"),  # (E, N, NU, NZ): what tgco_gains writes
-        ("double *", "slopes curvatures"),  # (E, N+1, S), (E, N+1, S, S): what tgco_expand writes
-        ("double *", "mu"),
-        ("int64_t *", "inner iterations rung"),
-        ("int32_t *", "status converged refused lost"),
-        (Array, "parameters"),  # of the model: (E, N, count)
-        # numbers w that all problems share, of the model, and of stages and the last knot of a traced cost
-        ("const double *", "shared stage_shared last_shared"),
-        ((Array, COST_ARRAYS), "cost_data"),
-        ("const Constraint *", "constraint"),
-        ("int32_t", "guide phr replicas optimality bounded"),  # bounded: no stage's cost is below 0
-        (Array, "center radius weight"),
-        (Options, "options"),
-        ("double", "gain"),  # share of L_M by which tgco_lift must lower it
-    )
-    _fields_ = fields(declared)
-
-
-class Outer(Structure):
-    """The outer loop of the augmented Lagrangian (see solvers.augmented_lagrangian)."""
-
-    declared = (
-        ("const Problem *", "of"),
-        ("int64_t *", "outer waited outcome"),  # (E): outcome is RUNNING until a problem ends
-        ("double *", "last_cost last_violation mark"),  # (E); mark (E, 2)
-        ("double *", "best_X best_U best_mu best_cost best_violation"),  # (E, ...)
-        ("const int64_t *", "base"),  # (E): outer iterations before this solve, for `single_after`
-        ("const double *", "goal near"),  # (E, DIM), (E); NULL: arrival doesn't count
-        ("int32_t", "solves updates"),  # whether a pass makes the inner solves, and the outer iterations of those ended
-        ("int64_t", "passes max_outer patience single_after"),  # -1: no patience, or never a single contact
-        ("int32_t", "ends stops"),  # stops: a caught iterate ends its problem's solve
-        ("double", "growth stalled_growth penalty_max tolerance halved settled"),  # stalled_growth: 0: none
-        ("int64_t", "lifted_steps"),
-        ("double", "lifted_gain"),
-    )
-    _fields_ = fields(declared)
-
-
-class Sampling(Structure):
-    """MPPI's rounds (see guidance.MPPI)."""
-
-    declared = (
-        ("const Problem *", "of"),
-        ("int64_t", "samples rounds knots elite"),  # knots at which noise is drawn; 0: at every stage, white
-        ("double", "temperature collision_penalty dwell_cost decay"),
-        ("const uint64_t *", "keys"),  # (E, rounds)
-        (Array, "deviation lower upper"),  # (E, 1, NU), bounds (E, N, NU)
-        ("const int32_t *", "left"),  # (N): the knot before each stage; unused where white
-        ("const double *", "share"),  # (N): share of the interval to the next
-        ("const int32_t *", "geometric"),  # of each constraint: whether samples that touch it are counted
-        ("double *", "mean"),  # (E, N, NU) in and out
-    )
-    _fields_ = fields(declared)
-
-
-class Interior(Structure):
-    """The interior point (see solvers.interior)."""
-
-    declared = (
-        ("const Problem *", "of"),
-        # (E): mu, in and out; out: error of the end test, sum of residuals, and 1 where the cost falls to second order
-        # from where the conditions hold, which is looked for where `minimum` is
-        ("double *", "barrier error theta falls"),
-        ("const double *", "constant least_cost"),  # (E): what of the cost does not count, and its least size
-        ("const double *", "free_start"),  # (E, NX): 1 where a component of the start is a variable; NULL: nowhere
-        ("int64_t", "max_iterations failures patience trials idle"),
-        ("int32_t", "corrects warm minimum"),
-        ("double", "tolerance violation push steepest boundary closest central smallest restored"),
-        ("double", "barrier_error barrier_share barrier_floor barrier_least counts usual_multiplier"),
-        ("double", "largest_multiplier"),
-        ("double", "highest lowest gain_theta gain_phi armijo switching power_theta power_phi"),
-        ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
-        (
-            "double",
-            "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest slight explodes relaxes",
-        ),
-        ("double", "held pivot noise rounding soft_growth soft_decay forced_growth"),
-        ("double", "smoothing"),  # mu in units of the cost, at which the barrier stays; 0: it falls
-        ("double", "seconds"),  # after which problems end with TIME_LIMIT; infinite: never
-    )
-    _fields_ = fields(declared)
-
-
-class Kkt(Structure):
-    """Linear systems with the matrix of the KKT conditions (see lagrangian.kkt); R rows."""
-
-    declared = (
-        ("const Problem *", "of"),
-        ("const double *", "free_start active"),  # as in Interior; (E, R): 1 where a row holds
-        ("const double *", "give"),  # (E, R): by which rows that hold give way to their multipliers; NULL: 0
-        ("const double *", "K"),  # (E, N, NU, NX): gains; NULL: 0
-        ("double *", "a b c"),  # (C, E, N+1, NX+NU), (C, E, N, NX), (C, E, R): right hand sides in, z, y, v out
-        ("double *", "y left"),  # (E, N+1, NX): costates; (C, E): largest of what active rows leave open
-        ("int64_t", "problems count rounds"),  # E, C
-        ("double", "stiff slight pivot"),
-    )
-    _fields_ = fields(declared)
-
-
-STRUCTURES = (Array, Constraint, Options, Problem, Outer, Sampling, Interior, Kkt)
-ENUMERATIONS = (Kind, Guide, Status, End)
+def constants() -> str:
+    """The file constants.h; c/editor has it for editors."""
+    return "#pragma once\n\n" + defines(CONSTANTS) + enumerations(ENUMERATIONS)
 
 
 def array(value: Tensor | None, knots: bool) -> Array:

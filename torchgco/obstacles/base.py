@@ -1,4 +1,4 @@
-"""The interface of all kinds of obstacles: distances of the vehicle from them, for solver, search and polish."""
+"""The interface of all kinds of obstacles: distances of the vehicle from them, for solver and search."""
 
 from __future__ import annotations
 

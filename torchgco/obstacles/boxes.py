@@ -184,7 +184,7 @@ class BoundBoxes(OwnKind):
         return Lowered({}, {"bound": bound} | self.lowered_stops())
 
     def _lowered(self) -> Tensor:
-        """The numbers (B, ...) that boxes.c reads: bounds of all boxes, axis by axis, factors, all numbers of each."""
+        """The numbers (B, ...) that boxes.h reads: bounds of all boxes, axis by axis, factors, all numbers of each."""
         absent, radius = self.absent.unsqueeze(-1), self.inflated_radii.unsqueeze(-1)
         reach = marked(BOUND_SLACK * (self.inflated().extent + radius), absent)
         bounds = torch.stack((self.centers, reach), dim=-1).transpose(1, 2)

@@ -56,23 +56,25 @@ def layout_grid(
     columns: int | None = None,
     rows: int = 3,
     body: BoundBody | None = None,
+    position: slice | None = None,
 ) -> Figure:
     """Maps of the first columns x rows layouts with each solver's trajectories; in space also their side views.
 
     Args:
         layouts: arrays of a layout file: centers (L, M, d) and radii (L, M) in metres, and, where present, velocities
             (L, M, d), boxes, start and goal ((n,) or (L, n)), vehicle_radius, goal_radius, dt, layout (L,) ids.
-        trajectories: states X (L, N+1, n) by solver, positions first, nan where there is none; the first solver is the
-            one under study, drawn over the others.
+        trajectories: states X (L, N+1, n) by solver, nan where there is none; the first solver is the one under study,
+            drawn over the others.
         trials: with columns scenario, model, layout, solver, feasible, reached.
         columns: default: 4 in the plane, 3 in space.
         body: of the vehicle, in the place of vehicle_radius: the first solver's is drawn at some knots; None: a ball.
+        position: its place in states; None: they begin with it.
 
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
     that this cut misses are dotted where they are near. A moving obstacle is drawn where it comes closest to the first
     solver's trajectory, if it comes near, outlined in that solver's colour. Crosses mark contact, at the knots and
-    between them, with the map too.
+    between them, with the map too, of flights that aren't feasible.
 
     Raises:
         InputError: the trajectories don't fit the layouts, or one has no row in `trials`.
@@ -82,7 +84,7 @@ def layout_grid(
     for solver, states in paths.items():
         if states.ndim != 3 or len(states) != count:
             raise InputError(f"trajectories.{solver}", f"shape ({count}, N+1, n)", states.shape)
-    scene = scene_of(layouts, body)
+    scene = scene_of(layouts, body, position)
     columns = columns or (4 if scene.dimension == 2 else 3)
     count = min(count, columns * rows)
     flights = flights_of(scene, {solver: states[:count] for solver, states in paths.items()}, trials)
@@ -122,10 +124,12 @@ def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFra
                 raise InputError("trials", f"a row of {solver} for layout {scene.ids[i]}", "none")
             row = verdicts.loc[(solver, scene.ids[i])]
             end = "" if row["reached"] else SHORT if row["feasible"] else INFEASIBLE
-            path = X[:, : scene.dimension]
+            path = X[:, scene.position or slice(scene.dimension)]
             moved = np.linalg.norm(flown(path) - scene.start[i], axis=-1).max(initial=0.0)
             still = len(flown(path)) > 1 and bool(moved < STILL * _way(scene, i))
-            found[solver].append(Flight(path, end, contacts(scene, i, path, X), still, X[: len(flown(path))]))
+            # By the judge, who follows the path between the knots: a straight line may touch what it doesn't.
+            touched = path[:0] if row["feasible"] else contacts(scene, i, path, X)
+            found[solver].append(Flight(path, end, touched, still, X[: len(flown(path))]))
     return found
 
 

@@ -64,6 +64,7 @@ class Course:
     colour: str
     label: str
     keeps: bool  # whether its constraints hold
+    touches: bool  # whether contact is looked for
 
 
 def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
@@ -113,7 +114,7 @@ def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[l
         t, unit = times(problem) if solution.times is None else solution.times, "t [s]"
     except InputError:
         t, unit = torch.arange(problem.N + 1, device=problem.x0.device), "knot"
-    found = []
+    found, touching = [], _touching(problem.take(torch.tensor(places, device=problem.x0.device)), solution.take(places))
     for i, b in enumerate(places):
         last = int(problem.stages[b])
         X, U = (part[b].detach().cpu().double().numpy() for part in (solution.X, solution.U))
@@ -122,8 +123,17 @@ def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[l
         X, U, at = X[: last + 1], U[:last], at[: last + 1]
         paths = tuple(X[:, part] for part in _positions(problem))
         keeps = bool(solution.violation[b] <= ADMITTED)
-        found.append(Course(b, X, U, at, paths, PALETTE[i % len(PALETTE)], label, keeps))
+        found.append(Course(b, X, U, at, paths, PALETTE[i % len(PALETTE)], label, keeps, touching[i]))
     return found, unit
+
+
+def _touching(problem: Problem, solution: Solution) -> list[bool]:
+    """Where contact is looked for: a straight line may touch what the path between the knots doesn't."""
+    try:
+        frame = solution.to_frame(problem)
+    except InputError:  # obstacles of a kind that can't be judged
+        return [True] * problem.B
+    return (~(frame["clearance"] >= 0)).tolist() if "clearance" in frame else [False] * problem.B
 
 
 def _positions(problem: Problem) -> list[list[int]]:
@@ -241,6 +251,8 @@ class _Map:
         if self.world.body is not None:
             draw_body(ax, self.world.body, states, plane, course.colour)
             drawn.add("body")
+        if not course.touches:
+            return drawn
         touched = contacts(self.world.obstacles, flown(course.paths[0]), self.world.first.dt, states)
         if len(touched):
             ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **marker("contact"))

@@ -35,6 +35,7 @@ class Scene:
         ids: (L,) index of each layout in its file or generator.
         map: of all layouts, or one of each, or None.
         body: the vehicle's, in the place of the margin; None: it is a ball.
+        position: its place in the states of flights; None: they begin with it.
         gates: (L, G, d+1) centres and radii of balls to be passed in this order, nan where absent; or None.
     """
 
@@ -48,6 +49,7 @@ class Scene:
     map: DistanceField | None = None
     gates: np.ndarray | None = None
     body: BoundBody | None = None
+    position: slice | None = None
     sized: bool = True  # the vehicle's size is known, and with it what is in contact
 
     @property
@@ -67,13 +69,18 @@ class Pass(NamedTuple):
     distance: float  # m, the least between the surfaces at full radii
 
 
-def scene_of(layouts: Arrays, body: BoundBody | None = None) -> Scene:
-    """The scene of all layouts in the arrays of a layout file, for a vehicle that is a ball or has a body."""
+def scene_of(layouts: Arrays, body: BoundBody | None = None, position: slice | None = None) -> Scene:
+    """The scene of all layouts in the arrays of a layout file, for a vehicle that is a ball or has a body.
+
+    Args:
+        position: its place in the states of flights, and of starts and goals that aren't positions; None: the first.
+    """
     count, d = len(layouts["radii"]), np.shape(layouts["centers"])[2]
 
     def point(name: str) -> np.ndarray:
         states = np.asarray(layouts.get(name, np.full(d, np.nan)), dtype=float)
-        return np.broadcast_to(states[..., :d], (count, d))
+        at = slice(d) if position is None or states.shape[-1] == d else position
+        return np.broadcast_to(states[..., at], (count, d))
 
     return Scene(
         bodies=tuple(bodies(layouts, i) for i in range(count)),
@@ -86,6 +93,7 @@ def scene_of(layouts: Arrays, body: BoundBody | None = None) -> Scene:
         map=map_of(layouts),
         gates=gates_in(layouts),
         body=body,
+        position=position,
         sized=body is not None or "vehicle_radius" in layouts,
     )
 

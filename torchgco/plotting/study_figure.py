@@ -60,6 +60,7 @@ def study_figure(
     summary: pd.DataFrame,
     columns: Columns = "two",
     body: BoundBody | None = None,
+    position: slice | None = None,
 ) -> Figure:
     """Maps of the first layouts, from above; rates with Wilson intervals; shares of layouts up to a cost.
 
@@ -67,7 +68,7 @@ def study_figure(
         layouts, trajectories, trials: of one scenario and model, as for `layouts.layout_grid`; with costs, too.
         summary: as `experiments.statistics.summarise` returns it.
         columns: of a paper in two columns that the figure spans.
-        body: of the vehicle, as for `layouts.layout_grid`.
+        body, position: of the vehicle, as for `layouts.layout_grid`.
 
     A layout counts for the costs of a solver where it was reached; a line ends at the share of these.
 
@@ -78,7 +79,7 @@ def study_figure(
         raise InputError("columns", "one or two", columns)
     if len(summary[["scenario", "model"]].drop_duplicates()) != 1:
         raise InputError("summary", "one scenario and model", summary[["scenario", "model"]].drop_duplicates().values)
-    form, scene = PRINTS[columns], scene_of(layouts, body)
+    form, scene = PRINTS[columns], scene_of(layouts, body, position)
     count = min(len(layouts["radii"]), 2 * form.maps)
     flights = flights_of(scene, {name: np.asarray(X[:count]) for name, X in trajectories.items()}, trials)
     boxes = views(scene, flights, count, min(form.maps, count))

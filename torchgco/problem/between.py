@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Distance
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.obstacles.base import ADMITTED
@@ -53,12 +52,12 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Of a body that is where its balls are, of pairs that keep a distance the vector between them.
     """
     off = torch.zeros_like(X[:, 0, 0])
-    parts = [one.bare for one in problem.constraints if isinstance(one.bare, Distance)]
+    parts: list[Any] = [one.bare for one in problem.constraints if one.bare.on_the_way(X) is not None]
     if not parts or len(X) == 0:
         return off
     middle, even = _within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
     for part in parts:
-        apart = part.places(middle) - part.places(even)
+        apart = part.on_the_way(middle) - part.on_the_way(even)
         off = torch.maximum(off, apart.norm(dim=-1).flatten(1).amax(-1))
     return off
 

@@ -6,23 +6,23 @@ A mistake that broadcasting or autodiff would hide ends here, in one line, and n
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable, Iterable, MutableMapping, Sequence
-from contextlib import suppress
-from typing import Any, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakIdKeyDictionary
 
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
 from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.mixing import foreign, why
 from torchgco.base.options import Seconds, check_value
-from torchgco.base.shapes import MISTAKES, Dimensions, check_tensor, describe
+from torchgco.base.shapes import MISTAKES, check_tensor, describe
 from torchgco.base.tree import is_users
+from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
+from torchgco.costs.function import FunctionCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.dynamics.names import controls_of, states_of
@@ -42,10 +42,6 @@ ONE_KNOT = (
     "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; numbers per knot: "
     "`knot_values`, or an argument k)"
 )
-
-Given: TypeAlias = tuple[Any, Any]  # a part as the user gave it, and bound to a problem
-# The parts that have passed, by identity, and for which problems.
-_passed: MutableMapping[Any, set[Hashable]] = WeakIdKeyDictionary()
 
 
 def check_model(dynamics: Dynamics, x0: Tensor) -> None:
@@ -83,47 +79,6 @@ def _check_parameter(value: object, field: str, x0: Tensor) -> None:
         if value.dtype != x0.dtype or value.device != x0.device:
             raise InputError(field, f"{x0.dtype} on {x0.device} as x0", f"{value.dtype} on {value.device}")
         check_tensor(value, field)
-
-
-def check_code(
-    dims: Dimensions, x0: Tensor, dynamics: Given | None, cost: Given | None, constraints: Iterable[Given]
-) -> None:
-    """Try what the code of a user's parts does, once for each object and problems of these dimensions.
-
-    A part that has passed isn't tried again: the same object has the same code, and a loop that makes a problem per
-    period would spend most of its time here. What the code reads may have changed since, such as captured tensors,
-    attributes, the mode of a module, or x0: a mistake that arises so is found later, where the part is traced again
-    (operations that draw at random or leave PyTorch, other shapes) or by its result (`certify` compares
-    derivatives). All parts are tried again for another number of problems, stages, states or controls, time step,
-    position, dtype or device. Parts without weak references are always tried.
-
-    Args:
-        x0: the starts (B, n).
-        dynamics, cost, constraints: each as the user gave it and bound to the problem; those that are new.
-
-    Raises:
-        InputError: as `check_dynamics`, `check_cost`, `check_constraint`.
-    """
-    where = dims.position and (dims.position.start, dims.position.stop)
-    about = dims.B, dims.N, dims.n, dims.m, dims.dt, where, dims.obstacles_from, x0.dtype, x0.device
-    if dynamics is not None:
-        _check_once(dynamics, about, lambda part: check_dynamics(part, x0, dims.N))
-    if cost is not None:
-        _check_once(cost, about, lambda part: check_cost(part, x0, dims.N, dims.m))
-    for i, constraint in enumerate(constraints):
-        name = getattr(constraint[1], "name", None)
-        field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
-        _check_once(constraint, about, lambda part, field=field: check_constraint(part, field, x0, dims.N, dims.m))
-
-
-def _check_once(part: Given, about: Hashable, check: Callable[[Any], None]) -> None:
-    if not is_users(part[1]):
-        return
-    if not any(one in _passed and about in _passed[one] for one in part):
-        check(part[1])
-    for one in part:
-        with suppress(TypeError):  # no weak reference to it
-            _passed.setdefault(one, set()).add(about)
 
 
 def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
@@ -169,8 +124,8 @@ def _check_stages(dynamics: Dynamics, rows: Tensor, x0: Tensor, N: int) -> None:
         if dynamics.at(k) is dynamics:  # the same at every stage: all states as problems of their own
             ahead = dynamics.take(i.repeat_interleave(len(k))).step(*(part.flatten(0, 1) for part in z))
             return ahead.unflatten(0, (-1, len(k)))
-        each = [dynamics.at(int(j)).take(i).step(*(part[:, at] for part in z)) for at, j in enumerate(k)]
-        return torch.stack(each, dim=1)
+        own = dynamics.take(i)  # once: numbers of all stages, at each of them, would be as many as the horizon squared
+        return torch.stack([own.at(int(j)).step(*(part[:, at] for part in z)) for at, j in enumerate(k)], dim=1)
 
     place = called("dynamics.step", STEP_OF_STAGE, joined_knots, together, alone, rows, k, arguments)
     if place is not None:
@@ -193,13 +148,12 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
-    reads = cost.reads_knots
-    _check_axes("cost.stage", lambda i, k, x, u: stage(i, x, u, k), reads, rows, k, X[:, :-1], U)
-    _check_axes("cost.terminal", lambda i, _, x: cost.take(i).terminal(x), False, rows, k[:1], X[:, -1:])
+    part, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
+    _check_axes("cost.stage", lambda k, x, u: part.stage(x, u, k), takes_k, k, X[:, :-1], U)
+    _check_axes("cost.terminal", lambda _, x: part.terminal(x), False, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
     _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
     _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
-    part = cost.take(rows)
     if type(cost).expand is Cost.expand and type(cost).total is Cost.total:
         _check_slope("cost.stage", lambda x, u: part.stage(x, u, k).sum(-1), X[:, :-1], U)
         _check_slope("cost.terminal", lambda x, u: part.terminal(x), X[:, -1], U[:, -1])
@@ -254,7 +208,8 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
 
     def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         if constraint.reads_knots:
-            each = [together(i, k[at : at + 1], *(part[:, at : at + 1] for part in z)) for at in range(len(k))]
+            own = constraint.take(i)
+            each = [own.rows_at(k[at : at + 1], *(part[:, at : at + 1] for part in z)) for at in range(len(k))]
             return torch.cat(each, dim=1)
         K, single = len(k), (part.flatten(0, 1).unsqueeze(1) for part in z)
         return together(i.repeat_interleave(K), k[:1], *single).squeeze(1).unflatten(0, (-1, K))
@@ -267,7 +222,7 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
     if place is not None:
         got = f"rows of knot {int(knots[place])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
-    _check_axes(field, together, constraint.reads_knots, rows, knots, *arguments)
+    _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
@@ -343,11 +298,9 @@ def _check_apart(field: str, function: Callable[..., Tensor], rows: Tensor, *arg
         raise InputError(field, OWN_ROW, "values that change with those of another problem")
 
 
-def _check_axes(
-    field: str, function: Callable[..., Tensor], reads_k: bool, rows: Tensor, k: Tensor, *arguments: Tensor
-) -> None:
-    """Check that function(rows, k, *arguments) doesn't look at how many axes its arguments have, nor at what k is."""
-    if called(field, ANY_AXES, depends_on_axes, function, rows, k, arguments, reads_k):
+def _check_axes(field: str, function: Callable[..., Tensor], takes_k: bool, k: Tensor, *arguments: Tensor) -> None:
+    """Check that function(k, *arguments) doesn't look at how many axes its arguments have, nor at what k is."""
+    if called(field, ANY_AXES, depends_on_axes, function, k, arguments, takes_k):
         raise InputError(field, ANY_AXES, "others for a state by itself, and its k, than among those of all knots")
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Number
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from torchgco.problem.free_start import moved_inside
 from torchgco.problem.goal import Goal, with_goal, without_goal
 
 # A goal that is only stated changes no minimum: where its tensors ask for gradients they are refused when it is bound.
+ALONE = FunctionType, slice  # whose objects are equal to themselves alone, or tell all there is to them
 GIVEN_PARTS = "dynamics", "cost", "constraints", "x0", "time"
 
 
@@ -50,7 +52,7 @@ class Given:
         """That of a problem's fields; InputError within a transform of torch.func or torch.compile."""
         check_untransformed("Problem")
         asks = bool(asking([fields[name] for name in _live(fields)]))
-        return cls(dict(fields), tuple(_facts(fields)), asks)
+        return cls(dict(fields), _facts(fields), asks)
 
     @property
     def numbers(self) -> dict[str, Any]:
@@ -72,7 +74,7 @@ class Given:
 
     def current(self, problem: Any) -> Any:
         """`problem`, which is of these parts; bound again where their numbers have changed since."""
-        facts = tuple(_facts(self.fields))
+        facts = _facts(self.fields)
         if facts == self.facts:
             return problem
         if not self.renewed or self.renewed[0][1] != facts:
@@ -131,24 +133,25 @@ class _Itself:
         return id(self.held)
 
 
-def _facts(fields: Mapping[str, Any]) -> Iterator[Hashable]:
+def _facts(fields: Mapping[str, Any]) -> tuple[Hashable, ...]:
     """Parts and functions; numbers, how often tensors were written into, and sums over the bytes of tensors and arrays:
     `.data` and NumPy write unseen."""
     parts = fields["constraints"]
-    yield from map(_Itself, parts if isinstance(parts, (list, tuple)) else (parts,))
-    yield from (_Itself(fields[name]) for name in ("dynamics", "cost"))
+    found: list[Hashable] = [_Itself(part) for part in (parts if isinstance(parts, (list, tuple)) else (parts,))]
+    found += [_Itself(fields[name]) for name in ("dynamics", "cost")]
     for leaf in leaves(fields):
         if isinstance(leaf, Tensor):
-            yield 0 if leaf.is_inference() else leaf._version
+            found.append(0 if leaf.is_inference() else leaf._version)
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
-                yield _sum(leaf.detach())
-        elif isinstance(leaf, (int, float, str, bytes, Number)):
-            yield leaf
-        elif callable(leaf) or leaf is None or isinstance(leaf, slice):
-            yield _Itself(leaf)
+                found.append(_sum(leaf.detach()))
+        elif isinstance(leaf, (int, float, str, bytes, Number)) or leaf is None or type(leaf) in ALONE:
+            found.append(leaf)
+        elif callable(leaf):
+            found.append(_Itself(leaf))
         elif isinstance(leaf, np.ndarray) or hasattr(leaf, "__array__") or isinstance(leaf, (Collection, memoryview)):
-            yield _sum(leaf)
+            found.append(_sum(leaf))
+    return tuple(found)
 
 
 def _sum(numbers: Any) -> int | None:

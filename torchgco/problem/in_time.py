@@ -142,8 +142,9 @@ def fitting_factors(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     rates = 0.5 * model.dt * (model.field(X[:, :-1], U) + model.field(X[:, 1:], U))
     size = X.amax(1, keepdim=True) - X.amin(1, keepdim=True)
     change, rates = ((z / torch.where(size > 0, size, 1.0)).flatten(2) for z in (X.diff(dim=1), rates))
-    of_stages = torch.nn.functional.one_hot(time.of_stages(problem.N), time.count).to(X)
-    both, square, whole = (z.sum(-1) @ of_stages for z in (change * rates, rates.square(), change.square()))
+    none, at = X.new_zeros(problem.B, time.count), time.of_stages(problem.N)
+    squares = change * rates, rates.square(), change.square()
+    both, square, whole = (none.index_add(1, at, z.sum(-1)) for z in squares)
     factors = both / square
     misses = whole - factors * both  # what is left of the squares
     return torch.where((misses <= MISFIT * whole) & (factors > 0), factors, torch.nan)
@@ -214,11 +215,9 @@ class _Dynamics(WrappedDynamics):
     k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at` where there are switches
 
     batched: ClassVar[tuple[str, ...]] = ("model",)
-    stretches: ClassVar[bool] = True  # type: ignore[misc]
 
     n = property(lambda self: self.model.n + 1 + (0 if self.controls is None else len(self.controls)))  # type: ignore[assignment]
     m = property(lambda self: self.model.m + (self.switches is not None))  # type: ignore[assignment]
-    integrator = property(lambda self: self.model.integrator)  # type: ignore[assignment]
 
     def at(self, k: int | Tensor) -> Self:
         return self if self.switches is None else replace(self, k=k)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -95,42 +94,39 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
     return _place(alone(rows, k, *arguments), together(rows, k, *arguments)) if exempt else None
 
 
-def depends_on_axes(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor], reads_k: bool) -> bool:
+def depends_on_axes(function: Rows, k: Tensor, arguments: Sequence[Tensor], takes_k: bool) -> bool:
     """Whether rows of one knot (b, ...), or of its samples (b, S, ...), differ from those of all knots (b, K, ...).
 
     Code that takes some of these forms alone is left to those who call it so.
 
     Args:
-        function: of problems (b,), knots (K,) or one of them, an int, and arguments with these leading axes.
-        rows: two problems.
+        function: of knots (K,) or one of them, an int, and arguments with these leading axes.
         k: the numbers of the knots (K,).
         arguments: (2, K, ...).
-        reads_k: every knot is tried, as a number finds places that a tensor doesn't: those of a dict, for instance.
+        takes_k: code that takes k is tried at every knot, as a number finds places that a tensor doesn't: those of a
+            dict, for instance.
     """
-
-    def precise(*z: Any) -> Tensor:
-        with whole_numbers_become(arguments[0].dtype):
-            return function(*z)
-
-    return _forms_differ(precise, rows, k, arguments, reads_k)
-
-
-def _forms_differ(function: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor], reads_k: bool) -> bool:
-    several = _tried(function, rows, k, *arguments)
-    if several is None or several.shape[:2] != (len(rows), len(k)):
-        return False
-    some = {0, len(k) // 2, len(k) - 1}
-    for at in range(len(k)) if reads_k else some:
-        one, due = [z[:, at] for z in arguments], several[:, at]
-        alone = _tried(function, rows, k[at : at + 1], *(z.unsqueeze(1) for z in one))
-        if alone is None or alone[:, 0].shape != due.shape or bool(unlike(alone[:, 0], due).any()):
-            continue  # it joins knots, which is another matter
-        forms = [_tried(function, rows, int(k[at]), *one)]
-        if at in some:
-            samples = _tried(function, rows, int(k[at]), *(torch.stack((z, z, z), dim=1) for z in one))
-            forms.append(None if samples is None else samples[:, 0])
-        if any(form is not None and form.shape == due.shape and bool(unlike(form, due).any()) for form in forms):
-            return True
+    with whole_numbers_become(arguments[0].dtype):
+        several = _tried(function, k, *arguments)
+        if several is None or several.shape[:2] != arguments[0].shape[:2]:
+            return False
+        some = [0, len(k) // 2, len(k) - 1]
+        each = range(len(k)) if takes_k else some
+        forms = [(at, _tried(function, int(k[at]), *(z[:, at] for z in arguments))) for at in each]
+        for at in some:
+            samples = [torch.stack((z, z, z), dim=1) for z in (z[:, at] for z in arguments)]
+            found = _tried(function, int(k[at]), *samples)
+            forms.append((at, None if found is None else found[:, 0]))
+        known = [(at, form) for at, form in forms if form is not None and form.shape == several[:, 0].shape]
+        if not known:
+            return False
+        places = torch.tensor([at for at, _ in known], device=k.device)
+        due = several.transpose(0, 1)[places].flatten(0, 1)
+        wrong = unlike(torch.cat([form for _, form in known]), due).reshape(len(known), -1).any(-1)
+        for at in places[wrong].tolist():
+            alone, of_all = _tried(function, k[at : at + 1], *(z[:, at : at + 1] for z in arguments)), several[:, at]
+            if alone is not None and alone[:, 0].shape == of_all.shape and not bool(unlike(alone[:, 0], of_all).any()):
+                return True  # else it joins knots, which is another matter
     return False
 
 

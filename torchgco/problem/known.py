@@ -35,5 +35,5 @@ class Known:
     lifted: dict[str, Known] = field(default_factory=dict)
 
     def of_lifted(self, kind: str) -> Known:
-        """What is known of the problems with further states."""
-        return self.lifted.setdefault(kind, Known())
+        """What is known of the problems with further states; a solve that works on these works on those."""
+        return self.lifted.setdefault(kind, Known(current=self.current, warned=self.warned))

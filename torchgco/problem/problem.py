@@ -21,7 +21,7 @@ from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import as_given, bound, remember
-from torchgco.problem.border import check_code, check_model
+from torchgco.problem.border import check_model
 from torchgco.problem.free_start import checked_horizon, chooses_position, clear_starts, moved_inside, start_mask
 from torchgco.problem.free_time import FreeTime, check_served
 from torchgco.problem.given import Given, place, replaced
@@ -29,6 +29,7 @@ from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, reach, savings
 from torchgco.problem.summary import summary
+from torchgco.problem.tried import check_code
 
 
 @dataclass(frozen=True)

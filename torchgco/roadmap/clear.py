@@ -7,7 +7,7 @@ all that is near an obstacle is expensive, in the middle of doors, with their co
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from torchgco.maps.ways import length
 from torchgco.roadmap.geometry import Scene
@@ -48,7 +48,7 @@ def clear_path(lattice: Lattice, ends: Array, price: Price, radius: float, unit:
     path = ways.path(int(ways.total.argmin()))
     step = max(lattice.spacing, length(path) / (HOPS * ROOMY))
     points = even(path, max(2, int(np.ceil(length(path) / step)) + 1))
-    inner = gaussian_filter1d(points, AVERAGED * unit / step, axis=0, mode="nearest")
+    inner = scipy.ndimage.gaussian_filter1d(points, AVERAGED * unit / step, axis=0, mode="nearest")
     return [even(np.concatenate((ends[:1], inner[1:-1], ends[1:])), HOPS + 1)]
 
 
@@ -63,5 +63,5 @@ def smoothed(points: Array, deviation: float) -> Array:
         return points
     between = points - np.linspace(points[0], points[-1], len(points))  # 0 at both ends
     odd = np.concatenate((-between[:0:-1], between, -between[-2::-1]))  # about both: averages there are 0, too
-    averaged = gaussian_filter1d(odd, deviation, axis=0, mode="nearest")[len(points) - 1 : 2 * len(points) - 1]
-    return points - between + averaged
+    averaged = scipy.ndimage.gaussian_filter1d(odd, deviation, axis=0, mode="nearest")
+    return points - between + averaged[len(points) - 1 : 2 * len(points) - 1]

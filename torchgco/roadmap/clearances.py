@@ -11,8 +11,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from torchgco.roadmap.native_maps import SURE_SPACINGS, Map, library_for, map_of
 
@@ -102,12 +102,12 @@ class Clearances:
     @cached_property
     def rooms(self) -> NDArray[np.int32]:
         """Numbers of the connected regions of free nodes; 0 where blocked."""
-        return np.asarray(label(self.everywhere > 0, np.ones([3] * self.d))[0])
+        return np.asarray(scipy.ndimage.label(self.everywhere > 0, np.ones([3] * self.d))[0])
 
     @cached_property
     def marks(self) -> Nodes:
         """A node (M, d) of each connected region of blocked nodes."""
-        regions = np.asarray(label(self.everywhere < 0, np.ones([3] * self.d))[0])
+        regions = np.asarray(scipy.ndimage.label(self.everywhere < 0, np.ones([3] * self.d))[0])
         _, first = np.unique(regions, return_index=True)
         nodes = np.stack(np.unravel_index(first, regions.shape), axis=-1)
         return nodes[regions.flat[first] > 0]

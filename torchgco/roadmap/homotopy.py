@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,14 +21,15 @@ def classes(paths: Tensor, obstacles: Inflated) -> Tensor:
     space all paths are of one class: there, two paths count as one where they are nowhere farther apart than the
     largest obstacle's size.
     """
-    alike = _wind_alike(paths, obstacles) if paths.shape[-1] == 2 else _are_close(paths, obstacles)
-    first = torch.ones_like(alike[..., 0])
-    label = torch.arange(paths.shape[1], device=paths.device).repeat(paths.shape[0], 1)
-    for k in range(1, paths.shape[1]):
+    found = _wind_alike(paths, obstacles) if paths.shape[-1] == 2 else _are_close(paths, obstacles)
+    alike = found.cpu().numpy()  # which takes a small share of PyTorch's time for a few numbers
+    first = np.ones(alike.shape[:2], dtype=bool)
+    label = np.tile(np.arange(alike.shape[1]), (len(alike), 1))
+    for k in range(1, alike.shape[1]):
         same = alike[:, k, :k] & first[:, :k]
         first[:, k] = ~same.any(-1)
-        label[:, k] = torch.where(first[:, k], k, same.to(torch.int8).argmax(-1))
-    return label
+        label[:, k] = np.where(first[:, k], k, same.argmax(-1))
+    return torch.from_numpy(label).to(paths.device)
 
 
 def _wind_alike(paths: Tensor, obstacles: Inflated) -> Tensor:

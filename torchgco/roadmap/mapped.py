@@ -12,10 +12,9 @@ from collections.abc import Callable
 from functools import cached_property, partial
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchgco.base.shapes import computing_on
@@ -169,9 +168,9 @@ class Ways:
         return np.unique(np.concatenate([np.asarray(some, np.int64) for some in lists]))
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> scipy.spatial.cKDTree:
         """Of the blocks' clearest nodes."""
-        return cKDTree(self.points)
+        return scipy.spatial.cKDTree(self.points)
 
     def path(self, block: int) -> Array:
         """The way from start to goal (P, d) through a block."""
@@ -190,7 +189,7 @@ def _smoothed(price: Price, points: Array, counts: tuple[int, ...]) -> Array:
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     values = price(grid.reshape(-1, d)).reshape(sizes)
     share = (points - low) / np.maximum(high - low, MAPPED_ROUNDING) * (np.array(sizes) - 1)
-    return map_coordinates(values, share.T, order=1, mode="nearest")
+    return scipy.ndimage.map_coordinates(values, share.T, order=1, mode="nearest")
 
 
 def paths(

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from torchgco.kernels import EagerWarning, native
-from torchgco.native.compiler import Compiler, NativeError, find_compiler
-from torchgco.native.declarations import Structure, fields, head, load
+from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
+from torchgco.native.declarations import Header, Structure, defines
 from torchgco.native.engine import run
+from torchgco.native.includes import included, joined
 from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
@@ -26,45 +27,14 @@ SEARCHES_AT_ONCE = 64  # problems searched together
 GROUP = 4  # of them, at least so many by each thread
 BLOCK, EDGES_AT_ONCE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
-SEARCH_SOURCE, BOXES_SOURCE = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
-BOX = Path(__file__).parents[1] / "native" / "c" / "box.h"
-# What box.h needs, for EDGES_AT_ONCE edges in a vector.
-VECTORS = """
-typedef double V __attribute__((vector_size(SIDE * sizeof(double))));
-typedef __typeof__((V){0} == (V){0}) I;
-#define SET(c) ((double)(c) - (V){0})
-static inline V tgco_choose(I where, V a, V b) { return (V)((where & (I)a) | (~where & (I)b)); }
-"""
+C = Path(__file__).parent / "c"
 
 
-class Arguments(Structure):
-    """What the library in C reads and writes: B problems among M spheres, graphs of V points with K edges each, and
-    paths of P corners.
-    """
+class Arguments(Structure): ...
 
-    declared = (
-        ("int64_t", "spheres spread candidates points edges neighbours hubs corners directions shells midway"),
-        ("double", "margin least clear factor tie"),
-        ("const double *", "centers distances"),  # (B, M, DIM), (B, M): radii, negative where absent
-        ("const double *", "start goal"),  # (B, DIM)
-        ("const double *", "cube rays shell"),  # (spread, DIM) in the unit cube; (B, directions, DIM); (shells)
-        ("double *", "nodes"),  # (B, V, DIM)
-        ("int32_t *", "ends"),  # (B, V, K): where edges lead; blocked ones are -1 and come last
-        ("double *", "lengths"),  # (B, V, K), infinite for blocked ones
-        ("double *", "price"),  # (B, V)
-        ("double *", "path"),  # (B, P, DIM)
-        ("double *", "string"),  # (B, 2 P - 1, DIM)
-        ("const double *", "cost"),  # (B, 2 P - 1)
-        ("uint8_t *", "arrives"),  # (B)
-        ("const double *", "reach"),  # corners (B, 2, DIM) of the region that holds start, goal and obstacles
-        # Read only where there are boxes.
-        ("int64_t", "boxes extras"),
-        ("const double *", "box"),  # their numbers (B, boxes, BOX_NUMBERS)
-        ("const double *", "beside"),  # points around them (B, extras, DIM)
-        ("const uint8_t *", "exists"),  # (B, extras)
-        ("const double *", "largest"),  # the largest size (B)
-    )
-    _fields_ = fields(declared)
+
+SEARCH_HEADER = Header((C / "search.h").read_text())
+SEARCH_HEADER.declare(Arguments)
 
 
 @dataclass(frozen=True)
@@ -163,11 +133,11 @@ def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
 def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
     # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
     constants = {
-        "DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": UNIT, "BLOCK": BLOCK, "SIDE": EDGES_AT_ONCE,
+        "DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": UNIT, "BLOCK": BLOCK, "REAL": "double",
+        "LANES": EDGES_AT_ONCE,
     }  # fmt: skip
-    own = [VECTORS, BOX.read_text(), BOXES_SOURCE.read_text()] if boxes else []
     try:
-        return load("\n".join((head([Arguments], [], constants), *own, SEARCH_SOURCE.read_text())), [Arguments])
+        return build(joined(defines(constants) + included("search.c"), C) + SEARCH_HEADER.layout)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

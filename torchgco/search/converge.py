@@ -19,7 +19,7 @@ from torchgco.search.search import Search
 from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import STATIONARY
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import InteriorPoint, guessed
 
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
@@ -50,7 +50,9 @@ class Converge(Row):
         if self.among == "all":
             self._tighten(search)
         elif self.begins(problem) and not search.begun:
-            search.begin(search.interior.solved(search.call, escapes=True))
+            guess = guessed(search.call)
+            found = search.interior.solved(search.call, guess=guess, escapes=True)
+            search.begin(search.interior.no_worse(search.call, guess, found))
             self._from_rest(search)
             rows = _unsolved(search)
             search.best.improve(rows, search.call.take(rows))
@@ -126,7 +128,8 @@ def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
     """Keep results of the interior point that are better than the best by more than rounding, and as feasible.
 
     A result is better that is feasible where the best isn't, arrives at a stated goal where the best doesn't, or is
-    cheaper by more than a stationary trajectory may leave to save.
+    cheaper by more than a stationary trajectory may leave to save. Where the best touches an obstacle between two knots
+    one is better that touches less; where it doesn't, none is that does.
     """
     old, new = search.best.of(rows).best, end.best
     admitted = search.interior.admitted(search.call.problem)
@@ -139,7 +142,9 @@ def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
     problem = search.call.problem.take(rows)
     arrives = leaves_goal(problem, old.X, new.X)
     better = is_preferred(problem, new, old, limit) & (lost | arrives | (cheaper & tight))
-    search.best.replace(rows, better, new, end)
+    now, before = (path_clearance(problem, one.X, one.U).clamp(max=0.0) for one in (new, old))
+    clearer = (now > before) & (new.violation <= limit) & ~leaves_goal(problem, new.X, old.X)
+    search.best.replace(rows, torch.where(lost | (now == before), better, clearer), new, end)
 
 
 def _unsolved(search: Search) -> Tensor:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from torchgco.kernels import chord_clearance
@@ -24,7 +24,7 @@ from torchgco.search.chords import EXTRA
 from torchgco.search.poses import ARC_LENGTH, TIGHTEST, Poses, clear_at
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solved
-from torchgco.search.steering import SAME_MODEL, alike, heading_and_speed, sampled
+from torchgco.search.steering import SAME_MODEL, alike, sampled
 
 GROWTH_ROUNDS = 3  # of solves, at most, each among larger obstacles than the one before
 SPOT_TURN = 0.125  # rad that a vehicle turns on the spot from one pose to the next
@@ -59,11 +59,9 @@ def car(problem: Problem) -> Car | None:
     seen = sampled(problem)
     if seen is None:
         return None
-    z, n, at = seen.z, problem.n, problem.position
-    places = heading_and_speed(z[0, :, :n], seen.rates[:, at], seen.slopes[:, at])
-    if places is None or any(part.points.attitude.of != places[0] for part in bodies):
+    z, n, (heading, speed) = seen.z, problem.n, seen.places
+    if any(part.points.attitude.of != heading for part in bodies):
         return None
-    heading, speed = places
     radius = max(float(part.vehicle_radius.max()) for part in bodies)
     if not alike(seen.rates[:, heading], z[0, :, speed] * seen.slopes[:, heading, speed]):
         arc = TIGHTEST * ARC_LENGTH * radius
@@ -204,7 +202,7 @@ class Rest:
             return None
         blocks = found[0].blocks
         ways = np.append(found[0].costs[end], np.inf)[blocks.block].reshape(blocks.counts)[..., 0]
-        ways = np.where(np.isfinite(ways), ways, minimum_filter(ways, 3, mode="nearest"))
+        ways = np.where(np.isfinite(ways), ways, scipy.ndimage.minimum_filter(ways, 3, mode="nearest"))
         return cls(blocks.lattice, blocks.side, ways)
 
     def __call__(self, poses: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Whether a horizon suffices for the way to the goal: said before a solve, where the model has a limit on speed."""
+"""Whether a horizon suffices for the way to the goal: said where a solve misses it, if the model has limits."""
 
 from __future__ import annotations
 
@@ -240,7 +240,7 @@ def _way(problem: Problem, z: Tensor) -> Tensor:
     """The squared lengths (B, S) of a stage's way at states and controls (B, S, n + m)."""
     x, u = z[..., : problem.n], z[..., problem.n :]
     at, dynamics = problem.position, problem.dynamics
-    if getattr(dynamics, "integrator", "none") == "none":
+    if not dynamics.stretches:
         return (dynamics.step(x, u) - x)[..., at].square().sum(-1)
     return (dynamics.dt * dynamics.field(x, u)[..., at]).square().sum(-1)
 

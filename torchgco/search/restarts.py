@@ -120,7 +120,8 @@ class Restarts(Solver):
         if not any(bodies):
             starts = [one for one in self.passes.steps if isinstance(one, Starts)]
             count, every = max((one.count for one in starts), default=0), any(one.when == "all" for one in starts)
-            return replace(self.interior.choosing_time(problem), starts=count, starts_all=every)
+            chooser = self.interior.choosing_time(problem)
+            return replace(chooser, starts=count, others=count if every else count // 2)
         limit = self.local.violation_tolerance
         paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
         through = partial(solved_through_gates, self.interior, limit)

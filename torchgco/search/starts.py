@@ -11,12 +11,13 @@ from torch import Tensor
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive
 from torchgco.base.status import STOPPED, UNMOVED, Status, is_over
-from torchgco.base.tree import take
-from torchgco.kernels import measured, open_loop
+from torchgco.base.tree import put, take
+from torchgco.kernels import measured, open_loop, path_clearance
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived, outside_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
+from torchgco.search.chords import GROWN_BARRIER, ClearChords, cleared, serving
 from torchgco.search.converge import Converge, continued, keep_clear, keep_tight, solved_nearby
 from torchgco.search.reach import beyond_reach
 from torchgco.search.search import Search
@@ -36,12 +37,12 @@ class Starts(Row):
     lead chaotic systems far away. Every other guess is the trajectory of random controls over their whole range,
     shifted so that it ends where the line does: it breaks symmetries in which the best trajectory rests, and turns a
     vehicle that can't go straight to its goal. A stated goal that isn't reached is the end of both. Guesses are keyed
-    by (seed, id, start).
+    by (seed, id, start). What they lead to is solved on among larger obstacles where it touches one between two knots.
 
     Args:
         count: of guesses, and of as many others where none of these leads to a feasible trajectory that arrives.
-        when: "unsolved": where the first solve failed, the best trajectory is infeasible, or it ends outside a stated
-            goal, and it was never caught; "all": of problems without obstacles.
+        when: "unsolved": where the first solve failed, the best trajectory is infeasible, between the knots too, or it
+            ends outside a stated goal, and it was never caught; "all": of problems without obstacles.
         bend: standard deviation of the noise in the states half-way, as a share of the range of each along the best
             trajectory, or that of the random controls where this is wider.
         change: standard deviation of the noise in the controls, as a share of half their range.
@@ -72,7 +73,7 @@ class Starts(Row):
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem, rows = search.call.problem, self._rows(search)
-        slots = search.solver.slots or problem.B * self.count
+        slots, held = search.solver.slots or problem.B * self.count, search.best.end.best.X.clone()
         for number in range(START_ROUNDS if Converge.worth(problem) else 0):
             rows = rows[self._missed(search)[rows]] if number > 0 else rows
             # Of none, `split` would make one empty batch.
@@ -80,6 +81,11 @@ class Starts(Row):
                 if search.call.late:
                     return
                 self._solve(search, some, number * self.count)
+        best = search.best
+        new = (held != best.end.best.X).flatten(1).any(-1) & ~is_over(best.end.status)
+        if (some := new.nonzero().flatten()).numel() > 0:  # found, but not to the end
+            call = replace(search.call.take(some), callback=None)
+            keep_clear(search, some, continued(search.interior, call, best.of(some).best))
 
     def _rows(self, search: Search) -> Tensor:
         """The problems to solve again, (b,)."""
@@ -93,9 +99,10 @@ class Starts(Row):
 
     @staticmethod
     def _missed(search: Search) -> Tensor:
-        """Where the best trajectory is infeasible, or ends outside a stated goal, (B,) bool."""
+        """Where the best trajectory is infeasible, between the knots too, or ends outside a stated goal, (B,) bool."""
         best = search.best.end.best
-        return ~(best.violation <= search.solver.violation_tolerance) | outside_goal(search.call.problem, best.X)
+        missed = ~(best.violation <= search.solver.violation_tolerance) | outside_goal(search.call.problem, best.X)
+        return missed | (path_clearance(search.call.problem, best.X, best.U) < 0)
 
     def _solve(self, search: Search, rows: Tensor, first: int) -> None:
         """All starts of the problems in `rows` as one batch, numbered from `first`."""
@@ -104,8 +111,25 @@ class Starts(Row):
         call = replace(search.call.take(each), callback=None, warm=None)
         X, U = self._guess(call, take(search.best.end.best, each), start)
         end = solved_nearby(search.interior, replace(call, U0=U), X)
+        self._clear(search, call, end)
         for number in range(self.count):
             keep_tight(search, rows, take(end, slice(number, None, self.count)))
+
+    @staticmethod
+    def _clear(search: Search, call: Call, end: SolveEnd) -> None:
+        """The interior point goes on among larger obstacles where results touch one between two knots."""
+        solver, limit = replace(search.interior, warm_barrier=GROWN_BARRIER), search.solver.violation_tolerance
+
+        def once(rows: Tensor, larger: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
+            new = continued(solver, larger, old)
+            serves, found, clearance = serving(call.problem.take(rows), new.best, old, least, limit)
+            chosen = serves.nonzero().flatten()
+            put(end.best, rows[chosen], take(found, chosen))
+            end.status[rows[chosen]] = new.status[chosen]
+            end.iterations[rows] += new.iterations
+            return serves, clearance
+
+        cleared(call, end.best, ClearChords().rounds, limit, once)
 
     def _guess(self, call: Call, best: Iterate, start: Tensor) -> tuple[Tensor, Tensor]:
         """States (b, N+1, n) and controls (b, N, m) to begin with, for starts of the numbers (b,)."""

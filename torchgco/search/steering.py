@@ -75,10 +75,11 @@ class Sampled(NamedTuple):
     ends: tuple[Tensor, Tensor]  # (n + m,) each: the bounds, infinite without any
     rates: Tensor  # (SAMPLES, n)
     slopes: Tensor  # (SAMPLES, n, n + m)
+    places: tuple[int, int]  # in the state, of heading and speed
 
 
 def sampled(problem: Problem) -> Sampled | None:
-    """None for vehicles that don't move in a plane by differential equations that are the same at all times."""
+    """None for vehicles that don't drive in a plane along their heading, by the same equations at all times."""
     model, at = problem.dynamics, problem.dynamics.position
     if at is None or at.stop - at.start != 2 or model.at(0) is not model or problem.m < 2 or not model.is_integrated:
         return None
@@ -89,11 +90,18 @@ def sampled(problem: Problem) -> Sampled | None:
     z = low + share * (high - low)
     x, u = z[..., :n], z[..., n:]
     rates = model.field(x, u)[0]
-    each = (gradients_at_once(lambda x, u, i=i: model.field(x, u)[..., i], x, u) for i in range(n))
-    slopes = torch.stack([torch.cat(parts, dim=-1) for parts in each], dim=-2)[0]
+
+    def slope(i: int) -> Tensor:
+        return torch.cat(gradients_at_once(lambda x, u: model.field(x, u)[..., i], x, u), dim=-1)[0]
+
+    velocity = {i: slope(i) for i in range(at.start, at.stop)}  # which tells most vehicles apart
+    places = heading_and_speed(x[0], rates[:, at], torch.stack(list(velocity.values()), dim=-2))
+    if places is None:
+        return None
+    slopes = torch.stack([velocity[i] if i in velocity else slope(i) for i in range(n)], dim=-2)
     if not bool(torch.isfinite(slopes).all() & torch.isfinite(rates).all()):
         return None
-    return Sampled(z, (low, high), (ends[0], ends[1]), rates, slopes)
+    return Sampled(z, (low, high), (ends[0], ends[1]), rates, slopes, places)
 
 
 def steered(problem: Problem) -> Steered | None:
@@ -101,13 +109,9 @@ def steered(problem: Problem) -> Steered | None:
     seen = sampled(problem)
     if seen is None:
         return None
-    z, (low, high), ends, rates, slopes = seen
-    n, at = problem.n, problem.position
+    z, (low, high), ends, rates, slopes, (heading, speed) = seen
+    n = problem.n
     x = z[..., :n]
-    places = heading_and_speed(x[0], rates[:, at], slopes[:, at])
-    if places is None:
-        return None
-    heading, speed = places
     turn = _by_one_control(slopes[:, heading], n, speed)
     push = _by_one_control(slopes[:, speed], n, None)
     if turn is None or push is None or turn == push:

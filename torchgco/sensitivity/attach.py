@@ -15,14 +15,16 @@ from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import MISTAKES, computing_on
 from torchgco.base.tree import copied, is_users
+from torchgco.kernels import current, open_loop
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.problem.horizons import for_solvers
+from torchgco.problem.in_time import factors_in, factors_of, states_in_time, times_of
 from torchgco.problem.problem import Problem
-from torchgco.sensitivity.form import for_systems, for_user
 from torchgco.sensitivity.function import Solved, System
 from torchgco.sensitivity.points import Points, gains_of, points_of
 from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
+from torchgco.solvers.timing import lifted_multipliers
 
 EXACT_STEP = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
 EXACT_COSTATES = 1e-5  # share of the largest costate by which that step may change one
@@ -64,6 +66,8 @@ def refuse_forms(problem: Problem, what: str) -> None:
 
 def _captures(problem: Problem) -> bool:
     """Whether values of users' functions lead to tensors that ask for gradients, as those of the first problem show."""
+    if not any(map(is_users, (problem.dynamics, problem.cost, *problem.constraints))):
+        return False
     one = problem.take(slice(0, 1))
     X, U = (part.detach() for part in one.at_rest)
     uses: list[tuple[object, Callable[[], Tensor]]] = [
@@ -177,3 +181,32 @@ def _with_values(found: Solution, rows: Tensor, values: tuple[Tensor, ...]) -> S
 def _written(values: Tensor, rows: Tensor, new: Tensor) -> Tensor:
     """`values` (B, ...) with `new` in some rows."""
     return new if len(rows) == len(values) else values.index_copy(0, rows, new)
+
+
+def for_systems(problem: Problem, solution: Solution) -> tuple[Problem, Solution]:
+    """The problem in the form that solvers work on, with its solution; both themselves where they are one already."""
+    whole = for_solvers(problem)
+    if whole is problem:
+        return current(problem), solution
+    whole, multipliers = current(whole), solution.multipliers
+    if problem.time is not None:
+        X, U = states_in_time(problem, solution.X, solution.U, factors_of(problem, solution.times))
+        multipliers = lifted_multipliers(problem, whole, multipliers)
+    else:
+        X, U = torch.cat((solution.X, open_loop(whole, solution.U)[..., problem.n :]), dim=-1), solution.U
+    return whole, replace(solution, X=X.contiguous(), U=U.contiguous(), multipliers=multipliers)
+
+
+def for_user(problem: Problem, found: Solution, K: Tensor) -> Solution:
+    """The same solution in the user's states and controls, with the times where these are free; gradients go along.
+
+    Args:
+        problem: the user's.
+        K: its gains.
+    """
+    if found.X.shape[-1] == problem.n and problem.time is None:
+        return found
+    lam = found.multipliers.lam[: len(problem.constraints)]
+    parts = {"X": found.X[..., : problem.n], "U": found.U[..., : problem.m], "K": K}
+    times = None if problem.time is None else times_of(problem, factors_in(problem, found.X))
+    return replace(found, **parts, multipliers=Multipliers(lam, found.multipliers.mu), times=times)

@@ -10,4 +10,3 @@ from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian as Augment
 from torchgco.solvers.ilqr import ILQR as ILQR
 from torchgco.solvers.interior import InteriorPoint as InteriorPoint
 from torchgco.solvers.memory import plan_batch as plan_batch
-from torchgco.solvers.polish.polish import Polish as Polish

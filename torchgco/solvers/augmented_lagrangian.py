@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
-from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive, check_options
+from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive
 from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import kernels_of, measured, open_loop, value
@@ -37,7 +37,7 @@ HOLD = 2.0  # penalty on an abandoned trajectory, as a multiple of the extra cos
 
 
 @dataclass(frozen=True)
-class AugmentedLagrangian(Solver):
+class AugmentedLagrangian(Solver, named="solver"):
     """AL-iLQR, for each problem: inner solve, multiplier update, penalty update, guidance, until it has converged.
 
     With `inner.as_printed` the loop is that of the paper: mu grows after every inner solve, inequalities have the
@@ -76,9 +76,6 @@ class AugmentedLagrangian(Solver):
     slots: Count | None = None
     record: bool = False
     by_kernels: bool = False
-
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
 
     def recording(self) -> AugmentedLagrangian:
         """The same solver, which keeps the history of every problem."""

@@ -16,7 +16,7 @@ from torchgco.base import clock
 from torchgco.base.brief import Brief
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError, StartWarning
-from torchgco.base.options import Seconds, Seed, check_value
+from torchgco.base.options import Checked, Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
@@ -149,7 +149,10 @@ def check_states(X0: Any, problem: Problem) -> None:
     check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
 
 
-class Solver(Brief):
+CHOOSING_TIME = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
+
+
+class Solver(Brief, Checked):
     """A solver for batches of problems. Its fields are its options; it keeps no state between calls.
 
     Attributes:
@@ -239,8 +242,7 @@ class Solver(Brief):
         self.announce(call.problem)
         chooser = self.choosing_time(call.problem)
         if chooser is None:
-            able = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
-            raise InputError("solver", able, type(self).__name__)
+            raise InputError("solver", CHOOSING_TIME, type(self).__name__)
         found = solve_in_time(chooser, problem, call, X0)
         self._check(problem, call, found)
         _, X, U = at_times(problem, found.X, found.U, found.times)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.base.status import STALLED, UNMOVED, Status, is_over
 from torchgco.ilqr.riccati import BackwardPass
-from torchgco.judging.gates import passes
+from torchgco.judging.gates import passages
 from torchgco.kernels import cost_scale, cost_unit, kernels_of, path_clearance
 from torchgco.lagrangian.lagrangian import Lagrangian, binding
 from torchgco.obstacles.base import ADMITTED
@@ -128,8 +128,8 @@ def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Te
         return status
     part, X, U = problem.take(rows), X[rows], U[rows]
     bad = path_clearance(part, X, U) < 0 if all(one.has_chords for one in part.obstacles) else rows < 0
-    for way in (passes(constraint, X) for constraint in part.constraints):
-        bad = bad if way is None else bad | ~way.passed.all(-1)
+    for way in passages(part, X, U).values():
+        bad = bad | ~way.passed.all(-1)
     status = status.clone()
     status[rows[bad]] = int(Status.INFEASIBLE)
     return status

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, NonNegative, Share, check_options
+from torchgco.base.options import Count, NonNegative, Share
 from torchgco.base.status import STALLED, Status
-from torchgco.base.tree import put, take
+from torchgco.base.tree import Rows, put, take
 from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.line_search import LineSearch
 from torchgco.kernels import kernels_of, measured, open_loop, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.state import InnerState, Iterate, SolveEnd
+from torchgco.native.kept_descent import KeptDescent
 from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.ending import start_status
@@ -23,7 +26,7 @@ from torchgco.solvers.session import Session
 
 
 @dataclass(frozen=True)
-class ILQR(Solver):
+class ILQR(Solver, named="ilqr"):
     """Iterative LQR: expansions, backward pass, line search, until L_M no longer falls.
 
     Used alone, it makes one inner solve; constraints count only through the multipliers and penalties of a warm start,
@@ -50,9 +53,6 @@ class ILQR(Solver):
     max_iterations: Count = 50
     line_search: LineSearch = LineSearch()
     damp_below: Share = 0.0
-
-    def __post_init__(self) -> None:
-        check_options(self, "ilqr")
 
     @property
     def descent(self) -> Descent:
@@ -102,3 +102,41 @@ def descend(
         if running is not found:
             put(found, running.rows, running)
     return found, status
+
+
+class RepeatedDescent:
+    """`descend` for problems that stay packed in C, where C serves them. One thread calls it at a time.
+
+    Args:
+        inner: iLQR.
+        problem: of torchgco's own parts, with tensors that nobody else holds. The start, and the references of a
+            quadratic cost, count as soon as they are written in place; other numbers after `refresh`.
+    """
+
+    def __init__(self, inner: ILQR, problem: Problem) -> None:
+        self.inner, self.problem = inner, problem
+
+    @cached_property
+    def _kept(self) -> KeptDescent | None:
+        """Packed at the first solve, as many a subset never has one; None where PyTorch's kernels serve."""
+        return kernels_of(self.problem).kept_descent(self.problem, self.inner.descent, not self.inner.as_printed)
+
+    def take(self, index: Rows) -> RepeatedDescent:
+        """The same for the problems in `index`."""
+        part = self.problem.take(index)
+        return self if part is self.problem else RepeatedDescent(self.inner, part.renewed())
+
+    def refresh(self, i: int) -> None:
+        """The numbers of constraint i have been written."""
+        kept = vars(self).get("_kept")
+        if kept is not None:
+            kept.refresh_constraint(i)
+
+    def solve(self, U: Tensor, multipliers: Multipliers) -> tuple[Tensor, Tensor, Tensor]:
+        """States X (B, N+1, n), controls (B, N, m) of one inner solve from controls U, and their violation (B,)."""
+        kept = self._kept
+        if kept is not None and kept.solve(U, multipliers):
+            return kept.X, kept.U.clone(), kept.violation()
+        problem = self.problem.renewed()  # whose numbers are others than those that it was packed with
+        found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, not self.inner.as_printed), U)
+        return found.X, found.U, measured(problem, found.X, found.U)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.options import Count, Positive
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
@@ -16,6 +15,7 @@ from torchgco.eager.fixed import GOLDEN, ROUNDINGS
 from torchgco.eager.kernels import least_violation
 from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
 from torchgco.kernels.in_pytorch import InteriorKernels
+from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -33,39 +33,12 @@ from torchgco.solvers.unbounded import beyond_rounding
 REPORTED_AT_ONCE = 256  # problems between two reports of progress
 SADDLE_STEPS = 1e-3, 1e-1  # sizes of the controls, by which a solve goes on beside a saddle point or a maximum
 ROUGH, FEW = 1e-2, 60  # tolerance, and iterations, of a trajectory whose time is to be freed next
+DRAWN_ITERATIONS = 30  # iterations of a drawn guess, after which its cost is compared
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
-# In brackets: the names of Waechter and Biegler (2006). Constants without such a name are not in the paper.
-FILTER: dict[str, Any] = {
-    "push": 1e-2,  # least slack at the start, and how far guesses are moved inside of their bounds (kappa_1)
-    "boundary": 0.99, "closest": 1.0 - 1e-12,  # share of the way to where a slack is 0 (tau_min), and at most: above 0
-    "central": 1e10,  # factor by which s z may leave mu (kappa_Sigma)
-    "barrier_error": 10.0, "barrier_share": 0.2, "barrier_floor": 0.1,  # kappa_epsilon, kappa_mu; tolerance times this
-    "barrier_least": 1e-30, "counts": STATIONARY,  # where complementarity makes up more than this share of the cost
-    "usual_multiplier": 100.0, "largest_multiplier": 1e3,  # s_max; costates at the start are 0 where larger
-    "highest": 1e4, "lowest": 1e-4,  # theta_max, theta_min, as multiples of theta at the start, of 1 at least
-    "gain_theta": 1e-5, "gain_phi": 1e-8, "armijo": 1e-4,  # gamma_theta, gamma_phi, eta_phi
-    "switching": 1.0, "power_theta": 1.1, "power_phi": 2.3,  # delta, s_theta, s_phi
-    "shift_first": 1e-4, "shift_least": 1e-20, "shift_max": 1e20,  # delta_w: first, min, max
-    "shift_decay": 1.0 / 3.0, "shift_growth": 8.0, "shift_growth_first": 100.0,  # kappa_w: minus, plus, plus-bar
-    "patience": 10, "trials": 3,  # short steps before the watchdog, and its full steps
-    "corrects": 1, "smallest": 1e-10,  # second-order corrections; least step length
-    "held": 1e-3,  # of the cost's steepest slope, by which its curvature changes it over a slack: less holds no step
-    "steepest": 1.0,  # slope or curvature of the cost, to which it is scaled
-    "pivot": 1e-14, "noise": 10.0,  # least pivot, as a share of its entry; rounding of phi, in units of its last bit
-    "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
-    "slight": 2e-5,  # times delta_c: the least share, 1e3 roundings, of what the cost lets equalities give way
-    "relaxes": 0.01,  # of the violation tolerance, by which rows are relaxed there (1e-8: IPOPT's bound_relax_factor)
-    "soft_growth": 100.0, "soft_decay": 0.1,
-    "crawl": 0.02, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
-    "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,
-    "smoothing": 0.0,  # mu, in units of the cost, at which the barrier stays
-    "minimum": 0,  # 1: says where the cost falls to second order from a point that meets the conditions of first order
-    "rounding": 1e-10, "idle": 3,  # an error below this that doesn't fall by half for so long is due to rounding
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
-class InteriorPoint(Solver):
+class InteriorPoint(Solver, named="solver"):
     """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
 
     States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
@@ -75,11 +48,16 @@ class InteriorPoint(Solver):
 
     Args:
         tolerance: of the optimality conditions, scaled as in the paper; in float32 8e-6, or what rounding allows.
+            IPOPT: tol.
         violation_tolerance: residual (metres for lengths) up to which a trajectory counts as feasible; in float32
-            1.2e-5 at least.
-        max_iterations: of each problem.
-        initial_barrier: the barrier parameter mu at the start.
-        warm_barrier: the same for a call with multipliers of an earlier solution.
+            1.2e-5 at least. IPOPT: constr_viol_tol.
+        max_iterations: of each problem. IPOPT: max_iter.
+        initial_barrier: the barrier parameter mu at the start. IPOPT: mu_init.
+        warm_barrier: the same, and `bound_push`, for a call with multipliers of an earlier solution.
+        bound_push: least slack at the start, and how far a guess is moved inside of its bounds, as a share of its size
+            (of 1 at least) or of half their range. IPOPT: bound_push, bound_frac.
+        acceptable_tolerance: an error of the conditions at which a problem counts as solved, too, once it hasn't fallen
+            by half in three iterations, or no step or iteration is left. IPOPT: acceptable_tol.
 
     Raises:
         InputError: a field out of its range.
@@ -90,9 +68,19 @@ class InteriorPoint(Solver):
     max_iterations: Count = 500
     initial_barrier: Positive = 0.1
     warm_barrier: Positive = 1e-6
+    bound_push: Positive = 1e-2
+    acceptable_tolerance: Positive = 1e-10
 
-    def __post_init__(self) -> None:
-        check_options(self, "solver")
+    def options(self, warm: bool, **changes: float) -> BarrierOptions:
+        """What kernels read; `changes` of its fields."""
+        return replace(
+            BarrierOptions(
+                tol=self.tolerance, constr_viol_tol=self.violation_tolerance, max_iter=self.max_iterations,
+                acceptable_tol=self.acceptable_tolerance, bound_push=self.warm_barrier if warm else self.bound_push,
+                counts=STATIONARY, warm=int(warm),
+            ),
+            **changes,
+        )  # fmt: skip
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
@@ -121,7 +109,8 @@ class InteriorPoint(Solver):
         """This solver; where the time is held, with a tolerance that any trajectory meets, and few iterations."""
         held = replace(self, tolerance=max(self.tolerance, ROUGH), max_iterations=min(self.max_iterations, FEW))
         first = replace(self, max_iterations=held.max_iterations)
-        return Chooser(held, self, self.admitted(problem), first)
+        rough = replace(held, max_iterations=DRAWN_ITERATIONS).solved
+        return Chooser(held, self, self.admitted(problem), first, rough=rough)
 
     def solved(
         self,
@@ -218,20 +207,16 @@ class InteriorPoint(Solver):
         """Solves problems, and puts how they ended into `end` at `rows`; whether their costs fall to second order."""
         problem, warm = call.problem, call.warm
         if warm is None:
-            multipliers, mu, how = Multipliers.zero(problem, 1.0).lam, self.initial_barrier, FILTER
+            multipliers, mu = Multipliers.zero(problem, 1.0).lam, self.initial_barrier
         else:
-            mu, how = self.warm_barrier, FILTER | {"push": self.warm_barrier}
+            mu = self.warm_barrier
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
-        how = how | {"smoothing": smoothing, "minimum": int(escapes)}
-        X, U = inside(problem, X, call.U0, how["push"])
+        how = self.options(warm is not None, smoothing=smoothing, minimum=int(escapes), seconds=call.seconds_left)
+        X, U = inside(problem, X, call.U0, how.bound_push)
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
         scale = cost_scale(problem)
         fitted = Multipliers(multipliers, PENALTY * scale.unit)
-        out = kernels.solve(
-            problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
-            constant=scale.constant, least_cost=scale.size, seconds=call.seconds_left,
-            max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
-        )  # fmt: skip
+        out = kernels.solve(problem, X, U, multipliers, X.new_full((problem.B,), mu), scale, how)
         X, U = rolled_out(problem, X, U, out["gains"][..., :-1])
         found = Iterate(X, U, fitted, problem.cost.total(X, U), measured(problem, X, U))
         put(end.best, rows, found)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
+from torchgco.base.products import exponential, least_squares, product
 from torchgco.base.shapes import MISTAKES
 from torchgco.constraints.bounds import Bounds, bounds_of
 from torchgco.obstacles.base import Obstacles
@@ -87,22 +88,23 @@ class LinearTime:
         generator = A.new_zeros(B, n + m + 1, n + m + 1)
         generator[:, :n] = torch.cat((A, G, c.unsqueeze(-1)), dim=-1)
         generator *= (factor * problem.N * problem.dynamics.dt / STAGES).view(-1, 1, 1)
-        step = torch.linalg.matrix_exp(generator)[:, :n]
+        step = exponential(generator)[:, :n]
         one, push, drift = step[..., :n], step[..., n : n + m], step[..., -1:]
         x, reach, through, start = self.line[:, 0].unsqueeze(-1), [], self.asked, self.line[:, 0].unsqueeze(-1)
         for _ in range(STAGES):
-            x = one @ x + drift
-            reach.append(through @ push)
-            through = through @ one
-        W, missing = torch.cat(reach[::-1], dim=-1), self.asked @ (self.line[:, -1:].mT - x)  # (B, p, STAGES m)
+            x = product(one, x) + drift
+            reach.append(product(through, push))
+            through = product(through, one)
+        W, missing = torch.cat(reach[::-1], dim=-1), product(self.asked, self.line[:, -1:].mT - x)  # (B, p, STAGES m)
         known = (torch.isfinite(W).all((1, 2)) & torch.isfinite(missing).all((1, 2)) & self.bounded).view(-1, 1, 1)
         W, missing = torch.where(known, W, 0.0), torch.where(known, missing, torch.inf)
-        u = torch.linalg.pinv(W) @ torch.where(known, missing, 0.0)
-        misses = (W @ u - missing).abs().amax((1, 2)) / (1.0 + (self.asked @ (x - start)).abs().amax((1, 2)))
+        u = least_squares(W, torch.where(known, missing, 0.0).squeeze(-1)).unsqueeze(-1)
+        size = 1.0 + product(self.asked, x - start).abs().amax((1, 2))
+        misses = (product(W, u) - missing).abs().amax((1, 2)) / size
         u = u.view(B, STAGES, m)
         path = [start]
         for part in u.unsqueeze(-1).unbind(1):
-            path.append(one @ path[-1] + push @ part + drift)
+            path.append(product(one, path[-1]) + product(push, part) + drift)
         return torch.cat(path, dim=-1).mT, u, misses
 
     def _fits(self, x: Tensor, u: Tensor, misses: Tensor) -> Tensor:
@@ -120,7 +122,7 @@ def _linear(problem: Problem, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Ten
     model = problem.dynamics
     rates = lambda x, u: model.field(model.settled(x), u)
     A, G = jacobian(rates, x, u)
-    return A, G, rates(x, u) - (A @ x.unsqueeze(-1)).squeeze(-1)
+    return A, G, rates(x, u) - product(A, x.unsqueeze(-1)).squeeze(-1)
 
 
 def _asked(problem: Problem, end: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
+from torchgco.base.products import product
 from torchgco.base.shapes import MISTAKES
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import gates_of
@@ -100,9 +101,9 @@ def asked_of_the_end(problem: Problem) -> Tensor:
             return z
         if not bool((c != 0).any()):
             return z
-        A = J @ J.mT
+        A = product(J, J.mT)
         A = A + torch.diag_embed((SOFT * A.abs().amax((1, 2)) + 1e-300).unsqueeze(-1).expand_as(c))
-        step = (J.mT @ torch.linalg.lstsq(A, c.unsqueeze(-1)).solution).squeeze(-1)
+        step = (J * torch.linalg.solve_ex(A, c.unsqueeze(-1)).result).sum(1)
         z = torch.where(torch.isfinite(step).all(-1, keepdim=True), z - step, z)
     return z
 

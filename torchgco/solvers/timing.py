@@ -27,9 +27,11 @@ from torchgco.costs.base import WrappedCost
 from torchgco.kernels import open_loop, path_clearance
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
+from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.in_time import at_held_times, factors_in, fitting_factors, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
+from torchgco.solvers.convexity import looks_convex
 from torchgco.solvers.drawn import KNOTS, STREAM, controls_of
 from torchgco.solvers.history import appended, in_units
 from torchgco.solvers.linear_time import LinearTime
@@ -40,6 +42,7 @@ HELD_NEXT = 2.0  # the next one, of the one before
 AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
 BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
 DRAWN_TIMES, DRAWN_CONTROLS = 0.5, 0.5  # deviations of drawn guesses: in octaves, and of half a control's range
+NEAR = 1e-2  # violation up to which a rough solve says what a trajectory costs
 SAME_TIME = 0.1  # difference of two times, as a share, that makes no other search
 
 
@@ -62,7 +65,8 @@ class Chooser:
         paces: shares of the times found at which it is searched again, as another way may be the better one there.
         through: takes the time of problems with gates as a variable at once; None: as of others.
         starts: drawn guesses of the time and the controls, from which it is taken as a variable, too, in the end.
-        starts_all: for all problems; else for those that haven't converged.
+        others: so many of problems that have converged.
+        rough: solves from these roughly, without a verdict; None: there are none.
     """
 
     held: Runs
@@ -72,7 +76,8 @@ class Chooser:
     paces: tuple[float, ...] = ()
     through: Callable[[Any], Solution] | None = None
     starts: int = 0
-    starts_all: bool = False
+    others: int = 0
+    rough: Callable[[Any], SolveEnd] | None = None
 
 
 class Timed:
@@ -120,8 +125,8 @@ class Timed:
         if legs is None:
             return estimate
         each = legs.stage_factors(torch.where(estimate.isnan(), 1.0, estimate), N)
-        of_stages = torch.nn.functional.one_hot(time.of_stages(N), time.count).to(each)
-        return each @ of_stages / of_stages.sum(0)
+        at = time.of_stages(N)
+        return each.new_zeros(len(each), time.count).index_add(1, at, each) / torch.bincount(at)
 
     @cached_property
     def own(self) -> Tensor:
@@ -215,7 +220,7 @@ class Timed:
         factors = factors_in(self.problem.take(rows), found.X)
         return (factors <= AT_LEAST * self.time.least[rows]).all(-1)
 
-    def _freed(self, call: Any, start: Solution) -> Solution:
+    def _freed(self, call: Any, start: Solution | Iterate) -> Solution:
         """The trajectories with the time free."""
         return self.chooser.free.run(replace(call, X0=start.X, U0=start.U, warm=None))
 
@@ -256,13 +261,35 @@ class Timed:
     def _from_drawn(self) -> None:
         """Take the time as a variable from trajectories of drawn controls in drawn times about the one found.
 
-        Least times are local: of controls that turn a thrust there are many.
+        Least times are local: of controls that turn a thrust there are many. Where nothing has converged yet, each
+        guess is solved. Elsewhere, but for problems that look convex, all are solved roughly, side by side; the best of
+        each problem is solved on where it may be better than what is known.
         """
-        status, count = self.best.status, self.chooser.starts
-        open_ = status != Status.INVALID_START
-        rows = (open_ if self.chooser.starts_all else open_ & (status != Status.CONVERGED)).nonzero().flatten()
-        if rows.numel() == 0 or count == 0 or self.call.late:
+        user, best = self.problem, self.best
+        if self.chooser.starts == 0 or self.call.late:
             return
+        done = best.status == Status.CONVERGED
+        rows = (~done & (best.status != Status.INVALID_START)).nonzero().flatten()
+        if rows.numel() > 0:
+            ends = self.chooser.free.run(self._drawn(rows, self.chooser.starts))
+            for number in range(self.chooser.starts):
+                self._keep(rows, ends.take(slice(number, None, self.chooser.starts)))
+        rows, rough = done.nonzero().flatten(), self.chooser.rough
+        some = self.best.take(rows)
+        rows = rows[~looks_convex(user.take(rows), some.X[..., : user.n], some.U[..., : user.m])]
+        if rows.numel() > 0 and rough is not None and not self.call.late:
+            call, old = self._drawn(rows, self.chooser.others), self.best.take(rows)
+            ends = rough(call)
+            self.best.iterations[rows] += ends.iterations.view(len(rows), -1).sum(1)
+            cost = torch.where(ends.best.violation <= NEAR, ends.best.cost, torch.inf)
+            least, place = cost.view(len(rows), -1).min(-1)
+            chosen = (least < old.cost).nonzero().flatten()
+            if chosen.numel() > 0:
+                at = chosen * self.chooser.others + place[chosen]
+                self._keep(rows[chosen], self._freed(call.take(at), take(ends.best, at)))
+
+    def _drawn(self, rows: Tensor, count: int) -> Any:
+        """The call of `count` guesses for each of the problems `rows` (b,)."""
         each = rows.repeat_interleave(count)
         start = torch.arange(count, device=rows.device).repeat(rows.numel())
         call, user = replace(self.call.take(each), callback=None, warm=None), self.problem.take(each)
@@ -276,9 +303,7 @@ class Timed:
         x0[:, user.n] = guess[:, 0]
         lifted = call.problem._with({"x0": x0}, call.problem.known)
         _, U = states_in_time(user, self._line[each], U, guess)
-        ends = self.chooser.free.run(replace(call, problem=lifted, X0=open_loop(lifted, U), U0=U))
-        for number in range(count):
-            self._keep(rows, ends.take(slice(number, None, count)))
+        return replace(call, problem=lifted, X0=open_loop(lifted, U), U0=U)
 
     def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Any:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""

@@ -5,6 +5,7 @@ and `facts` knows what a trace rests on, so that it is used again only where it 
 and `baselines/nlp.py` programs for IPOPT. It imports `base`. Begin with `traced.py`.
 """
 
+from torchgco.tracing.facts import CAPTURED as CAPTURED
 from torchgco.tracing.facts import Facts as Facts
 from torchgco.tracing.facts import Unseen as Unseen
 from torchgco.tracing.traced import Traced as Traced

@@ -29,6 +29,10 @@ def _is_negative(x: Tensor) -> Tensor:
     return (x < 0) | ((x == 0) & (1.0 / x < 0))
 
 
+def _copysign(a: Tensor, b: Tensor | float) -> Tensor:
+    return a.abs() * (torch.where(_is_negative(b), -1.0, 1.0) if isinstance(b, Tensor) else math.copysign(1.0, b))
+
+
 def _xor(a: Tensor, b: Tensor) -> Tensor:
     return (a != 0) != (b != 0)
 
@@ -245,7 +249,7 @@ DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "aten.isnan": lambda x: x != x,
     "aten.isinf": lambda x: x.abs() == torch.inf,
     "aten.signbit": _is_negative,
-    "aten.copysign": lambda a, b: a.abs() * torch.where(_is_negative(b), -1.0, 1.0),
+    "aten.copysign": _copysign,
     "aten.logical_xor": _xor,
     "aten.fmax": _other_where_nan(torch.maximum),
     "aten.fmin": _other_where_nan(torch.minimum),

@@ -42,6 +42,7 @@ from torchgco.tracing.trust import (
     tells_settings,
 )
 
+CAPTURED = 1 << 26  # bytes of tensors and arrays, at most, that are held for what was found with them
 MOST_FACTS = 50_000  # facts of a problem: with more of them a trace is as quick
 COMPARED_NUMBERS = 10_000  # numbers of a tensor of torchgco's own parts that are compared by content
 PLAIN = {bool, int, str, bytes, torch.dtype, torch.device, *map(type, (None, ..., NotImplemented))}
@@ -105,6 +106,12 @@ class Facts:
     def hold(self) -> bool:
         """Whether the tensors that the key has by content have it still: a trace reads those that it has met."""
         return all(_bytes(tensor) == content for tensor, content in self._contents.values())
+
+    @property
+    def nbytes(self) -> int:
+        """The size of the tensors and arrays that are held, of sparse ones as if they were dense."""
+        held = (thing for thing in self.alive if isinstance(thing, (Tensor, np.ndarray)))
+        return sum(int(np.prod(thing.shape)) * thing.dtype.itemsize for thing in held)
 
     def walk(self, thing: Any) -> None:
         kind = type(thing)
@@ -291,16 +298,17 @@ class Facts:
         """A class by identity, with what stands in it: a program may put other methods there, by names or from afar."""
         if not self._first(cls):
             return
-        self.same(cls)
-        if "_abc_impl" in vars(cls):  # classes that were registered for an abstract one
-            self.note(len(abc._get_dump(cls)[0]))  # type: ignore[attr-defined]
+        self.alive.append(cls)
+        # Classes that were registered for an abstract one.
+        others = len(abc._get_dump(cls)[0]) if "_abc_impl" in vars(cls) else 0  # type: ignore[attr-defined]
         if is_library(cls):
-            if cls.__flags__ & HEAP:
-                held = [value for name, value in vars(cls).items() if name not in BESIDES]
-                self.alive += held
-                self.note(*map(id, held))
-                self._all(cls.__mro__[1:])
+            held = [value for name, value in vars(cls).items() if name not in BESIDES] if cls.__flags__ & HEAP else []
+            self.alive += held
+            self.note(id(cls), others, *map(id, held))
+            for base in cls.__bases__:
+                self._class(base)
             return
+        self.note(id(cls), others)
         if not is_library(type(cls)) or not is_made(cls):
             raise Unseen(cls.__name__)
         self._all(cls.__mro__[1:])
@@ -352,6 +360,9 @@ class Facts:
             self.note(len(value))
             for part in value:
                 self._form(part)
+        elif type(value) is dict:
+            self._all(value)
+            self._form(tuple(value.values()))
         elif isinstance(value, Tensor):
             self.note(value.dtype, value.dim(), value.shape[1:], value.shape[:1] == (1,))
         else:

@@ -187,7 +187,7 @@ class Nets:
         net = _Layers(part, self._shapes, self._places(first)[0], precision).net()
         inputs, made = np.asarray(known[part.source]).reshape(part.rows, part.k), []
         for row in inputs:
-            outputs = ca.SX.sym(f"o{len(calls)}", net.size)
+            outputs = ca.SX.sym("o", net.size)
             calls.append(Call(net, ca.densify(ca.SX(ca.vertcat(*row))), outputs))
             made.append([outputs[i] for i in range(net.size)])
         place = 0

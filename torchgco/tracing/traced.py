@@ -379,7 +379,7 @@ def own_tensors(part: PerElement) -> list[Tensor]:
 def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
     """Numbers (s,) where they are structural, and NaN for the others, and for learned ones, (s,) bool."""
     pattern = numbers.numpy().copy()
-    structural = np.isin(pattern, STRUCTURAL) & ~((pattern == 0.0) & np.signbit(pattern))
+    structural = (pattern[:, None] == np.array(STRUCTURAL)).any(1) & ~((pattern == 0.0) & np.signbit(pattern))
     pattern[learned.astype(bool) | ~structural] = np.nan
     return pattern
 

@@ -9,6 +9,7 @@ from base64 import b64decode
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 # Walls of a room of 6 x 4 cells, rows from the top as in an image: 1 is occupied.
 ROOM = np.array([[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 1, 0, 0, 0], [1, 1, 1, 1, 1, 1]])
@@ -147,6 +148,8 @@ SAMPLES: dict[str, tuple[bytes, dict[str, float]]] = {
 
 def write(folder: Path, name: str, data: bytes | None = None) -> Path:
     """The sample, or other bytes under its name, with the image that map_server's yaml files name."""
+    if name.endswith((".ply", ".stl", ".obj")):
+        pytest.importorskip("trimesh")
     if name.endswith(".yaml"):
         (folder / "plan.pgm").write_bytes(SAMPLES["plan.pgm"][0])
     (folder / name).write_bytes(SAMPLES[name][0] if data is None else data)

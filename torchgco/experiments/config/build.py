@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchgco.base.errors import InputError
 from torchgco.base.memory import free_memory
-from torchgco.base.options import Count, Within, check_options, check_value
+from torchgco.base.options import Checked, Count, Within, check_value
 from torchgco.dynamics import QuadrotorPlanning, QuadrotorThrusts
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
@@ -297,16 +297,13 @@ def _instantiate(node: Any, field: str) -> Any:
 
 
 @dataclass(frozen=True)
-class _Device:
+class _Device(Checked, named="device"):
     """The node `device`."""
 
     name: Literal["cpu", "cuda"]
     dtype: Literal["float64", "float32"]
     kernels: Literal["native", "eager"]
     threads: Annotated[int, Within(1, MAX_PROCESSES)] | None
-
-    def __post_init__(self) -> None:
-        check_options(self, "device")
 
 
 def _device(node: Mapping[str, Any]) -> tuple[torch.device, torch.dtype]:

@@ -42,7 +42,9 @@ from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.success import with_success
 from torchgco.kernels import native
 from torchgco.missions import Mission
+from torchgco.problem.horizons import for_solvers
 from torchgco.scenarios import Layouts, Task
+from torchgco.solvers.contracts import CHOOSING_TIME
 
 # From a baseline's name to the whole configuration with that solver.
 Recompose = Callable[[str], dict[str, Any]]
@@ -177,6 +179,8 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
             raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
     rivals = _rivals(configuration, recompose)
     solvers = {name: setup.solver if held is configuration else solver_of(held) for name, held in rivals.items()}
+    if setup.mission is None:
+        _check_time(task, solvers)
     plant = None if setup.mission is None else setup.mission.plant
     decided = {**configuration, **files_of(configuration, getattr(plant, "files", ()))}
     manifest = Manifest(
@@ -193,6 +197,16 @@ def check_mission(mission: Mission, task: Task) -> None:
     mission.check_stated(task.problem)
     if mission.duration < dynamics.dt:
         raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
+
+
+def _check_time(task: Task, solvers: Mapping[str, Any]) -> None:
+    """Refuse solvers that can't choose a free time before any of them flies."""
+    if task.problem.time is None:
+        return
+    problem = for_solvers(task.problem)
+    for place, (name, solver) in enumerate(solvers.items()):
+        if solver.choosing_time(problem) is None:
+            raise InputError("study.baselines" if place else "solver", f"{CHOOSING_TIME}, as it is free here", name)
 
 
 def _rivals(configuration: dict[str, Any], recompose: Recompose) -> dict[str, dict[str, Any]]:

@@ -28,7 +28,7 @@ def advised(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
     if len(short) == 0:
         return ""
     shown = short.head(EXPLAINED)
-    problem = setup.vehicle.task(layouts.take(shown["layout"].tolist()), setup.device, setup.dtype).problem
+    problem = setup.task(layouts.take(shown["layout"].tolist())).problem
     found: dict[str, list[str]] = {}
     for i, row in enumerate(shown.to_dict("records")):
         one, status = problem.take(torch.tensor([i], device=problem.x0.device)), Status[str(row["status"])]
@@ -75,7 +75,7 @@ def explained(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
 
 def _told(setup: Setup, layouts: Layouts) -> dict[int, str]:
     """What happened to layouts with as many stages, by their numbers."""
-    task = setup.vehicle.task(layouts, setup.device, setup.dtype)
+    task = setup.task(layouts)
     ids = torch.as_tensor(layouts.ids, device=setup.device)
     solution = setup.solver.recording().solve(task.problem, task.U0, seed=setup.seed, ids=ids)
     solution = replace(solution, account=solution.account.asked(task.problem, setup.solver_name))

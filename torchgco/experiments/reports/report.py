@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,7 +29,6 @@ from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
-from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
@@ -39,6 +39,7 @@ from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
+SHOWN_LAYOUTS = 12  # layouts in a picture, at most
 FACETS = 6  # most tasks that have panels of their own; more are pooled over the swept variables
 Arrays = Mapping[str, np.ndarray]
 
@@ -71,23 +72,34 @@ def write_report(
     write_tables(folder, parts)
     held = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
-        layouts, body = _posed(Layouts.load(folder / LAYOUTS), vehicle)
+        stored = Layouts.load(folder / LAYOUTS)
+        layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), vehicle)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
-            states = trajectories(solutions)
+            states = {name: X[:SHOWN_LAYOUTS] for name, X in trajectories(solutions).items()}
         if figures:
-            held["layouts"] = lambda: layout_grid(layouts, states, trials, body=body)
+            held["layouts"] = lambda: layout_grid(layouts, states, trials, **how)
         if printed:
             for ending in ("png", "pdf"):
-                held[f"study.{ending}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed, body)
+                held[f"study.{ending}"] = lambda: study_figure(
+                    layouts, states, trials, parts[0].summary, printed, **how
+                )
     draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
     return format_report(parts, form)
 
 
-def _posed(layouts: Layouts, vehicle: Vehicle | None) -> tuple[Arrays, BoundBody | None]:
-    """The arrays of layouts as problems were made of them, and the vehicle's body where it is no ball."""
+def _posed(layouts: Layouts, vehicle: Vehicle | None) -> tuple[Arrays, dict[str, Any]]:
+    """The arrays of layouts as problems are made of them, the vehicle's body where it is no ball, and its position."""
     if vehicle is None:
-        return layouts.arrays(), None
-    return vehicle.completed(layouts).arrays(), body_of(vehicle.task(layouts.take([0])).problem)
+        return layouts.arrays(), {}
+    groups = [(rows, vehicle.task(layouts.take(rows))) for rows in layouts.alike()]
+    one = groups[0][1].problem
+    arrays, how = vehicle.completed(layouts).arrays(), {"body": body_of(one), "position": one.dynamics.position}
+    if one.dynamics.position is None:
+        return arrays, how
+    start, goal = (np.full((layouts.count, layouts.dimension), np.nan) for _ in range(2))
+    for rows, task in groups:
+        start[rows], goal[rows] = task.problem.x0[:, task.problem.position].numpy(), task.goal.numpy()
+    return {**arrays, "start": start, "goal": goal}, how
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:

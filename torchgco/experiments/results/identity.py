@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from torchgco.experiments.results.files import checksum
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
-from torchgco.scenarios.layouts import BINDS, BOXES, GATES, SINES, TIME
+from torchgco.scenarios.layouts import BINDS, BOXES, GATES, REQUIRED, SINES, SPHERES, TIME
 from torchgco.scenarios.stored_maps import map_arrays
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
@@ -174,38 +174,33 @@ def layout_digests(
     alone = layouts.map is not None and layouts.map.batch is not None
     if layouts.map is not None and not alone:
         shared["map"] = _map_digests(layouts.map)
+    shared |= {name: value for name in (TIME, BINDS) if (value := getattr(layouts, name)) is not None}
     shared = _normal(shared)  # once for all layouts: a study may have thousands
     moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
     codes = {}
     for i, number in enumerate(layouts.ids.tolist()):
-        there = ~np.isnan(layouts.radii[i])
-        own = {"centers": layouts.centers[i][there], "radii": layouts.radii[i][there]}
-        if moves and layouts.velocities is not None:
-            own["velocities"] = layouts.velocities[i][there]
-        if layouts.box_centers is not None:
-            here = ~np.isnan(layouts.box_centers[i]).all(axis=-1)
-            held = {name: getattr(layouts, name) for name in BOXES}
-            if held["box_radii"] is not None and not held["box_radii"][i][here].any():
-                del held["box_radii"]  # sharp boxes, as without the array
-            if here.any():
-                held |= {name: getattr(layouts, name) for name in SINES}
-                own |= {name: value[i][here] for name, value in held.items() if value is not None}
-        for name in ("start", "goal"):
-            if getattr(layouts, name) is not None:
-                own[name] = getattr(layouts, name)[i]
-        if layouts.gate_centers is not None and layouts.gate_radii is not None:
-            here = ~np.isnan(layouts.gate_radii[i])
-            own |= {name: getattr(layouts, name)[i][here] for name in GATES}
-        if layouts.free_time is not None:
-            own[TIME] = layouts.free_time
-        if layouts.goal_required is not None:
-            own[BINDS] = layouts.goal_required
+        own: dict[str, Any] = {**_there(layouts, SPHERES if moves else REQUIRED, i)}
+        boxes = _there(layouts, (*BOXES, *SINES), i)
+        if "box_radii" in boxes and not boxes["box_radii"].any():
+            del boxes["box_radii"]  # sharp boxes, as without the array
+        own |= {name: part for name, part in boxes.items() if len(part)}
+        own |= _there(layouts, GATES, i)
+        own |= {name: states[i] for name in ("start", "goal") if (states := getattr(layouts, name)) is not None}
         if isinstance(layouts.stages, np.ndarray):
             own["stages"] = int(layouts.stages[i])
         if alone and layouts.map is not None:
             own["map"] = _map_digests(layouts.map.single(i))
         codes[number] = _digest_of({**shared, **_normal(own)})
     return codes
+
+
+def _there(layouts: Layouts, names: Sequence[str], i: int) -> dict[str, np.ndarray]:
+    """The rows of a layout's arrays, without those of NaN, by which spheres, boxes or gates are absent."""
+    held = {name: value[i] for name in names if (value := getattr(layouts, name)) is not None}
+    if not held:
+        return {}
+    places = held[names[0]]
+    return {name: value[~np.isnan(places).all(axis=-1)] for name, value in held.items()}
 
 
 def _map_digests(field: DistanceField) -> dict[str, str]:

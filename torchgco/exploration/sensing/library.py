@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchgco.native.compiler import Compiler, build, find_compiler
+from torchgco.native.includes import included, joined
 
 C_FOLDER = Path(__file__).parent / "c"
 C_TYPES = {"int64_t": c_int64, "double": c_double}
@@ -38,7 +39,7 @@ def _passed(value: Any) -> Any:
 
 @functools.cache
 def _library(compiler: Compiler | None) -> ctypes.CDLL:
-    source = "\n".join(path.read_text() for path in sorted(C_FOLDER.glob("*.c")))
+    source = joined(included(*sorted(path.name for path in C_FOLDER.glob("*.c"))), C_FOLDER)
     library = build(source)
     for name, declared in DECLARED.findall(source):
         function = getattr(library, name)

@@ -3,6 +3,8 @@
 
    The numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half their lengths (DIM), and the
    radius, which is negative where there is no box. */
+#pragma once
+#include "lanes.h"
 
 #define BOX_NUMBERS (DIM * DIM + 2 * DIM + 1)
 #define BOX_HALF(box) ((box) + DIM + DIM * DIM)

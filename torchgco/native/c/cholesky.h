@@ -1,4 +1,6 @@
 /* The Cholesky factor of the controls' block of a stage's Hessian, and triangular systems with it. */
+#pragma once
+#include "model.h"
 
 /* L of L L' = H_uu, of whose upper triangle in H (S, S) is read; L's diagonal is inverted. Pivots go into `pivots`. */
 static inline void factor_controls(const V *H, V *L, V *pivots) {

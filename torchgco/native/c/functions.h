@@ -1,5 +1,7 @@
 /* Exponentials, logarithms and the tangent of all lanes at once, each within 3 units in the last place. Where a lane's
    argument is out of the range that a formula is made for, or not finite, the C library is called for that lane. */
+#pragma once
+#include "lanes.h"
 
 #if TGCO_IS_DOUBLE
 #define TGCO_LN2_1 0x1.62e42fefa38p-1 /* short enough for its products with exponents to be exact */
@@ -23,7 +25,7 @@
 
 /* `near`, and where `far` is true what the C library makes of x. */
 #define TGCO_FROM_LIBRARY(name) \
-    __attribute__((noinline)) static V tgco_distant_##name(V x, V near, I far) { \
+    TGCO_APART V tgco_distant_##name(V x, V near, I far) { \
         for (int i = 0; i < LANES; i++) if (far[i]) near[i] = TGCO_MATH(name)(x[i]); \
         return near; \
     }
@@ -85,6 +87,13 @@ static inline V tgco_logarithm(V x, V more) {
     p = tgco_fused(p, z, SET(2.0 / 3.0));
     V low = tgco_fused(power, SET(TGCO_LN2_2), more), bend = tgco_fused(-p, z, f);
     return tgco_fused(power, SET(TGCO_LN2_1), f + tgco_fused(-s, bend, low));
+}
+
+/* m in [1, 2) and e of a normal number m 2^e. */
+static inline V tgco_mantissa(V x) { return (V)(((I)x & ~(I)SET(-INFINITY)) | (I)SET(1.0)); }
+static inline V tgco_exponent(V x) {
+    I e = (((I)x >> TGCO_EXPONENT) & (2 * TGCO_BIAS + 1)) - TGCO_BIAS;
+    return (V)(e + (I)SET(TGCO_WHOLE)) - SET(TGCO_WHOLE);
 }
 
 TGCO_FROM_LIBRARY(log)

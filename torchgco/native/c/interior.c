@@ -1,6 +1,11 @@
 /* A primal-dual interior point with a filter (Waechter and Biegler 2006) for problems side by side: states, controls
    and slacks move together, and the lanes are kept filled. solvers/interior says what it does. */
 
+#define _POSIX_C_SOURCE 199309L /* a clock that nobody sets */
+#include <time.h>
+#include "interior_fixed.h"
+#include "interior_search.h"
+
 /* Values and an empty filter of the lanes `of`; `anew`: slacks, too, and which rows have one. */
 static void settle(Barrier *t, Track *k, I of, int anew) {
     const Interior *how = t->how;
@@ -8,19 +13,19 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     V cost = values(t, s->X, s->U, t->c, t->gap);
     if (anew) {
         sort_rows(t, of);
-        ROWS(t, 0, {
-            V slack = most(-t->c[q], SET(how->push) * t->room[q]);
+        EACH_ROW(t, 0, q) {
+            V slack = most(-t->c[q], SET(how->bound_push) * t->room[q]);
             if (t->some_out) slack = tgco_choose(t->out[q], SET(1.0), slack);
             t->s[q] = tgco_choose(of, slack, t->s[q]);
-        })
+        }
     }
     residuals(t, t->c, t->s, t->r);
     V theta = size_of(t, t->gap, t->r), phi = cost - t->mu * logarithms(t, t->s);
     k->theta = tgco_choose(of, theta, k->theta);
     k->phi = tgco_choose(of, phi, k->phi);
     V one = SET(1.0), base = most(theta, one);
-    k->highest = tgco_choose(of, SET(how->highest) * base, k->highest);
-    k->lowest = tgco_choose(of, SET(how->lowest) * base, k->lowest);
+    k->highest = tgco_choose(of, SET(how->theta_max_fact) * base, k->highest);
+    k->lowest = tgco_choose(of, SET(how->theta_min_fact) * base, k->lowest);
     for (int l = 0; l < LANES; l++) if (of[l]) k->pairs[l] = 0;
 }
 
@@ -33,7 +38,7 @@ static void measure_bounds(const Barrier *t, V *size) {
         for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
             V limit = tgco_fabs(at(s->rows[i].bound, &con->bound, con->place[k])[j]);
             int v = con->variable[j];
-            size[v] = most(tgco_if(finite(limit), limit), size[v]);
+            size[v] = most(tgco_if(tgco_finite(limit), limit), size[v]);
         }
     }
 }
@@ -56,7 +61,7 @@ static void infer_sizes(const Barrier *t, V *size) {
             V by = size[i] / tgco_fabs(moved[v * NX + i]);
             if (i != v) found = tgco_choose(by > SET(0.0), least(by, found), found);
         }
-        size[v] = tgco_choose((size[v] == SET(0.0)) & finite(found), found, size[v]);
+        size[v] = tgco_choose((size[v] == SET(0.0)) & tgco_finite(found), found, size[v]);
     }
 }
 
@@ -133,7 +138,7 @@ static void begin(Barrier *t, Track *k, I of) {
     k->restoring &= ~of; k->watching &= ~of;
     k->relaxed &= ~of; k->presses &= ~of;
     if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
-    t->soft = tgco_choose(of, SET(how->soft), t->soft);
+    t->soft = tgco_choose(of, SET(how->jacobian_regularization_value), t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
@@ -142,19 +147,19 @@ static void begin(Barrier *t, Track *k, I of) {
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
     largest = steepest(t, &plain);
-    V scale = SET(how->steepest) / largest;
-    I scaled = of & finite(scale) & (largest > zero);
+    V scale = SET(how->nlp_scaling_obj_target_gradient) / largest;
+    I scaled = of & tgco_finite(scale) & (largest > zero);
     t->scale = tgco_choose(scaled, scale, t->scale);
     t->raised = tgco_choose(scaled, plain / largest, t->raised);
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
     settle(t, k, of, 1);
     if (how->warm) {
         if (t->some_out) join_multipliers(t, of);
-        ROWS(t, 0, {
-            V z = t->scale * t->z[q], lowest = t->mu / (SET(how->central) * t->s[q]);
+        EACH_ROW(t, 0, q) {
+            V z = t->scale * t->z[q], lowest = t->mu / (SET(how->kappa_sigma) * t->s[q]);
             t->z[q] = tgco_choose(of, by_role(t, q, most(z, lowest), z), t->z[q]);
-        })
-        ROWS(t, 1, t->z[q] = tgco_choose(of, t->scale * t->z[q], t->z[q]))
+        }
+        EACH_ROW(t, 1, q) t->z[q] = tgco_choose(of, t->scale * t->z[q], t->z[q]);
         expand(t);
         adjoin(t, of, 0);
     } else {
@@ -167,16 +172,16 @@ static void begin(Barrier *t, Track *k, I of) {
 /* The next mu of the lanes whose barrier problem is solved well enough; their filter begins anew. */
 static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V scale_z) {
     const Interior *how = t->how;
-    V base = most(dual, primal), usual = SET(how->tolerance * how->barrier_floor);
-    V smallest = tgco_choose(k->presses, SET(how->barrier_least), usual);
+    V base = most(dual, primal), usual = SET(how->tol * how->mu_floor);
+    V smallest = tgco_choose(k->presses, SET(how->mu_min), usual);
     if (how->smoothing > 0) smallest = SET(how->smoothing) * t->scale;
     I lowered = running & ~running;
     for (int tries = 0; tries < LONGEST_FALL; tries++) {
         V error = most(base, complementarity(t, t->mu) * scale_z);
-        I low = (error <= SET(how->barrier_error) * t->mu) & (t->mu > smallest);
+        I low = (error <= SET(how->barrier_tol_factor) * t->mu) & (t->mu > smallest);
         low &= running & ~k->restoring & ~k->watching;
         if (!any(low)) break;
-        V slow = SET(how->barrier_share) * t->mu, fast = t->mu * tgco_sqrt(t->mu);
+        V slow = SET(how->mu_linear_decrease_factor) * t->mu, fast = t->mu * tgco_sqrt(t->mu);
         V next = most(smallest, least(slow, fast));
         t->mu = tgco_choose(low, next, t->mu);
         lowered |= low;
@@ -196,12 +201,12 @@ static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
     for (;;) {
         I bad = open & ~factor(t, open);
         if (!any(bad)) break;
-        V before = k->last, first = SET(how->shift_first), floor = SET(how->shift_least);
-        V start = tgco_choose(before == SET(0.0), first, most(floor, before * SET(how->shift_decay)));
-        V growth = tgco_choose(before == SET(0.0), SET(how->shift_growth_first), SET(how->shift_growth));
+        V before = k->last, first = SET(how->first_hessian_perturbation), floor = SET(how->min_hessian_perturbation);
+        V start = tgco_choose(before == SET(0.0), first, most(floor, before * SET(how->perturb_dec_fact)));
+        V growth = tgco_choose(before == SET(0.0), SET(how->perturb_inc_fact_first), SET(how->perturb_inc_fact));
         V next = tgco_choose(t->shift == SET(0.0), start, growth * t->shift);
         t->shift = tgco_choose(bad, next, t->shift);
-        lost |= bad & (t->shift > SET(how->shift_max));
+        lost |= bad & (t->shift > SET(how->max_hessian_perturbation));
         open = bad & ~lost;
     }
     return running & ~lost;
@@ -212,8 +217,8 @@ static I soften(Barrier *t, const Track *k, I moving) {
     const Interior *how = t->how;
     for (;;) {
         V largest = SET(0.0);
-        ROWS(t, 1, largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest))
-        if (t->some_out) ROWS(t, 0, largest = most(tgco_if(t->fixes[q], tgco_fabs(t->z[q] + t->dz[q])), largest))
+        EACH_ROW(t, 1, q) largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest);
+        if (t->some_out) EACH_ROW(t, 0, q) largest = most(tgco_if(t->fixes[q], tgco_fabs(t->z[q] + t->dz[q])), largest);
         I large = moving & (largest > SET(how->explodes) * t->raised) & (t->soft < SET(how->softest));
         if (!any(large)) return moving;
         t->soft = tgco_choose(large, SET(how->soft_growth) * t->soft, t->soft);
@@ -232,7 +237,7 @@ static I recover(Barrier *t, Track *k, I failed) {
     for (int l = 0; l < LANES; l++) {
         if (!failed[l]) continue;
         if (++k->failures[l] > how->failures) { lost[l] = -1; continue; }
-        int seeks = k->theta[l] > how->violation && !k->restoring[l];
+        int seeks = k->theta[l] > how->constr_viol_tol && !k->restoring[l];
         double harder = how->forced_growth * k->forced[l];
         k->forced[l] = harder < how->shift_recovery ? how->shift_recovery : harder;
         if (seeks) { k->restoring[l] = -1; k->entered[l] = k->theta[l]; t->objective[l] = 0; }
@@ -245,7 +250,9 @@ static I recover(Barrier *t, Track *k, I failed) {
 
 /* Lanes that have become feasible enough go on with the cost. */
 static void resume(Barrier *t, Track *k) {
-    I done = k->restoring & ((k->theta <= SET(t->how->restored) * k->entered) | (k->theta <= SET(t->how->violation)));
+    const Interior *how = t->how;
+    I less = k->theta <= SET(how->required_infeasibility_reduction) * k->entered;
+    I done = k->restoring & (less | (k->theta <= SET(how->constr_viol_tol)));
     if (!any(done)) return;
     k->restoring &= ~done;
     t->objective = tgco_choose(done, SET(1.0), t->objective);
@@ -260,11 +267,11 @@ static I barrier_counts(Barrier *t, I of, V *left) {
     if (t->how->smoothing > 0) return of & ~of; /* it is to stay */
     if (!any(of)) return of;
     V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
-    ROWS(t, 0, *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]))
-    ROWS(t, 1, *left += tgco_fabs(t->z[q] * t->r[q]))
+    EACH_ROW(t, 0, q) *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]);
+    EACH_ROW(t, 1, q) *left += tgco_fabs(t->z[q] * t->r[q]);
     for (int l = 0; l < LANES; l++) {
         int64_t e = t->lanes.element[l];
-        size[l] = __builtin_fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
+        size[l] = fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
     }
     return of & (*left > SET(t->how->counts) * size);
 }
@@ -278,21 +285,21 @@ static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
     V idle = tgco_choose(error <= SET(0.5) * k->least, zero, k->idle + one);
     k->idle = tgco_choose(running, idle, k->idle);
     k->least = tgco_choose(running & (error < k->least), error, k->least);
-    I feasible = running & ~k->restoring & (primal <= SET(how->violation));
-    I met = feasible & (error <= SET(how->tolerance)), counts = barrier_counts(t, met, &left);
+    I feasible = running & ~k->restoring & (primal <= SET(how->constr_viol_tol));
+    I met = feasible & (error <= SET(how->tol)), counts = barrier_counts(t, met, &left);
     k->idle = tgco_choose(counts & (left <= SET(0.5) * k->left), zero, k->idle);
     k->left = tgco_choose(counts, least(left, k->left), k->left);
     k->presses |= counts;
-    I rests = k->idle >= SET((double)how->idle);
+    I rests = k->idle >= SET((double)how->acceptable_iter);
     met &= ~counts | rests;
-    met &= ((SET(how->tolerance) >= SET(how->rounding)) & ~k->presses) | (error <= SET(2.0) * t->mu) | (k->idle >= one);
-    return met | (feasible & rests & (error <= SET(how->rounding)));
+    met &= ((SET(how->tol) >= SET(how->rounding)) & ~k->presses) | (error <= SET(2.0) * t->mu) | (k->idle >= one);
+    return met | (feasible & rests & (error <= SET(how->acceptable_tol)));
 }
 
 /* Where a multiplier of an inequality explodes, rows leave each other no room: they are relaxed, as IPOPT's bounds are. */
 static void relax(Barrier *t, Track *k, I running) {
     V largest = SET(0.0);
-    ROWS(t, 0, largest = most(t->z[q], largest))
+    EACH_ROW(t, 0, q) largest = most(t->z[q], largest);
     I lacks = running & (largest > SET(t->how->explodes) * t->raised) & ~k->relaxed & ~k->watching;
     if (!any(lacks)) return;
     k->relaxed |= lacks;
@@ -306,11 +313,11 @@ static void relax(Barrier *t, Track *k, I running) {
 static I readmit(Barrier *t, Track *k, I of, double admitted) {
     I broken = of & ~of, changed = broken;
     t->admitted = admitted;
-    ROWS(t, 0, broken |= of & is_broken(t, q))
+    EACH_ROW(t, 0, q) broken |= of & is_broken(t, q);
     if (!any(broken)) return changed;
-    ROWS(t, 0, t->dz[q] = tgco_truth(t->out[q])) /* no step is under way */
+    EACH_ROW(t, 0, q) t->dz[q] = tgco_truth(t->out[q]); /* no step is under way */
     visit_rows(t, broken, 0, come_in);
-    ROWS(t, 0, changed |= t->dz[q] != tgco_truth(t->out[q]))
+    EACH_ROW(t, 0, q) changed |= t->dz[q] != tgco_truth(t->out[q]);
     if (!any(changed)) return changed;
     for (int l = 0; l < LANES; l++) if (changed[l]) {
         t->mu[l] = first_barrier(t, l);
@@ -327,15 +334,15 @@ static I readmit(Barrier *t, Track *k, I of, double admitted) {
 static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     const Interior *how = t->how;
     V dual, primal, scale_z;
-    if (t->some_out) readmit(t, k, running, how->highest); /* beyond which no residual is accepted */
+    if (t->some_out) readmit(t, k, running, how->theta_max_fact); /* beyond which no residual is accepted */
     relax(t, k, running);
     residuals(t, t->c, t->s, t->r);
     memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     expand(t);
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(how->smoothing) * t->scale) * scale_z);
-    I ended = running & ~running, astray = running & k->watching & ~finite(*error);
-    I small = (*error <= most(SET(how->tolerance), SET(how->rounding))) & (primal <= SET(how->violation));
+    I ended = running & ~running, astray = running & k->watching & ~tgco_finite(*error);
+    I small = (*error <= most(SET(how->tol), SET(how->acceptable_tol))) & (primal <= SET(how->constr_viol_tol));
     small &= ~k->restoring; /* no step that can't be taken matters there */
     if (any(astray)) go_back(t, k, astray);
     I solved = find_solved(t, k, running & ~astray, *error, primal);
@@ -344,11 +351,11 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
         if (solved[l]) {
             I one = running & ~running;
             one[l] = -1;
-            if (t->some_out && any(readmit(t, k, one, how->violation))) continue;
+            if (t->some_out && any(readmit(t, k, one, how->constr_viol_tol))) continue;
             status[l] = CONVERGED;
         }
         else if (!((*error)[l] - (*error)[l] == 0)) status[l] = NON_FINITE;
-        else if (k->made[l] >= how->max_iterations) status[l] = small[l] ? CONVERGED : MAX_ITERATIONS;
+        else if (k->made[l] >= how->max_iter) status[l] = small[l] ? CONVERGED : MAX_ITERATIONS;
         else continue;
         ended[l] = -1;
     }
@@ -367,7 +374,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
             status[l] = small[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
             ended[l] = -1;
         }
-    V tau = least(most(SET(how->boundary), SET(1.0) - t->mu), SET(how->closest));
+    V tau = least(most(SET(how->tau_min), SET(1.0) - t->mu), SET(how->tau_max));
     I won = search(t, k, moving, tau);
     k->made += tgco_truth(running);
     /* Where only short steps are accepted, the step reaches further than the model: more curvature shortens it. */
@@ -375,7 +382,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     V higher = tgco_choose(t->shift > floor, SET(how->recovery_growth) * t->shift, most(floor, k->last));
     lower = tgco_if(lower >= floor, lower);
     k->forced = tgco_choose(won & ~k->restoring, tgco_choose(k->crawls, higher, lower), k->forced);
-    t->soft = tgco_choose(won, most(SET(how->soft), SET(how->soft_decay) * t->soft), t->soft);
+    t->soft = tgco_choose(won, most(SET(how->jacobian_regularization_value), SET(how->soft_decay) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
     for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l] && k->forced[l] == 0) k->failures[l] = 0;
     for (int l = 0; l < LANES; l++) if (moving[l] && !won[l] && small[l]) { status[l] = CONVERGED; ended[l] = -1; }
@@ -385,12 +392,17 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     return ended;
 }
 
+static V stiffest(const Barrier *t) {
+    V found = SET(0.0);
+    EACH_ROW(t, 0, q) found = most(by_role(t, q, t->z[q] / t->s[q], SET(0.0)), found);
+    return found;
+}
+
 /* Lanes of `ended` from whose iterate the cost falls to second order: the reduced Hessian isn't positive definite. Where
    rows have become so stiff that rounding decides, none. */
 static I find_falls(Barrier *t, I ended) {
-    V shift = t->shift, stiffest = SET(0.0);
-    ROWS(t, 0, stiffest = most(by_role(t, q, t->z[q] / t->s[q], SET(0.0)), stiffest))
-    ended &= stiffest < SET(1.0 / t->how->rounding);
+    V shift = t->shift;
+    ended &= stiffest(t) < SET(1.0 / t->how->rounding);
     if (!any(ended)) return ended;
     expand(t);
     t->shift = tgco_choose(ended, SET(0.0), shift);
@@ -415,15 +427,10 @@ static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, 
     t->how->error[e] = error;
     t->how->theta[e] = k->theta[lane];
     p->iterations[e] += (int64_t)k->made[lane];
-    p->status[e] = status == CONVERGED && breaks_rows_left_out(t, lane) ? INFEASIBLE : status;
-}
-
-static void enter_barrier(Barrier *t, int lane, int64_t e) {
-    const Problem *p = t->lanes.of;
-    enter_problem(&t->lanes, lane, e);
-    for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->lanes.X[i][lane] = p->X[e * (p->N + 1) * NX + i];
-    for (int64_t i = 0; i < p->N * NU; i++) t->lanes.U[i][lane] = p->U[e * p->N * NU + i];
-    if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
+    if (status == CONVERGED && breaks_rows_left_out(t, lane)) status = INFEASIBLE;
+    /* The slack of a violated row without slope falls to 0, and its multiplier has no end. */
+    int fails = status == NON_FINITE || status == NOT_POSITIVE_DEFINITE;
+    p->status[e] = fails && stiffest(t)[lane] == INFINITY ? LINE_SEARCH_FAILED : status;
 }
 
 static double seconds_now(void) {

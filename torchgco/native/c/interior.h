@@ -1,4 +1,6 @@
 /* The interior point's data: constraints are c(x, u) + s = 0 with slacks s > 0, or c(x, u) = 0. */
+#pragma once
+#include "model.h"
 
 typedef struct {
     Lanes lanes;
@@ -14,9 +16,12 @@ typedef struct {
     V *room, *relaxed; /* (rows): half the range between two bounds, 1 at most; by how much a row is relaxed */
     int some_relaxed;  /* whether any is, in a lane */
     I *out, *fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
-    int some_out;   /* whether there are any in a lane; see interior_fixed.c */
+    int some_out;   /* whether there are any in a lane; see interior_fixed.h */
     double admitted; /* violation of rows outside, up to which they stay there */
-    int64_t *first, rows;        /* the first row of each constraint, and how many there are */
+    int64_t *first, rows;        /* the first row of each constraint, and how many there are, also at its end */
+    V *across[3]; /* (widest): numbers of the rows of one constraint at one knot */
+    I *moves;
+    int64_t widest; /* rows of a constraint at a knot, at most */
     V mu, shift, scale;
     V raised;    /* how many times larger the scale is than it would be in the units of the problem */
     V objective; /* 0 where feasibility alone is sought */

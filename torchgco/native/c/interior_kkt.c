@@ -9,6 +9,7 @@
    The interior point's factors of H + A'wA with w = 1 / (D + 1 / sigma), and of F, give steps towards the solution: each
    round closes what the last one has left open, of active rows all but a share of about 1 / sigma, as the method of
    multipliers does. */
+#include "interior_fixed.h"
 
 #define LEAST 1e-200 /* multiplier of an active row of an inequality, by which its stiffness is divided */
 
@@ -30,7 +31,7 @@ static inline V weight_of(const Barrier *t, const System *of, int64_t q) {
 
 /* A row of inequalities that holds has this curvature; one that doesn't none. (The interior point: z / s.) */
 static void stiffen(Barrier *t, const System *of) {
-    ROWS(t, 0, t->s[q] = tgco_choose(of->active[q] > SET(0.0), t->z[q] / weight_of(t, of, q), SET(INFINITY)))
+    EACH_ROW(t, 0, q) t->s[q] = tgco_choose(of->active[q] > SET(0.0), t->z[q] / weight_of(t, of, q), SET(INFINITY));
     t->soft = SET(1.0) / of->sigma;
 }
 
@@ -183,7 +184,8 @@ static V *start_system(System *of, int64_t N, int64_t rows) {
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
-    Interior options = {.of = how->of, .free_start = how->free_start, .pivot = how->pivot, .largest_multiplier = INFINITY};
+    Interior options = {
+        .of = how->of, .free_start = how->free_start, .pivot = how->pivot, .constr_mult_init_max = INFINITY};
     Barrier barrier, *t = &barrier;
     System system, *of = &system;
     if (!start_barrier(t, &options)) return 0;

@@ -1,6 +1,7 @@
 /* Vectors V of LANES numbers of type REAL (double or float), one problem or sample per lane; lanes are never mixed. */
-
+#pragma once
 #include <math.h>
+#include <stdint.h>
 
 /* The function of the C library for REAL: sin or sinf. */
 #define TGCO_SUFFIX_double
@@ -14,6 +15,14 @@
 
 typedef REAL V __attribute__((vector_size(LANES * sizeof(REAL))));
 typedef __typeof__((V){0} == (V){0}) I; /* all bits of a lane set where true */
+/* As many numbers of 32 bits, and numbers of other types that have the same values. */
+typedef uint32_t W __attribute__((vector_size(LANES * 4)));
+typedef int32_t Z __attribute__((vector_size(LANES * 4)));
+typedef float F __attribute__((vector_size(LANES * 4)));
+#define TGCO_CONVERTED(a, type) __builtin_convertvector(a, type)
+
+#define TGCO_INLINE static inline __attribute__((always_inline))
+#define TGCO_APART static __attribute__((noinline))
 
 static inline V tgco_set(double c) { return (REAL)c - (V){0}; } /* minus, so that -0.0 keeps its sign */
 #define SET(c) tgco_set(c)
@@ -36,7 +45,7 @@ static inline V tgco_set(double c) { return (REAL)c - (V){0}; } /* minus, so tha
 #define TGCO_FMA_float(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
 #endif
 #endif
-static inline __attribute__((always_inline)) V tgco_fused(V a, V b, V c) {
+TGCO_INLINE V tgco_fused(V a, V b, V c) {
 #if defined(TGCO_PART) && TGCO_PART == TGCO_BYTES
     return TGCO_JOIN(TGCO_FMA_, REAL)(a, b, c);
 #elif defined(TGCO_PART)
@@ -160,7 +169,7 @@ static inline V tgco_wave(V x, int shift) {
     return (V)((I)value ^ sign);
 }
 #define TGCO_WAVE(name, shift) \
-    __attribute__((noinline)) static V tgco_far_##name(V x, V near) { \
+    TGCO_APART V tgco_far_##name(V x, V near) { \
         for (int i = 0; i < LANES; i++) \
             if (!(TGCO_MATH(fabs)(x[i]) <= (REAL)TGCO_FAR)) near[i] = TGCO_MATH(name)(x[i]); \
         return near; \

@@ -2,6 +2,8 @@
    problems share.
 
    F = [fx fu] is sparse: f are the entries that are computed, the others constants of the model. H are upper triangles. */
+#pragma once
+#include "problem.h"
 
 #pragma GCC visibility push(hidden)
 extern const int tgco_nx, tgco_nu, tgco_np, tgco_nj; /* states, controls, the model's own numbers, entries f */
@@ -19,7 +21,7 @@ int model_slopes(int i, const V *x, const V *u, const V *p, const double *w, V *
 /* The cost of stage k at x, u, of the last knot where u is NULL; adds its gradient g (S) and Hessian H (S, S). */
 V cost_value(const Lanes *s, int64_t k, const V *x, const V *u);
 void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H);
-/* In a unit of its own (curvature.c), which the interior point's library has alone. f, and H += second derivatives of y' step;
+/* In a unit of its own (riccati.c), which the interior point's library has alone. f, and H += second derivatives of y' step;
    out = F z; traced rows: g[a] += c_z' by[a], H += c_z' diag(cc) c_z + lam' c_zz; out = c_z z. */
 void model_expand(const V *x, const V *u, const V *parameters, const double *w, const V *y, V *f, V *H);
 void model_push(const V *f, const V *z, V *out);

@@ -1,12 +1,14 @@
 /* MPPI (Algorithm 3): all rounds of sampled controls, problem by problem, with LANES samples side by side. */
-
 #include <float.h>
+#include "memory.h"
+#include "normal.h"
+#include "solids.h"
 
 /* Sums over samples begin as this many, of every SUMS-th sample, so that no bit depends on the number of lanes. */
 #define SUMS (TGCO_IS_DOUBLE ? 8 : 16)
-#define PARTS (SUMS / LANES)
+#define BUNDLES (SUMS / LANES)
 
-/* The working data of one problem, which all lanes of `s` hold; PARTS sums of a control lie side by side. */
+/* The working data of one problem, which all lanes of `s` hold; BUNDLES sums of a control lie side by side. */
 typedef struct {
     const Sampling *of;
     Lanes s;
@@ -54,7 +56,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
         if (!q->of->geometric[i] || con->place[k] == NOWHERE) continue;
 #if DIM > 0
         if (con->kind == BODY) {
-            V centers[con->balls * DIM];
+            V centers[MAX_ROWS];
             Ball ball;
             ball_centers(&q->s, i, k, x, centers);
             for (int b = 0; b < con->balls; b++) {
@@ -127,21 +129,21 @@ static void weigh(const Sampling *o, double *score) {
 static void average(Samples *q, uint64_t key, int64_t rows) {
     const Sampling *o = q->of;
     int64_t N = o->of->N;
-    memset(q->sum, 0, N * NU * PARTS * sizeof(V));
+    memset(q->sum, 0, N * NU * BUNDLES * sizeof(V));
     for (int64_t first = 0; first < o->samples; first += LANES) {
-        V *sum = q->sum + first / LANES % PARTS;
+        V *sum = q->sum + first / LANES % BUNDLES;
         V weight = SET(0.0), eps[NU], u[NU];
         for (int l = 0; l < LANES && first + l < o->samples; l++) weight[l] = (REAL)q->score[first + l];
         if (!any(weight > SET(0.0))) continue;
         normal(key, first, rows, q->z);
         for (int64_t k = 0; k < N; k++) {
             draw(q, k, eps, u);
-            for (int j = 0; j < NU; j++) ADD(sum[(k * NU + j) * PARTS], weight, u[j]);
+            for (int j = 0; j < NU; j++) ADD(sum[(k * NU + j) * BUNDLES], weight, u[j]);
         }
     }
     for (int64_t i = 0; i < N * NU; i++) {
         double total = 0;
-        for (int l = 0; l < SUMS; l++) total += (double)q->sum[i * PARTS + l / LANES][l % LANES];
+        for (int l = 0; l < SUMS; l++) total += (double)q->sum[i * BUNDLES + l / LANES][l % LANES];
         q->mean[i] = SET(total);
     }
 }
@@ -152,10 +154,10 @@ static int begin(Samples *q, const Sampling *o) {
     int64_t N = o->of->N, rows = (o->knots ? o->knots : N) * NU;
     int64_t bounds = length(&o->lower, N) + length(&o->upper, N);
     if (!start(&q->s, o->of)) return 0;
-    q->memory = aligned_alloc(sizeof(V), ((1 + PARTS) * N * NU + rows + bounds + NU) * sizeof(V));
+    q->memory = aligned_alloc(sizeof(V), ((1 + BUNDLES) * N * NU + rows + bounds + NU) * sizeof(V));
     q->score = malloc((o->samples + o->elite) * sizeof(double));
     if (!q->memory || !q->score) { finish(&q->s); free(q->memory); free(q->score); return 0; }
-    q->mean = q->memory; q->sum = q->mean + N * NU; q->z = q->sum + PARTS * N * NU;
+    q->mean = q->memory; q->sum = q->mean + N * NU; q->z = q->sum + BUNDLES * N * NU;
     q->lower = q->z + rows; q->upper = q->lower + length(&o->lower, N);
     q->deviation = q->upper + length(&o->upper, N);
     return 1;

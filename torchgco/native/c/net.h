@@ -3,9 +3,10 @@
    The order of sums depends on the processor alone, not on the number of lanes. Matrices M (k, h) lie row by row, so that
    y = b + M' a, and there are their transposes T (h, k). Arrays over neurons have NET_SIZE(h) numbers, of which those
    from h on are of no account; tangents G are such arrays for each column. */
-
+#pragma once
 #include <stdint.h>
 #include <string.h>
+#include "functions.h"
 
 #ifdef __AVX512F__
 #define NET_WIDTH 8
@@ -25,14 +26,14 @@ typedef REAL Wide __attribute__((vector_size(NET_WIDTH * sizeof(REAL))));
 #define NET_FMA_float(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
 #endif
 #endif
-static inline __attribute__((always_inline)) REAL net_fused_1(REAL a, REAL b, REAL c) {
+TGCO_INLINE REAL net_fused_1(REAL a, REAL b, REAL c) {
 #if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
     return TGCO_MATH(fma)(a, b, c);
 #else
     return a * b + c;
 #endif
 }
-static inline __attribute__((always_inline)) Wide net_fused(Wide a, Wide b, Wide c) {
+TGCO_INLINE Wide net_fused(Wide a, Wide b, Wide c) {
 #ifdef NET_FMA_double
     return TGCO_JOIN(NET_FMA_, REAL)(a, b, c);
 #else
@@ -43,7 +44,7 @@ static inline __attribute__((always_inline)) Wide net_fused(Wide a, Wide b, Wide
 /* Over the columns and vectors of a block, whose sums are in registers only where the loop is unrolled. */
 #define NET_EACH(i, n) _Pragma("GCC unroll 8") for (int i = 0; i < n; i++)
 
-static inline __attribute__((always_inline)) Wide net_set(REAL a) { return a - (Wide){0}; }
+TGCO_INLINE Wide net_set(REAL a) { return a - (Wide){0}; }
 
 static inline Wide net_load(const double *from) {
     Wide r;
@@ -70,7 +71,7 @@ static inline int net_first(I left) { int l = 0; while (!left[l]) l++; return l;
 
 /* R vectors of y. */
 #define NET_AFFINE(R) \
-    static inline __attribute__((always_inline)) void net_affine_##R( \
+    TGCO_INLINE void net_affine_##R( \
         const double *M, const double *b, int k, int h, const REAL *a, REAL *y) { \
         Wide s[R]; \
         NET_EACH(r, R) s[r] = b ? net_load(b + r * NET_WIDTH) : (Wide){0}; \
@@ -97,7 +98,7 @@ static inline REAL net_dot(const double *w, const REAL *a, int n) {
 }
 
 /* y (h) = b + M' a for a (k); b may be none. What fills y up to whole vectors is 0. */
-__attribute__((noinline)) static void net_affine(
+TGCO_APART void net_affine(
     const double *M, const double *T, const double *b, int k, int h, const REAL *a, REAL *y) {
     int i = 0;
     memset(y + h, 0, (NET_SIZE(h) - h) * sizeof(REAL));
@@ -116,7 +117,7 @@ __attribute__((noinline)) static void net_affine(
 
 /* R vectors of M' G for C columns. */
 #define NET_COLUMNS(R, C) \
-    static inline __attribute__((always_inline)) void net_columns_##R##_##C( \
+    TGCO_INLINE void net_columns_##R##_##C( \
         const double *M, int k, int h, const REAL *G, REAL *sums) { \
         Wide s[R][C]; \
         NET_EACH(r, R) NET_EACH(c, C) s[r][c] = (Wide){0}; \
@@ -149,7 +150,7 @@ NET_COLUMN_BLOCKS(2)
 NET_COLUMN_BLOCKS(1)
 
 /* sums (d, h) = M' G for tangents G (d, k). */
-__attribute__((noinline)) static void net_columns(
+TGCO_APART void net_columns(
     const double *M, const double *T, int k, int h, int d, const REAL *G, REAL *sums) {
     if (h <= 8) {
         for (int i = 0; i < h; i++)
@@ -165,9 +166,8 @@ __attribute__((noinline)) static void net_columns(
     }
 }
 
-/* v (k) += M y for y (h). */
-static inline void net_back(const double *M, const double *T, int k, int h, const REAL *y, REAL *v) {
-    REAL s[NET_SIZE(k)];
+/* v (k) += s = M y for y (h). */
+static inline void net_back(const double *M, const double *T, int k, int h, const REAL *y, REAL *v, REAL *s) {
     net_affine(T, M, 0, h, k, y, s);
     for (int j = 0; j < k; j++) v[j] += s[j];
 }
@@ -176,7 +176,7 @@ static inline void net_back(const double *M, const double *T, int k, int h, cons
 static inline REAL net_counted(REAL y, REAL slope) { return y != 0 ? slope * y : 0; }
 
 /* sum_i w_i s_i t_i over the neurons whose w isn't 0. */
-__attribute__((noinline)) static REAL net_sum_of_counted(int h, const REAL *w, const REAL *s, const REAL *t) {
+TGCO_APART REAL net_sum_of_counted(int h, const REAL *w, const REAL *s, const REAL *t) {
     REAL total = 0;
     for (int i = 0; i < h; i++) total += net_counted(w[i], s[i] * t[i]);
     return total;
@@ -208,7 +208,7 @@ NET_PAIRS(2)
 
 /* H (d, d) += sum_i w_i s_i t_i', its upper triangle at least, for tangents s and t (d, h); H, s and t have a column
    more than d where d is odd. */
-__attribute__((noinline)) static void net_congruence(int h, int d, const REAL *w, const REAL *s, const REAL *t, REAL *H) {
+TGCO_APART void net_congruence(int h, int d, const REAL *w, const REAL *s, const REAL *t, REAL *H) {
     int even = d + d % 2, size = NET_SIZE(h);
     for (int a = 0; a < even; a += 2)
         for (int b = a, step; b < even; b += step) {

@@ -1,5 +1,7 @@
 /* The outer loop of the augmented Lagrangian (Algorithm 1): inner solves of all problems, then multipliers, penalties
    and the tests of the end, until each has ended. solvers/augmented_lagrangian.py does the same in PyTorch. */
+#include <float.h>
+#include "lifted.h"
 
 /* What a sweep over an iterate finds. */
 typedef struct {
@@ -78,7 +80,7 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
     } else if (con->kind != FUNCTION && con->kind != BODY) {
         note_solids(s, con, rows, k, x, &pushed, sweep);
     } else if (con->kind == BODY) {
-        V centers[con->balls * DIM];
+        V centers[MAX_ROWS];
         Ball ball;
         ball_centers(s, i, k, x, centers);
         for (int b = 0; b < con->balls; b++) {
@@ -127,7 +129,7 @@ static int arrived(const Outer *o, int64_t e, double violation, const double *X)
     const double *last = X + (e * (o->of->N + 1) + o->of->N) * NX + POSITION;
     for (int a = 0; a < DIM; a++) square += (last[a] - o->goal[e * DIM + a]) * (last[a] - o->goal[e * DIM + a]);
 #endif
-    return __builtin_sqrt(square) <= o->near[e];
+    return sqrt(square) <= o->near[e];
 }
 
 /* Whether the iterate of problem e replaces its best: `is_preferred` in lagrangian/quality.py. */
@@ -157,14 +159,14 @@ static int64_t tested(const Outer *o, int64_t e, double violation, int caught) {
     const Problem *p = o->of;
     double cost = p->cost[e], *mark = o->mark + 2 * e;
     int fits = violation <= o->tolerance;
-    int cheaper = cost < mark[1] - o->settled * __builtin_fabs(mark[1]);
+    int cheaper = cost < mark[1] - o->settled * fabs(mark[1]);
     int progress = fits ? mark[0] > o->tolerance || cheaper : violation <= o->halved * mark[0];
     if (progress) { mark[0] = violation; mark[1] = cost; }
     o->waited[e] = progress ? 0 : o->waited[e] + 1;
     int64_t why = RUNNING;
     if (o->outer[e] >= o->max_outer) why = p->refused[e] ? LINE_SEARCH_FAILED : MAX_ITERATIONS;
     if (o->patience >= 0 && o->waited[e] >= o->patience) why = STALLED;
-    int settled = __builtin_fabs(cost - o->last_cost[e]) <= o->settled * __builtin_fabs(cost);
+    int settled = fabs(cost - o->last_cost[e]) <= o->settled * fabs(cost);
     if (o->ends && p->converged[e] && settled && fits) why = CONVERGED;
     return why == RUNNING && o->stops && caught ? STOPPED : why;
 }
@@ -173,7 +175,7 @@ static int64_t tested(const Outer *o, int64_t e, double violation, int caught) {
    A problem that has failed only gets its violation. */
 static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int count, int failed) {
     const Problem *p = s->of;
-    V least, total = SET(0.0), more = SET(0.0);
+    V least, total;
     I caught;
     for (int l = 0; l < LANES; l++) {
         int64_t e = number[l < count ? l : 0];
@@ -209,17 +211,13 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
         int64_t e = number[l];
         o->last_violation[e] = violation[l];
         going |= o->outcome[e] == RUNNING;
-        if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= __DBL_MAX__)) keep(o, e, violation[l]);
+        if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= DBL_MAX)) keep(o, e, violation[l]);
     }
     if (!going) return;
-    for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
-        total += cost_value(s, k, x, u);
-        more += knot_value(s, k, x, u);
-    }
+    V merit = merit_of(s, &total);
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];
-        p->cost[e] = total[l]; p->merit[e] = total[l] + more[l];
+        p->cost[e] = total[l]; p->merit[e] = merit[l];
         p->regularisation[e] = 0; p->inner[e] = p->rung[e] = 0;
     }
 }
@@ -277,38 +275,33 @@ int tgco_outer(const Outer *o, int64_t first, int64_t last) {
     return done;
 }
 
-static int violations(const Problem *p, int obstacles, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    I caught;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter_iterate(s, l, e + l < last ? e + l : e);
-        V violation = swept(s, obstacles, 0, SET(0.0), &caught).violation;
-        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = violation[l];
-    }
-    finish(s);
-    return 1;
-}
-
 /* The largest violation of given trajectories, into `merit`. */
-int tgco_violation(const Problem *p, int64_t first, int64_t last) { return violations(p, 0, first, last); }
+static void put_violation(Lanes *s, int64_t e, int used) {
+    I caught;
+    V violation = swept(s, 0, 0, SET(0.0), &caught).violation;
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
+}
+int tgco_violation(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, enter_iterate, put_violation);
+}
 
 /* The same of rows of obstacles alone. */
-int tgco_penetration(const Problem *p, int64_t first, int64_t last) { return violations(p, 1, first, last); }
+static void put_penetration(Lanes *s, int64_t e, int used) {
+    I caught;
+    V violation = swept(s, 1, 0, SET(0.0), &caught).violation;
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
+}
+int tgco_penetration(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, enter_iterate, put_penetration);
+}
 
 /* The sums of |lam c| over inequalities with c < 0 of given trajectories, into `merit`. */
-int tgco_slack(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
+static void put_slack(Lanes *s, int64_t e, int used) {
     I caught;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        V slack = swept(s, 0, 0, SET(0.0), &caught).slack;
-        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = slack[l];
-    }
-    finish(s);
-    return 1;
+    V slack = swept(s, 0, 0, SET(0.0), &caught).slack;
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = slack[l];
 }
+int tgco_slack(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_slack); }
 
 #if DIM > 0
 /* Squared distance of the origin from the segment that begins at a and goes along. */
@@ -328,7 +321,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
     V *points = aligned_alloc(sizeof(V), 2 * DIM * blocks * sizeof(V)); /* the first and the last one of each line */
     if (!points) return 0;
     for (int64_t e = first; e < last; e++) {
-        V least = SET(__builtin_inf()), knot;
+        V least = SET(INFINITY), knot;
         for (int64_t i = 0; i < 2 * DIM * blocks; i++)
             for (int l = 0; l < LANES; l++) {
                 int64_t k = i / (2 * DIM) * LANES + l, end = i / DIM % 2;
@@ -340,10 +333,10 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
             const double *o = con->bound.data + e * con->bound.element;
             const double *squares = con->squares.data + e * con->squares.element;
             const double *v = con->velocities.data ? con->velocities.data + e * con->velocities.element : NULL;
-            double stop = con->stops.data ? con->stops.data[e * con->stops.element] : __builtin_inf();
+            double stop = con->stops.data ? con->stops.data[e * con->stops.element] : INFINITY;
             for (int64_t j = 0; j < con->rows; j++, o += DIM, v += v ? DIM : 0) {
                 if (!(squares[j] >= 0)) continue;
-                V radius = SET(p->gain * __builtin_sqrt(squares[j])), a[DIM], along[DIM];
+                V radius = SET(p->gain * sqrt(squares[j])), a[DIM], along[DIM];
                 for (int64_t block = 0; block < blocks; block++) {
                     const V *from = points + 2 * DIM * block, *to = from + DIM;
                     for (int l = 0; l < LANES; l++) knot[l] = block * LANES + l < N ? block * LANES + l : N - 1;

@@ -1,4 +1,8 @@
 /* Passes along a trajectory: rollouts with the gains, and the backward pass that computes them. */
+#include "model.h"
+#include "code.h"
+#include "cholesky.h"
+#include "passes.h"
 
 /* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. It ends
    early, with what has added up so far, where that is over `enough` in all lanes, or isn't a number. */
@@ -31,7 +35,7 @@ void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
 void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
     V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ], pivots[NU];
-    V sum = SET(0.0), square = SET(0.0), least = SET(__builtin_inf());
+    V sum = SET(0.0), square = SET(0.0), least = SET(INFINITY);
     int regular = any(s->mu_r > SET(0.0));
     memset(g, 0, sizeof g); memset(H, 0, sizeof H);
     cost_expand(s, p->N, s->X + p->N * NX, 0, g, H);

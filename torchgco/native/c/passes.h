@@ -1,5 +1,7 @@
 /* Passes along a trajectory (passes.c), which are compiled with the model. They are told the functions of what constraints and
-   guide add to the cost of a knot (knot.c): the interior point's library has the model's unit, but no such functions. */
+   guide add to the cost of a knot (knot.h): the interior point's library has the model's unit, but no such functions. */
+#pragma once
+#include "problem.h"
 
 typedef V Value(const Lanes *s, int64_t k, const V *x, const V *u);
 typedef void Expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H);

@@ -2,12 +2,14 @@
 
    The library of a form of problems is linked from units. Its own one, the model (model.c), knows all sizes; those that
    take them as constants (passes.c, riccati.c) are compiled for each NX and NU; all others read them from the model, and
-   differ in DIM, REAL and LANES alone. Python's part before this file declares the structures and enumerations of
-   native/structures.py. */
-
+   differ in DIM, REAL and LANES alone. A unit is some .c files with all that these include. Two files that are included
+   are Python's text (native/codegen/source.py): constants.h, and code.h with the functions of a model, its cost and its
+   traced constraints. `editor` has one of each, and compile_flags.txt the sizes, with which every file compiles alone. */
+#pragma once
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
+#include "functions.h"
+#include "structures.h"
 
 #define S (NX + NU)
 #define NZ (NX + 1)
@@ -16,6 +18,7 @@
 typedef struct {
     V *lam, *bound, *squares, *velocities, *radii, *stops, *lift;
     V *widest; /* of a body among spheres: the largest inflated radius of each, ABSENT without one */
+    int64_t *near; /* room for the numbers of those that a ball may touch */
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
     const float *map[LANES]; /* of a FIELD: each lane's map */
 } Rows;
@@ -32,7 +35,7 @@ typedef struct {
 } Lanes;
 
 static inline int any(I where) { return tgco_any(where); }
-static inline I finite(V a) { return (a - a) == SET(0.0); }
+static inline I tgco_finite(V a) { return (a - a) == SET(0.0); }
 
 static inline const V *at(const V *array, const Array *shape, int64_t k) {
     return array + (shape->knot ? k * shape->size : 0);

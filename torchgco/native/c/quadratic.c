@@ -1,4 +1,5 @@
 /* The quadratic cost: value, gradient and Hessian at a knot. Weights are diagonals, or matrices (QUADRATIC_FULL). */
+#include "model.h"
 
 /* w' e + e' W e / 2 in e = z - reference, for z = x or z = u at a knot; w may be NULL. */
 typedef struct { const V *W, *w, *reference; } Quadratic;

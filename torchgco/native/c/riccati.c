@@ -1,4 +1,7 @@
 /* The Riccati recursion of the interior point: factors of all stages, and the step in states, controls and costates. */
+#include "interior.h"
+#include "code.h"
+#include "cholesky.h"
 
 /* The factor of the cost-to-go's curvature in the free components of the start, and the unit matrix in the others. */
 static I factor_start(Barrier *t) {
@@ -8,7 +11,7 @@ static I factor_start(Barrier *t) {
         I own = tgco_is(t->is_free[j]);
         V whole = tgco_choose(own, t->P[j * NX + j], one), pivot = whole;
         for (int a = 0; a < j; a++) SUBTRACT(pivot, L[j * NX + a], L[j * NX + a]);
-        good &= (pivot > SET(1e-14) * tgco_fabs(whole)) & finite(pivot);
+        good &= (pivot > SET(1e-14) * tgco_fabs(whole)) & tgco_finite(pivot);
         V inverse = one / tgco_sqrt(pivot);
         L[j * NX + j] = inverse;
         for (int i = j + 1; i < NX; i++) {
@@ -42,7 +45,7 @@ I factor(Barrier *t, I open) {
         factor_controls(Q, L, pivots);
         for (int j = 0; j < NU; j++) {
             V whole = Q[(NX + j) * S + NX + j];
-            good &= (pivots[j] > SET(t->how->pivot) * tgco_fabs(whole)) & finite(pivots[j]);
+            good &= (pivots[j] > SET(t->how->pivot) * tgco_fabs(whole)) & tgco_finite(pivots[j]);
             for (int i = 0; i < NX; i++) Y[j * NX + i] = Q[i * S + NX + j];
         }
         solve_lower(L, Y, NX, NX);
@@ -110,7 +113,7 @@ void solve(Barrier *t) {
             for (int i = 0; i < NX; i++) ADD(du[j], K[j * NZ + i], dx[i]);
             z[NX + j] = du[j];
         }
-        tgco_push(t->f + k * NJ, z, along_f);
+        model_push(t->f + k * NJ, z, along_f);
         for (int i = 0; i < NX; i++) dx[NX + i] = along_f[i] + t->aim[k * NX + i];
         for (int i = 0; i < NX; i++) {
             V y = t->p[(k + 1) * NX + i];

@@ -5,6 +5,8 @@
        tgco_stage_value(x, u, p, w, value)
        tgco_stage_entries(x, u, p, w, e)   STAGE_ENTRIES derivatives: STAGE_SLOPES of the gradient, then the Hessian's
        tgco_stage_places                where they belong in g and H */
+#include "model.h"
+#include "code.h"
 
 /* The cost of stage k at x, u; of the last knot where u is NULL. */
 V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {

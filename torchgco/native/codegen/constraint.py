@@ -18,7 +18,7 @@ from torchgco.tracing import Traced, own_tensors
 
 
 def trace_rows(problem: Problem, i: int) -> KnotSource:
-    """C of the rows c of constraint i, for the prelude of `emit`, with x (n), u (m), a knot's own numbers p, and the
+    """C of the rows c of constraint i, with x (n), u (m), a knot's own numbers p, and the
     numbers w that all problems share:
 
         tgco_KEY_rows(x, u, p, w, c)

@@ -15,7 +15,7 @@ from torchgco.base.tree import apart
 from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
 from torchgco.native.codegen import calls
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
-from torchgco.native.structures import COST_ARRAYS, Array, TracedCost, array
+from torchgco.native.structures import Array, Quadratic, TracedCost, array
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 
@@ -80,7 +80,7 @@ def cost_arrays(problem: Problem, source: CostSource, shared: tuple[Tensor, Tens
     scale = torch.stack((factor, shift), dim=-1).unsqueeze(1)
     numbers = {TracedCost.FACTOR: scale, TracedCost.STAGE: stage, TracedCost.LAST: last}
     arrays = [array(numbers[which], knots=True) for which in TracedCost]
-    return arrays + [Array()] * (COST_ARRAYS - len(arrays))
+    return arrays + [Array()] * (len(Quadratic) - len(arrays))
 
 
 def spans_of_cost(problem: Problem) -> tuple[Span, Span]:

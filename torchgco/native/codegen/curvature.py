@@ -19,13 +19,23 @@ SMOOTH_OPERATIONS = (
     "ERF", "FABS", "FMIN", "FMAX", "SIGN", "FLOOR", "CEIL", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "IF_ELSE_ZERO",
     "REMAINDER",
 )  # fmt: skip
+_EXPAND = """
+void model_expand(const V *x, const V *u, const V *p, const double *w, const V *y, V *f, V *H) {
+#ifdef TGCO_TOGETHER
+    tgco_together(x, u, p, w, y, f, H);
+#else
+    model_jacobian(x, u, p, w, f);
+    tgco_curve(x, u, p, w, y, H);
+#endif
+}
+"""
 
 
 def curvature_code(model: DynamicsSource, functions: Iterable[tuple[int, KnotSource]]) -> str:
-    """The functions that curvature.c names, for a model and the traced constraints by their place."""
+    """The functions of model.h with second derivatives, of a model and the traced constraints by their place."""
     rows = [(i, knot_source("curves", source.span, _rows_code, __file__)) for i, source in functions]
     code = dict.fromkeys(source.code for _, source in rows)
-    return "\n".join([_model_code(model), _push(model), *code, _switches(rows)])
+    return "\n".join([_model_code(model), _EXPAND, _push(model), *code, _switches(rows)])
 
 
 def _model_code(model: DynamicsSource) -> str:
@@ -57,7 +67,7 @@ def _step_code(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> str:
 
 
 def _rows_code(knot: Knot, name: str) -> str:
-    """`tgco_NAME_model` and `tgco_NAME_along` of a traced constraint, as curvature.c calls them."""
+    """`tgco_NAME_model` and `tgco_NAME_along` of a traced constraint, which `_switches` calls."""
     import casadi as ca
 
     inputs, ahead = knot.inputs, calls.Ahead(knot.calls, ca.vertcat(knot.x, knot.u))
@@ -170,8 +180,8 @@ def _reached(operations: list[int], needs: list[list[int]], through: bool) -> se
 
 
 def _push(model: DynamicsSource) -> str:
-    """`tgco_push(f, z, out)`: out = F z."""
-    lines = ["static inline void tgco_push(const V *restrict f, const V *restrict z, V *restrict out) {"]
+    """`model_push(f, z, out)`: out = F z."""
+    lines = ["void model_push(const V *restrict f, const V *restrict z, V *restrict out) {"]
     lines.append("    for (int i = 0; i < NX; i++) out[i] = SET(0.0);")
     for row, column, place, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
         factor = f"f[{place}]" if place >= 0 else f"SET({emit.literal(value)})"
@@ -180,12 +190,12 @@ def _push(model: DynamicsSource) -> str:
 
 
 def _switches(rows: Iterable[tuple[int, KnotSource]]) -> str:
-    """`tgco_model_rows` and `tgco_along_rows`, which call the functions of a constraint by its place."""
+    """`model_bend_rows` and `model_along_rows`, which call the functions of a constraint by its place."""
     models, alongs = [], []
     for i, source in rows:
         models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, w, by, cc, lam, g, H); break;")
         alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, w, z, out); break;")
     given = "int i, const V *x, const V *u, const V *p, const double *w"
-    of_model = f"void tgco_model_rows({given},\n    const V *by, const V *cc, const V *lam, V *const *g, V *H)"
-    along = f"void tgco_along_rows(\n    {given}, const V *z, V *out)"
+    of_model = f"void model_bend_rows({given},\n    const V *by, const V *cc, const V *lam, V *const *g, V *H)"
+    along = f"void model_along_rows(\n    {given}, const V *z, V *out)"
     return f"{emit.switch(of_model, models)}\n{emit.switch(along, alongs)}"

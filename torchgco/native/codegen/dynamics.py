@@ -26,7 +26,7 @@ STEP_FUNCTION, JACOBIAN = "tgco_step", "tgco_jacobian"
 
 @dataclass(frozen=True)
 class DynamicsSource:
-    """A model in C, for the prelude of `emit`, with x (n), u (m), and a problem's own numbers p (count) in vectors V,
+    """A model in C, with x (n), u (m), and a problem's own numbers p (count) in vectors V,
     and the numbers w that all problems share:
 
         static inline void tgco_step(const V *restrict x, const V *restrict u, const V *restrict p,
@@ -163,9 +163,11 @@ def computed_entries(jacobian: Any) -> Any:
 
 def elements(column: Any) -> np.ndarray:
     """The scalars of a column, (size,) objects."""
+    import casadi as ca
+
     elements = np.empty(column.numel(), dtype=object)
-    for i in range(column.numel()):
-        elements[i] = column[i]
+    for i, element in enumerate(ca.vertsplit(column)):
+        elements[i] = element
     return elements
 
 
@@ -173,7 +175,7 @@ def elements(column: Any) -> np.ndarray:
 def makers(*more: str) -> Sequence[str]:
     """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
     modules = (operations, arrays, dtypes, nets, emit, layers, calls)
-    files = (*(module.__file__ for module in modules), str(layers.NET_SOURCE), __file__, *more)
+    files = (*(module.__file__ for module in modules), __file__, *more)
     try:
         casadi = version("casadi")
     except PackageNotFoundError:

@@ -1,6 +1,6 @@
 """C over vectors whose lanes are problems, from the instructions of a CasADi function of scalar expressions.
 
-A file that holds such code defines REAL (double or float) and LANES (a power of two), then PRELUDE, then the functions.
+A file that holds such code defines REAL (double or float) and LANES (a power of two), and includes functions.h.
 No operation mixes lanes: a problem's bits don't depend on the content of other lanes. Products and sums are fused where
 the code says so alone (lanes.h), never by the compiler.
 """
@@ -11,7 +11,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchgco.base.errors import InputError
@@ -19,9 +18,8 @@ from torchgco.base.errors import InputError
 if TYPE_CHECKING:
     import casadi as ca
 
-PRELUDE = "\n".join((Path(__file__).parents[1] / "c" / name).read_text() for name in ("lanes.h", "functions.h"))
 MOST_LINES = 150_000  # compiled in some three minutes
-# Functions of the prelude, on each lane.
+# Functions of functions.h, on each lane.
 _OF_ONE = (
     "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
     "acosh", "atanh", "erf", "sqrt", "floor", "ceil", "fabs", "sign",
@@ -152,14 +150,14 @@ def _value(function: ca.Function, k: int, read: list[str], shared: int | None) -
 
 def switch(head: str, cases: Iterable[str], *end: str) -> str:
     """A function of C that chooses by its argument i."""
-    return "\n".join((f"static inline {head} {{", "    switch (i) {", *cases, "    }", *end, "}"))
+    return "\n".join((f"{head} {{", "    switch (i) {", *cases, "    }", *end, "}"))
 
 
 def literal(value: float) -> str:
     """A number as a literal of C, exact to the last bit."""
     if math.isfinite(value):
         return float(value).hex()
-    return '__builtin_nan("")' if math.isnan(value) else f"{'-' if value < 0 else ''}__builtin_inf()"
+    return "NAN" if math.isnan(value) else f"{'-' if value < 0 else ''}INFINITY"
 
 
 _OPERATORS = {

@@ -151,44 +151,49 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
     traced, count = span.traced, span.traced.count
     constants, pattern = traced.constants, traced.pattern
     first_shared = count + len(constants)
-    X, U = ca.SX.sym("X", span.states * span.n), ca.SX.sym("U", span.controls * span.m)
+    # Of the same names at each knot: most knots then have the same text, and reading its instructions takes long.
+    kinds = ("x", span.n, span.states), ("u", span.m, span.controls), ("p", 1, first_shared + len(pattern))
+    X, U, numbers = ([ca.SX.sym(name, size) for _ in range(K)] for name, size, K in kinds)
     # All are symbols until it is known which ones differ: a 0 or 1 among them would change its knot's form.
-    numbers = ca.SX.sym("p", first_shared + len(pattern))
+    numbers = ca.vertcat(ca.SX(0, 1), *numbers)
     each, calls = elements(numbers), _Calls()
     found = traced(
         each[:count],
-        elements(X).reshape(1, span.states, span.n),
-        elements(U).reshape(1, span.controls, span.m),
+        elements(ca.vertcat(ca.SX(0, 1), *X)).reshape(1, span.states, span.n),
+        elements(ca.vertcat(ca.SX(0, 1), *U)).reshape(1, span.controls, span.m),
         constants=each[count:first_shared],
         shared=each[first_shared:],
         calls=calls.all,
     ).reshape(len(span.knots), -1)
     x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
     at = {number.element_hash(): i for i, number in enumerate(each)}
-    functions, reads, places, forms, first = [], [], [], {}, None
-    for k, row in zip(span.knots, found, strict=True):
-        x_k, u_k = X[k * span.n : (k + 1) * span.n], U[k * span.m : (k + 1) * span.m] if k < span.controls else u
-        column = ca.densify(ca.vertcat(ca.SX(0, 1), *row))
+    reads, places, forms, common = [], [], {}, None
+    first: Any = None
+    columns, width = ca.densify(ca.vertcat(ca.SX(0, 1), *found.ravel())), found.shape[1]
+    for k, column in zip(span.knots, ca.vertsplit(columns, width) if width else [columns] * len(found), strict=True):
         inside = calls.inside(column)
         made = [call.outputs for call in inside]
         results = [column, *(call.inputs for call in inside)]
         # Its own numbers alone: functions of those of all knots would together be as long as the horizon squared.
         reads.append([at[name] for name in _names(*results) if name in at])
-        own = numbers[reads[-1]]
-        function = ca.Function("knot", [x_k, u_k, own, *made], results, {"allow_free": True})
+        inputs = [
+            X[k],
+            U[k] if k < span.controls else u,
+            numbers[reads[-1]],
+            *made,
+        ]
+        function = ca.Function("knot", inputs, results, {"allow_free": True})
         if function.has_free():
             raise InputError(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
-        # Of the same symbols: most knots have the same text, and reading its instructions one by one takes long.
-        inputs = [x, u, numbers[: own.numel()], *calls.symbols(inside)]
-        functions.append(ca.Function("knot", inputs, function.call(inputs)))
-        text = functions[-1].serialize()
+        first = first or function
+        text = function.serialize()
         if text not in forms:
-            forms[text] = _form(functions[-1])
+            forms[text] = _form(function)
         form, used = forms[text]
         form = [*form, *(calls.key(call) for call in inside)]
         places.append([reads[-1][i] for i in used])
-        first = first or form
-        if form != first:
+        common = common or form
+        if form != common:
             raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
     differ = [len(set(column)) > 1 for column in zip(*places, strict=True)]
     own = [i for i, place in enumerate(places[0]) if place < count or differ[i]]
@@ -197,28 +202,27 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
     values += [w[i] if np.isnan(value) else value for i, value in enumerate(pattern.tolist())]
     for i, place in enumerate(own):
         values[places[0][place]] = p[i]
-    inside, made = calls.first, calls.symbols(calls.first)
+    inside = calls.first
+    made = [ca.SX.sym(f"o{i}", call.net.size) for i, call in enumerate(inside)]
     read = ca.vertcat(ca.SX(0, 1), *(values[i] for i in reads[0]))
-    rows, *points = functions[0].call([x, u, read, *made])
+    rows, *points = first.call([x, u, read, *made])
     chosen = [[used[i] for i in own] for used in (places if any(differ) else places[:1])]
     found = [Call(call.net, point, out) for call, point, out in zip(inside, points, made, strict=True)]
     return Knot(x, u, p, w, rows, found), chosen
 
 
 class _Calls:
-    """The calls of networks at all knots, which of them one knot's rows need, and symbols for these."""
+    """The calls of networks at all knots, and which of them one knot's rows need."""
 
     def __init__(self) -> None:
         self.all: list[Call] = []
         self.first: list[Call] = []  # those of the first knot that was asked for
-        self._symbols: list[Any] = []
         self._owners: dict[int, int] = {}  # the call that makes a symbol
         self._keys: dict[int, str] = {}
         self._asked = False
 
     def inside(self, rows: Any) -> list[Call]:
         """The calls that rows depend on, be it through other calls, in order."""
-        import casadi as ca
 
         if not self._owners:
             self._owners = {name: i for i, call in enumerate(self.all) for name in _names(call.outputs)}
@@ -230,13 +234,7 @@ class _Calls:
         found = [self.all[i] for i in sorted(places)]
         if not self._asked:
             self._asked, self.first = True, found
-            self._symbols = [ca.SX.sym(f"o{i}", call.net.size) for i, call in enumerate(found)]
         return found
-
-    def symbols(self, inside: Sequence[Call]) -> list[Any]:
-        """One knot's outputs: the same symbols at each, where it has the networks of the first one."""
-        same = [call.net.size for call in inside] == [call.net.size for call in self.first]
-        return self._symbols if same else [call.outputs for call in inside]
 
     def key(self, call: Call) -> str:
         """What a call computes."""
@@ -249,7 +247,8 @@ def _names(*expressions: Any) -> list[int]:
     """The symbols of some expressions."""
     import casadi as ca
 
-    return [symbol.element_hash() for symbol in ca.symvar(ca.vertcat(ca.SX(0, 1), *expressions))]
+    read = ca.symvar(expressions[0] if len(expressions) == 1 else ca.vertcat(*expressions))
+    return [symbol.element_hash() for symbol in read]
 
 
 def _form(function: Any) -> tuple[list[tuple], list[int]]:

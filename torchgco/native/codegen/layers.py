@@ -1,7 +1,7 @@
 """C of a network: values, products with its Jacobian on either side, and second derivatives, layer by layer.
 
-Of a problem at a time, by the loops of c/net.h; lanes with the same numbers are computed once. The functions, for the
-prelude of `emit`, with inputs z (k), tangents T (k, d) column by column and outputs o (r), are
+Of a problem at a time, by the loops of c/net.h; lanes with the same numbers are computed once. The functions,
+with inputs z (k), tangents T (k, d) column by column and outputs o (r), are
 
     tgco_net_KEY(w, z, o)
     tgco_net_KEY_ahead(w, z, T, o, TO, kept)     and the tangents TO (r, d) of the outputs, column by column
@@ -15,13 +15,10 @@ import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
-from pathlib import Path
 from typing import Any
 
 from torchgco.native.codegen import emit
 from torchgco.tracing.nets import Linear, Net, Neurons
-
-NET_SOURCE = Path(__file__).parents[1] / "c" / "net.h"
 
 
 @dataclass(frozen=True)
@@ -60,9 +57,8 @@ class NetSource:
     def code(self) -> str:
         """The functions, once in a file however often this text stands there."""
         guard = f"TGCO_NET_{self.key}"
-        loops = ["#ifndef TGCO_NETS", "#define TGCO_NETS", NET_SOURCE.read_text(), "#endif"]
-        own = [f"#ifndef {guard}", f"#define {guard}", self._text.replace("KEY", self.key), "#endif"]
-        return "\n".join([*loops, *own])
+        text = self._text.replace("KEY", self.key)
+        return "\n".join(['#include "net.h"', f"#ifndef {guard}", f"#define {guard}", text, "#endif"])
 
     @cached_property
     def _text(self) -> str:
@@ -216,7 +212,8 @@ class NetSource:
         for i in range(len(self.net.layers), 0, -1):
             layer = self.net.layers[i - 1]
             if isinstance(layer, Linear):
-                lines.append(f"    net_back({_matrices(layer)}, {layer.k}, {layer.h}, v{i}, v{layer.source});")
+                given = f"{_matrices(layer)}, {layer.k}, {layer.h}, v{i}, v{layer.source}"
+                lines.append(f"    {{ REAL s[NET_SIZE({layer.k})]; net_back({given}, s); }}")
             else:
                 lines += self._bend(i, layer)
         lines.append(f"    memcpy(v, v0, {sizes[0]} * sizeof(REAL));")

@@ -6,22 +6,21 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from torchgco.native.codegen.cost import CostSource
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource
-from torchgco.native.codegen.emit import PRELUDE, literal, switch
+from torchgco.native.codegen.emit import literal, switch
 from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes
-from torchgco.native.declarations import defines, head
-from torchgco.native.structures import CONSTANTS, COST_ARRAYS, ENUMERATIONS, STRUCTURES, Quadratic, TracedCost
+from torchgco.native.declarations import defines
+from torchgco.native.includes import included, joined
+from torchgco.native.structures import HEADER, constants
 
-C = Path(__file__).parents[1] / "c"
 LANES = lanes()
+FEW_LANES = 2, 4  # lanes of libraries for few problems: lanes without a problem take time, too
 LIBRARIES_KEPT = 64  # libraries, the most recent ones
-HEADS = "problem.h", "model.h"
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
 LOOPS = """
 static inline V entry(int e, const V *f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
@@ -48,9 +47,14 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
 """
 
 
+def lanes_for(B: int, least: int = 1) -> int:
+    """How many lanes a library has that solves B problems, all in all, of which one makes use of `least`."""
+    return next((lanes for lanes in FEW_LANES if max(B, least) <= lanes < LANES), LANES)
+
+
 @dataclass(frozen=True)
 class Library:
-    """What a library is linked from beside a form's own code.
+    """What a library is linked from beside a form's own code: files of C, each with those that it includes.
 
     Attributes:
         model: files that are compiled with the model. They take the numbers of states and controls as constants: their
@@ -64,16 +68,11 @@ class Library:
     shared: tuple[str, ...]
 
 
-OBSTACLE_SOURCES = "box.h", "boxes.c", "field.c", "body.c"  # left out of problems without a position
-ROWS = ("problem.c", "rows.c", "penalty.c", *OBSTACLE_SOURCES)
-PHASES = "_rows", "_step", "_memory", "_fixed", "_search", "", "_kkt"
-PASS_SOURCES = "model.c", "passes.h", "cholesky.h", "passes.c"
-RICCATI = "curvature.c", "interior.h", "cholesky.h", "riccati.c"
-SOLVER_LIBRARY = Library(PASS_SOURCES, (), (*ROWS, "passes.h", "knot.c", "ilqr.c", "trajectories.c", "outer.c"))
-SAMPLER = Library(("model.c",), (), (*ROWS, "normal.c", "mppi.c"))
+PASS_SOURCES = "model.c", "passes.c"
+SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c"))
+SAMPLER = Library(("model.c",), (), ("mppi.c",))
 # The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
-INTERIOR = Library(PASS_SOURCES, RICCATI, (*ROWS, "interior.h", *(f"interior{phase}.c" for phase in PHASES)))
-COST_KINDS = {"quadratic.c": Quadratic, "traced.c": TracedCost}  # the arrays that a cost's file reads
+INTERIOR = Library(PASS_SOURCES, ("riccati.c",), ("interior.c", "interior_kkt.c"))
 SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
 
 
@@ -120,16 +119,12 @@ class Form:
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
             units.append(Unit(self._text(vectors | sizes, generated, *library.curvature), own=True))
-        shared = [name for name in library.shared if at is not None or name not in OBSTACLE_SOURCES]
-        return (*units, Unit(self._text(vectors | read, [], *shared)))
+        return (*units, Unit(self._text(vectors | read, [], *library.shared)))
 
     def _text(self, sizes: dict[str, Any], generated: list[str], *files: str) -> str:
         """The C file of a unit."""
-        costs = [kind for name, kind in COST_KINDS.items() if name in files]
-        shared = head(STRUCTURES, (*ENUMERATIONS, *costs), CONSTANTS)
-        texts = [(C / name).read_text() for name in (*HEADS, *files)]
-        begin, end = texts[: len(HEADS)], texts[len(HEADS) :]
-        return "\n".join((defines({**sizes, "COST_ARRAYS": COST_ARRAYS}), shared, PRELUDE, *begin, *generated, *end))
+        given = {"constants.h": constants(), "code.h": "\n".join(generated)}
+        return joined(defines(sizes) + included(*files), given=given) + HEADER.layout
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
@@ -185,7 +180,7 @@ def _written_out(model: DynamicsSource) -> str:
 
 
 def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int]) -> str:
-    """`tgco_rows`, `tgco_add_rows` and `tgco_slopes`, which call the functions of a constraint by its place."""
+    """`model_rows`, `model_add_rows` and `model_slopes`, which call the functions of a constraint by its place."""
     values, adds, slopes = [], [], []
     for i, rows in functions:
         name = f"tgco_{rows.key}"
@@ -198,8 +193,8 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
     given = "int i, const V *x, const V *u, const V *p, const double *w"
     return "\n".join(
         (
-            switch(f"void tgco_rows({given}, V *c)", values),
-            switch(f"void tgco_add_rows(\n    {given}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
-            switch(f"int tgco_slopes(\n    {given}, V *e, const int **columns)", slopes, "    return 0;"),
+            switch(f"void model_rows({given}, V *c)", values),
+            switch(f"void model_add_rows(\n    {given}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
+            switch(f"int model_slopes(\n    {given}, V *e, const int **columns)", slopes, "    return 0;"),
         )
     )

@@ -1,8 +1,8 @@
-/* Squared distances of points and of segments from boxes; box.h has the numbers of a box. A vector V holds SIDE edges. */
-
+/* Squared distances of points and of segments from boxes; box.h has the numbers of a box. A vector V has LANES edges. */
+#pragma once
 #include <float.h>
-#include <math.h>
-
+#include <stdint.h>
+#include "../../native/c/box.h"
 
 /* Squared distances of points, and half their slopes where the points move along segments. */
 static inline V square_at_share(const V *half, const V *begin, const V *along, V share, V *slope) {
@@ -101,14 +101,14 @@ static inline void measure_box(const double *box, const double *bounds, const Se
     V numbers[BOX_NUMBERS];
     double radius = BOX_RADIUS(box);
     spread(box, numbers);
-    for (int first = 0; first < count; first += SIDE) {
+    for (int first = 0; first < count; first += LANES) {
         V start[DIM], step[DIM];
-        for (int l = 0; l < SIDE; l++) {
+        for (int l = 0; l < LANES; l++) {
             int e = place[first + l < count ? first + l : first];
             for (int i = 0; i < DIM; i++) start[i][l] = g->a[i][e], step[i][l] = g->along[i][e];
         }
         V away = square_of_segment(numbers, start, step);
-        for (int l = 0; l < SIDE && first + l < count; l++) {
+        for (int l = 0; l < LANES && first + l < count; l++) {
             int e = place[first + l];
             double left = sqrt(away[l]) - radius, more = away[l] - radius * radius;
             gap[e] = left < gap[e] ? left : gap[e];

@@ -1,10 +1,12 @@
-/* The cheapest ways over blocks of a lattice, and paths drawn taut through it (roadmap/blocks.py, roadmap/mapped.py). The
-   part before this file declares the structures and constants. Two dimensions are three, with one layer. */
-
+/* The cheapest ways over blocks of a lattice, and paths drawn taut through it (roadmap/blocks.py, roadmap/mapped.py).
+   Two dimensions are three, with one layer. */
 #include <math.h>
-#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#include "lattice.h"
+
+#define COST double
+#include "../../native/c/heap.h"
 
 /* Clearances: roadmap/clearances.py has the same in NumPy. --------------------------------------------------------- */
 
@@ -196,26 +198,6 @@ void tgco_blocks(Graph *g) {
 
 /* The cheapest ways ------------------------------------------------------------------------------------------------ */
 
-typedef struct { double cost; int32_t block; } Entry;
-
-static void push(Entry *heap, int64_t *count, double cost, int32_t block) {
-    int64_t i = (*count)++;
-    for (; i > 0 && heap[(i - 1) / 2].cost > cost; i = (i - 1) / 2) heap[i] = heap[(i - 1) / 2];
-    heap[i] = (Entry){cost, block};
-}
-
-static Entry pop(Entry *heap, int64_t *count) {
-    Entry top = heap[0], last = heap[--*count];
-    int64_t i = 0;
-    for (int64_t child; (child = 2 * i + 1) < *count; i = child) {
-        child += child + 1 < *count && heap[child + 1].cost < heap[child].cost;
-        if (!(heap[child].cost < last.cost)) break;
-        heap[i] = heap[child];
-    }
-    heap[i] = last;
-    return top;
-}
-
 /* Whether the segment between the nodes of two blocks is nowhere deep in an obstacle. */
 static int joined(const Sweep *s, int64_t a, int64_t b) {
     const Graph *g = s->graph;
@@ -264,7 +246,7 @@ int32_t tgco_sweep(Sweep *s) {
     }
     while (count > 0) {
         Entry top = pop(heap, &count);
-        int64_t v = top.block, from[3], to[3], at[3];
+        int64_t v = top.item, from[3], to[3], at[3];
         if (top.cost > s->cost[v] + rest(s, v)) continue;
         top.cost = s->cost[v];
         if (s->ahead && s->onward[v] < 0) { s->end = v; break; }

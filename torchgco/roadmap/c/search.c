@@ -3,12 +3,14 @@
    Both do the same operations in the same order, and none is fused here (-ffp-contract=off): all numbers but square
    roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
    compared as squares, detours and costs with a tolerance, and ties are broken by the lowest index: the paths are the
-   same. DIM is the number of coordinates, BLOCK of edges measured side by side; the part before this file declares
-   `Arguments` (roadmap/native.py). */
-
+   same. DIM is the number of coordinates, BLOCK of edges measured side by side. */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
+#include "search.h"
+#if BOXES
+#include "boxes.h"
+#endif
 
 #define CLAMP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
 

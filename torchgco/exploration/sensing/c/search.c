@@ -4,30 +4,8 @@
 #include <stdint.h>
 #include <stdlib.h>
 
-typedef struct {
-    float key;
-    int32_t cell;
-} Entry;
-
-static void push(Entry *heap, int64_t *count, float key, int32_t cell) {
-    int64_t i = (*count)++;
-    while (i > 0 && heap[(i - 1) / 2].key > key) heap[i] = heap[(i - 1) / 2], i = (i - 1) / 2;
-    heap[i].key = key, heap[i].cell = cell;
-}
-
-static Entry pop(Entry *heap, int64_t *count) {
-    Entry top = heap[0], last = heap[--*count];
-    int64_t i = 0, n = *count;
-    for (;;) {
-        int64_t child = 2 * i + 1;
-        if (child >= n) break;
-        if (child + 1 < n && heap[child + 1].key < heap[child].key) child++;
-        if (heap[child].key >= last.key) break;
-        heap[i] = heap[child], i = child;
-    }
-    if (n > 0) heap[i] = last;
-    return top;
-}
+#define COST float
+#include "../../../native/c/heap.h"
 
 static inline float octile(const int64_t *a, const int64_t *b) {
     float d[3];
@@ -71,7 +49,7 @@ int64_t tgco_search(
             left[0] = count, left[1] = best, *expanded = steps;
             return 0;
         }
-        int32_t at = pop(heap, &count).cell;
+        int32_t at = pop(heap, &count).item;
         if (seen[at] == closed) continue;
         seen[at] = closed, steps++;
         int64_t c[3] = {at / (ny * nz), at / nz % ny, at % nz};

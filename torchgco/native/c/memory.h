@@ -1,4 +1,6 @@
 /* Lanes: their memory, and problems that enter and leave them. */
+#pragma once
+#include "model.h"
 
 static int64_t length(const Array *a, int64_t knots) { return a->data ? (a->knot ? knots : 1) * a->size : 0; }
 
@@ -33,7 +35,10 @@ static int64_t lay_out(Lanes *s, V *memory) {
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
         rows.stops = cut(&m, length(&c->stops, 1)); rows.radii = cut(&m, length(&c->radii, c->knots));
         rows.lift = cut(&m, length(&c->lift, c->knots));
-        if (c->balls > 0) rows.widest = cut(&m, c->squares.size / c->balls);
+        if (c->balls > 0) {
+            rows.widest = cut(&m, c->squares.size / c->balls);
+            rows.near = (int64_t *)cut(&m, c->rows / c->balls);
+        }
         rows.pushed = (I *)cut(&m, c->knots);
         for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;
@@ -142,4 +147,20 @@ static void leave(const Lanes *s, int lane, int32_t status, int32_t converged, i
     p->iterations[e] += (int64_t)s->made[lane]; p->inner[e] = (int64_t)s->inner[lane]; p->rung[e] = s->rung[lane];
     p->alpha[e] = s->alpha[lane]; p->used[e] = s->used[lane];
     p->status[e] = status; p->converged[e] = converged; p->refused[e] = refused; p->lost[e] = lost;
+}
+
+/* Loads the problems first, ..., last - 1, and puts what is asked of them: of e and those after it, in the first `used`
+   lanes. Returns 0 without memory. */
+typedef void Enter(Lanes *s, int lane, int64_t e);
+typedef void Put(Lanes *s, int64_t e, int used);
+
+static int put_all(const Problem *p, int64_t first, int64_t last, Enter *load, Put *put) {
+    Lanes lanes, *s = &lanes;
+    if (!start(s, p)) return 0;
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) load(s, l, e + l < last ? e + l : e);
+        put(s, e, last - e < LANES ? (int)(last - e) : LANES);
+    }
+    finish(s);
+    return 1;
 }

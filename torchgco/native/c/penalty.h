@@ -1,4 +1,6 @@
 /* The terms that multipliers and penalty add to L_M for one row of a constraint. */
+#pragma once
+#include "model.h"
 
 /* The term that a row adds to L_M. */
 static inline V worth(const Lanes *s, int equality, V c, V lam) {
@@ -27,4 +29,13 @@ static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
     *rho = tgco_if(~idle, mu);
     V g = tgco_fused(*rho, c, lam);
     return p->phr ? tgco_if(~idle, g) : g;
+}
+
+/* Adds the derivatives of the term of a row c with its slopes by position. */
+static inline void add_slopes(const Lanes *s, V c, V lam, const V *slopes, V *g, V *H) {
+    V rho, slope = pull(s, 0, c, lam, &rho);
+    for (int a = 0; a < DIM; a++) {
+        ADD(g[POSITION + a], slope, slopes[a]);
+        for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], rho * slopes[a], slopes[b]);
+    }
 }

@@ -1,9 +1,8 @@
 /* Normal draws in single precision that are a function of a key and of their number, as `draws.standard_normal` makes
    them: a counter per sample and row is hashed by MurmurHash3's finaliser (Appleby), two words to a Box-Muller pair. */
-
-typedef uint32_t W __attribute__((vector_size(LANES * 4)));
-typedef int32_t Z __attribute__((vector_size(LANES * 4)));
-typedef float F __attribute__((vector_size(LANES * 4)));
+#pragma once
+#include "constants.h"
+#include "lanes.h"
 
 static inline F single(float c) { return c - (F){0}; }
 
@@ -17,7 +16,7 @@ static inline W mixed(W z) {
 
 /* 24 bits of each word as a number in (0, 1]. */
 static inline F uniform(W word) {
-    return (__builtin_convertvector((Z)(word >> 8), F) + single(0.5f)) * single(0x1p-24f);
+    return (TGCO_CONVERTED((Z)(word >> 8), F) + single(0.5f)) * single(0x1p-24f);
 }
 
 /* sqrt(-2 log a) for a in (0, 1]: a = m 2^e with m in [sqrt(1/2), sqrt(2)), log m = 2 atanh((m - 1) / (m + 1)). */
@@ -26,16 +25,16 @@ static inline F radius(F a) {
     F m = (F)((bits & 0x7fffff) + 0x3f3504f3), f = (m - single(1.0f)) / (m + single(1.0f)), s = f * f;
     F series = single(1.0f / 9);
     for (int i = 7; i > 0; i -= 2) series = series * s + single(1.0f / i);
-    F square = single(-2.0f) * (__builtin_convertvector(e, F) * single(0x1.62e43p-1f) + single(2.0f) * f * series),
+    F square = single(-2.0f) * (TGCO_CONVERTED(e, F) * single(0x1.62e43p-1f) + single(2.0f) * f * series),
       root;
-    for (int l = 0; l < LANES; l++) root[l] = __builtin_sqrtf(square[l] > 0 ? square[l] : 0);
+    for (int l = 0; l < LANES; l++) root[l] = sqrtf(square[l] > 0 ? square[l] : 0);
     return root;
 }
 
 /* Cosine and sine of 2 pi a for a in (0, 1]: a quarter turn is taken off exactly, Taylor's series give the rest. */
 static inline void turn(F a, F *cosine, F *sine) {
-    Z quarter = __builtin_convertvector(single(4.0f) * a + single(0.5f), Z);
-    F r = single(6.283185307f) * (a - single(0.25f) * __builtin_convertvector(quarter, F)), s = r * r;
+    Z quarter = TGCO_CONVERTED(single(4.0f) * a + single(0.5f), Z);
+    F r = single(6.283185307f) * (a - single(0.25f) * TGCO_CONVERTED(quarter, F)), s = r * r;
     F even = single(1.0f), odd = single(1.0f);
     for (int i = 4; i > 0; i--) {
         even = single(1.0f) - s * single(1.0f / ((2 * i - 1) * (2 * i))) * even;
@@ -58,7 +57,7 @@ static void normal(uint64_t key, int64_t first, int64_t rows, V *z) {
         W word = mixed(((number + (uint32_t)i) * WEYL) ^ low);
         F length = radius(uniform(word)), cosine, sine;
         turn(uniform(mixed(word ^ high)), &cosine, &sine);
-        z[i] = __builtin_convertvector(length * cosine, V);
-        if (i + half < rows) z[i + half] = __builtin_convertvector(length * sine, V);
+        z[i] = TGCO_CONVERTED(length * cosine, V);
+        if (i + half < rows) z[i + half] = TGCO_CONVERTED(length * sine, V);
     }
 }

@@ -4,13 +4,16 @@
    A slack has no room in them, and their multipliers would explode. The first kind stays out of the solve, and is judged
    at its end: what is feasible there, with no multiplier, is optimal with the row, too. Of two bounds that coincide, the
    upper one becomes an equality, and the lower one stays out. */
+#pragma once
+#include <float.h>
+#include "interior_memory.h"
 
 /* NUDGE, GOLDEN and ROUNDINGS are those of eager/fixed.py, which says what they mean. */
 
 /* A number in [1, 2) for variable i: no row and no model is likely to let a sum of these cancel. */
 static inline double uneven(int64_t i) {
     double golden = GOLDEN * (double)(i + 1);
-    return 1.0 + golden - __builtin_floor(golden);
+    return 1.0 + golden - floor(golden);
 }
 
 /* Whether rows j, the upper, and l, the lower bound of constraint i, are of one variable. */
@@ -52,11 +55,12 @@ static void vary_controls(const Barrier *t, int64_t k, V *du) {
 /* States and controls of a knot (S), and how a change of all free variables changes them (S). */
 typedef struct { V *x, *z; } Response;
 
-/* The rows of constraint i at knot k that a change moves in one of two trajectories close together, into `moves`: a row
+/* The rows of constraint i at knot k that a change moves in one of two trajectories close together: a row
    may be flat in one point alone. A change that is within rounding of its terms is none. */
-static void find_moved(const Barrier *t, int64_t i, int64_t k, const Response *at, I *moves) {
+static I *find_moved(const Barrier *t, int64_t i, int64_t k, const Response *at) {
     int rows = t->lanes.of->constraint[i].rows;
-    V change[rows], part[rows], terms[rows], own[S];
+    I *moves = t->moves;
+    V *change = t->across[0], *part = t->across[1], *terms = t->across[2], own[S];
     for (int j = 0; j < rows; j++) moves[j] = SET(0.0) != SET(0.0);
     for (int near = 0; near < 2; near++, at++) {
         const V *u = k < t->lanes.of->N ? at->x + NX : 0;
@@ -67,15 +71,16 @@ static void find_moved(const Barrier *t, int64_t i, int64_t k, const Response *a
             along(t, i, k, at->x, u, own, part);
             for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
         }
-        for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= SET(ROUNDINGS * __DBL_EPSILON__) * terms[j]);
+        for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= SET(ROUNDINGS * DBL_EPSILON) * terms[j]);
     }
+    return moves;
 }
 
 /* Rows j of constraint i at knot k, in the lanes `of`, with less room than a slack is given at first, or than a guess is
    moved inside of its bounds. */
 static I is_tight(const Barrier *t, I of, int64_t i, int64_t k, int j) {
     const Constraint *con = t->lanes.of->constraint + i;
-    V room = SET(t->how->push);
+    V room = SET(t->how->bound_push);
     if (con->kind == BOUNDS) {
         int v = con->variable[j];
         V at = v < NX ? t->lanes.X[k * NX + v] : t->lanes.U[k * NU + v - NX];
@@ -141,8 +146,7 @@ static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
 static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    I moves[con->rows];
-    find_moved(t, i, k, at, moves);
+    const I *moves = find_moved(t, i, k, at);
     for (int j = 0; j < con->rows; j++) {
         I tight = is_tight(t, of, i, k, j), is_state = of & ~of;
         if (con->kind == BOUNDS && con->variable[j] < NX) is_state = ~is_state;
@@ -161,12 +165,11 @@ static inline I is_broken(const Barrier *t, int64_t q) {
 static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    I moves[con->rows];
-    find_moved(t, i, k, at, moves);
+    const I *moves = find_moved(t, i, k, at);
     for (int j = 0; j < con->rows; j++) {
         I in = of & is_broken(t, q + j) & moves[j];
         t->out[q + j] &= ~in;
-        t->s[q + j] = tgco_choose(in, SET(t->how->push), t->s[q + j]);
+        t->s[q + j] = tgco_choose(in, SET(t->how->bound_push), t->s[q + j]);
     }
 }
 
@@ -175,11 +178,11 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) 
 static void loosen(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    V change[con->rows], most_room = SET(t->how->relaxes * t->how->violation);
+    V *change = t->across[0], most_room = SET(t->how->relaxes * t->how->constr_viol_tol);
     along(t, i, k, at->x, k < t->lanes.of->N ? at->x + NX : 0, at->z, change);
     for (int j = 0; j < con->rows; j++, q++) {
         V room = most_room * least(tgco_fabs(change[j]), t->room[q]);
-        room = tgco_if(of & ~t->out[q] & finite(room), room);
+        room = tgco_if(of & ~t->out[q] & tgco_finite(room), room);
         t->relaxed[q] = tgco_choose(of, room, t->relaxed[q]);
         t->s[q] += room;
     }
@@ -240,7 +243,7 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
 #if DIM > 0
     if (con->kind != BOUNDS && con->kind != FUNCTION && con->kind != BODY) { first = POSITION; end = POSITION + DIM; }
 #endif
-    V own[S], change[con->rows], least_of[con->rows];
+    V own[S], *change = t->across[0], *least_of = t->across[1];
     for (int j = 0; j < con->rows; j++) least_of[j] = SET(INFINITY);
     for (int v = first; v < end; v++) {
         for (int w = 0; w < S; w++) own[w] = SET(w == v);
@@ -252,7 +255,7 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
     }
     for (int j = 0; j < con->rows; j++) {
         V gives = share * least_of[j];
-        t->gives[q + j] = tgco_choose(of & finite(gives) & (gives > SET(1.0)), gives, t->gives[q + j]);
+        t->gives[q + j] = tgco_choose(of & tgco_finite(gives) & (gives > SET(1.0)), gives, t->gives[q + j]);
     }
 }
 
@@ -305,7 +308,9 @@ static void soften_rows(Barrier *t, I of, V share, const V *active) {
 /* Whether rows that were left out of lane l are violated. */
 static int breaks_rows_left_out(const Barrier *t, int l) {
     int breaks = 0;
-    if (t->some_out) ROWS(t, 0, breaks |= t->out[q][l] && !t->fixes[q][l] && !(t->c[q][l] <= t->how->violation))
+    if (t->some_out) EACH_ROW(t, 0, q) {
+        breaks |= t->out[q][l] && !t->fixes[q][l] && !(t->c[q][l] <= t->how->constr_viol_tol);
+    }
     return breaks;
 }
 

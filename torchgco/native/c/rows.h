@@ -1,4 +1,6 @@
 /* The rows of bounds and spheres at one knot. */
+#pragma once
+#include "model.h"
 
 #define BLOCK 32 /* spheres evaluated together: most blocks are far away and add nothing */
 

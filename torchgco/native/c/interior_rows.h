@@ -1,4 +1,7 @@
 /* The rows of constraints in the interior point. */
+#pragma once
+#include "interior.h"
+#include "solids.h"
 
 /* Rows of constraint i at knot k begin here. */
 static inline int64_t row_of(const Barrier *t, int64_t i, int64_t k) {
@@ -17,7 +20,7 @@ static inline void solids_at(const Constraint *con, const Rows *rows, int64_t k,
 
 static void body_at(const Lanes *s, int64_t i, int64_t k, const V *x, V *c) {
     const Constraint *con = s->of->constraint + i;
-    V centers[con->balls * DIM];
+    V centers[MAX_ROWS];
     Ball ball;
     ball_centers(s, i, k, x, centers);
     for (int b = 0; b < con->balls; b++) {
@@ -148,7 +151,7 @@ static void add_body(Barrier *t, int64_t i, int64_t k, const V *x) {
     const Constraint *con = s->of->constraint + i;
     const V *numbers = at(s->rows[i].lift, &con->lift, con->place[k]);
     int64_t q = row_of(t, i, k), P = con->balls;
-    V centers[P * DIM], e[P * DIM * S], own[PARTS * (POSITION + DIM)], square[(POSITION + DIM) * S], *H = t->H + k * S * S;
+    V centers[MAX_ROWS], e[MAX_ROWS * S], own[PARTS * (POSITION + DIM)], square[(POSITION + DIM) * S], *H = t->H + k * S * S;
     V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], *g[PARTS];
     const int *columns;
     Into to = {.H = square};
@@ -235,7 +238,7 @@ static inline void solids_along(
 
 static void body_along(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *z, V *out) {
     const Constraint *con = s->of->constraint + i;
-    V centers[con->balls * DIM], steps[con->balls * DIM];
+    V centers[MAX_ROWS], steps[MAX_ROWS];
     Ball ball;
     ball_centers(s, i, k, x, centers);
     model_along_rows((int)i, x, u, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, z, steps);

@@ -1,5 +1,9 @@
 /* iLQR (Algorithm 2) for problems side by side: the line search, and the loop that keeps the lanes filled.
    A problem's results agree with PyTorch's kernels up to rounding (tests/native). */
+#pragma once
+#include "knot.h"
+#include "memory.h"
+#include "passes.h"
 
 #define ROUNDED 1e-6 /* share of a sum that rounding can't reach */
 
@@ -30,13 +34,13 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
             int64_t rung = s->rung[l] + tried + l % replicas;
             int last = rung + 1 >= o->rungs; /* its L_M counts, whatever it is */
             alpha[l] = o->ladder[last ? o->rungs - 1 : rung];
-            enough[l] = !open[l] ? -__builtin_inf() : last || !s->of->bounded ? __builtin_inf() : most[l];
+            enough[l] = !open[l] ? -INFINITY : last || !s->of->bounded ? INFINITY : most[l];
         }
         roll(s, knot_value, alpha, enough, &cost, &merit);
         V ratio = (merit - s->merit) / (alpha * linear + SET(0.5) * alpha * alpha * quadratic);
         I good = (ratio >= SET(o->ratio_min)) & (ratio <= SET(o->ratio_max));
         if (o->accept_last) good |= alpha < SET(o->smallest);
-        good &= finite(merit) & open;
+        good &= tgco_finite(merit) & open;
         *shortest = tgco_choose(open, merit, *shortest);
         int from[LANES];
         I won;
@@ -147,13 +151,3 @@ static void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
     }
 }
 
-/* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
-int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    int64_t *number = in_order(first, last);
-    if (!number || !start(s, p)) { free(number); return 0; }
-    inner_solves(s, number, last - first);
-    free(number);
-    finish(s);
-    return 1;
-}

@@ -1,41 +1,39 @@
 /* The terms of one knot of the iterate beside its cost: constraints and guide. */
+#pragma once
+#include "penalty.h"
+#include "solids.h"
 
 #define SAFE 1.000001 /* more than rounding: of the distance up to which a ball may touch a sphere */
 
-#if DIM > 0
-static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
-    const V *lam = rows->lam + con->place[k] * con->rows;
-    V c[BLOCK];
-    for (int64_t first = 0; first < con->rows; first += BLOCK) {
-        int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
-        if (!spheres(con, rows, first, last, k, x, c)) continue;
-        for (int64_t j = first; j < last; j++) total += worth(s, 0, c[j - first], lam[j]);
-    }
-    return total;
-}
+/* Functions NAME_terms add the terms of rows to `total`, or, where g isn't NULL, their gradient to g (S) and the upper
+   triangle of their Hessian to H (S, S). */
 
-/* Adds the derivatives of row j. */
-static inline void sphere_expand(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V lam, V *g, V *H) {
+#if DIM > 0
+/* The same of row j, whose value is c. */
+static inline V sphere_terms(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V c, V lam, V total,
+    V *g, V *H) {
+    if (!g) return total + worth(s, 0, c, lam);
+    if (!any(~(c <= SET(0.0)) | (lam != SET(0.0)))) return total;
     V away[DIM], rho, slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam, &rho);
     for (int a = 0; a < DIM; a++) {
         SUBTRACT(g[POSITION + a], SET(2.0) * slope, away[a]);
         for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], SET(4.0) * rho * away[a], away[b]);
     }
+    return total;
 }
 
-static inline void spheres_expand(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
+TGCO_INLINE V spheres_terms(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total, V *g, V *H) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     V c[BLOCK];
     for (int64_t first = 0; first < con->rows; first += BLOCK) {
         int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
         if (!spheres(con, rows, first, last, k, x, c)) continue;
-        for (int64_t j = first; j < last; j++) {
-            if (!any(~(c[j - first] <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
-            sphere_expand(s, con, rows, j, k, x, lam[j], g, H);
-        }
+        for (int64_t j = first; j < last; j++)
+            total = sphere_terms(s, con, rows, j, k, x, c[j - first], lam[j], total, g, H);
     }
+    return total;
 }
 
 /* Of the spheres of a body, in order, those that a ball may touch in any lane at knot k, or that have a multiplier. */
@@ -73,134 +71,83 @@ static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V
     return count;
 }
 
-static inline V near_value(const Lanes *s, const Ball *ball, int64_t k, const int64_t *near, int64_t count, V total) {
-    const V *lam = ball->rows.lam + ball->con.place[k] * ball->con.rows;
-    V away[DIM];
-    for (int64_t i = 0; i < count; i++)
-        total += worth(s, 0, sphere(&ball->con, &ball->rows, near[i], k, ball->x, away), lam[near[i]]);
-    return total;
-}
-
-static inline void near_expand(
-    const Lanes *s, const Ball *ball, int64_t k, const int64_t *near, int64_t count, V *g, V *H) {
+TGCO_INLINE V near_terms(
+    const Lanes *s, const Ball *ball, int64_t k, const int64_t *near, int64_t count, V total, V *g, V *H) {
     const V *lam = ball->rows.lam + ball->con.place[k] * ball->con.rows;
     V away[DIM];
     for (int64_t i = 0; i < count; i++) {
         V c = sphere(&ball->con, &ball->rows, near[i], k, ball->x, away);
-        if (any(~(c <= SET(0.0)) | (lam[near[i]] != SET(0.0))))
-            sphere_expand(s, &ball->con, &ball->rows, near[i], k, ball->x, lam[near[i]], g, H);
-    }
-}
-#endif
-
-#if DIM > 0
-/* Rows of a body, ball by ball. */
-__attribute__((noinline)) static V body_value(const Lanes *s, int64_t i, int64_t k, const V *x, V total) {
-    const Constraint *con = s->of->constraint + i;
-    V centers[con->balls * DIM];
-    int64_t near[con->rows / con->balls + 1], count = 0;
-    Ball ball;
-    ball_centers(s, i, k, x, centers);
-    if (con->kind_of_balls == SPHERES && !(count = spheres_near(s, i, k, centers, near))) return total;
-    for (int b = 0; b < con->balls; b++) {
-        ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
-        if (ball.con.kind == SPHERES) total = near_value(s, &ball, k, near, count, total);
-        else if (ball.con.kind == BOXES) total = boxes_value(s, &ball.con, &ball.rows, k, ball.x, total);
-        else total = field_value(s, &ball.con, &ball.rows, k, ball.x, total);
+        total = sphere_terms(s, &ball->con, &ball->rows, near[i], k, ball->x, c, lam[near[i]], total, g, H);
     }
     return total;
 }
 
-__attribute__((noinline)) static void body_expand(const Lanes *s, int64_t i, int64_t k, const V *x, V *g, V *H) {
+/* Rows of a body, ball by ball. */
+TGCO_APART V body_terms(const Lanes *s, int64_t i, int64_t k, const V *x, V total, V *g, V *H) {
     const Constraint *con = s->of->constraint + i;
-    V centers[con->balls * DIM], e[con->balls * DIM * S], own[POSITION + DIM], square[(POSITION + DIM) * S];
+    V centers[MAX_ROWS], e[MAX_ROWS * S], by[POSITION + DIM], square[(POSITION + DIM) * S], *own = g ? by : 0;
     const int *columns = 0;
-    int64_t near[con->rows / con->balls + 1], some = 0;
+    int64_t *near = s->rows[i].near, some = 0;
     int count = -1;
     Ball ball;
     ball_centers(s, i, k, x, centers);
-    if (con->kind_of_balls == SPHERES && !(some = spheres_near(s, i, k, centers, near))) return;
+    if (con->kind_of_balls == SPHERES && !(some = spheres_near(s, i, k, centers, near))) return total;
     for (int b = 0; b < con->balls; b++) {
         ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
-        for (int a = POSITION; a < POSITION + DIM; a++) {
+        for (int a = POSITION; g && a < POSITION + DIM; a++) {
             own[a] = SET(0.0);
             for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
         }
-        if (ball.con.kind == SPHERES) near_expand(s, &ball, k, near, some, own, square);
-        else if (ball.con.kind == BOXES) boxes_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
-        else field_expand(s, &ball.con, &ball.rows, k, ball.x, own, square);
-        if (adds_nothing(own + POSITION, square + POSITION * S)) continue;
+        if (ball.con.kind == SPHERES) total = near_terms(s, &ball, k, near, some, total, own, square);
+        else if (ball.con.kind == BOXES) total = boxes_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
+        else total = field_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
+        if (!g || adds_nothing(own + POSITION, square + POSITION * S)) continue;
         if (count < 0)
             count = model_slopes(
                 (int)i, x, 0, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, e, &columns);
         pull_slope(count, columns, e + b * DIM * count, own + POSITION, g);
         pull_square(count, columns, e + b * DIM * count, square + POSITION * S, H);
     }
+    return total;
 }
 #endif
 
-/* Rows that are traced, in functions of their own: room for any number of them would cost the others time. */
-__attribute__((noinline)) static V traced_value(
-    const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V total) {
-    const Constraint *con = s->of->constraint + i;
-    V c[MAX_ROWS];
-    model_rows((int)i, x, u, at(s->rows[i].bound, &con->bound, con->place[k]), con->shared, c);
-    for (int j = 0; j < con->rows; j++) total += worth(s, con->equality, c[j], lam[j]);
-    return total;
-}
-
-__attribute__((noinline)) static void traced_expand(
-    const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V *g, V *H) {
+/* Rows that are traced, in a function of their own: room for any number of them would cost the others time. */
+TGCO_APART V traced_terms(
+    const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V total, V *g, V *H) {
     const Constraint *con = s->of->constraint + i;
     const V *numbers = at(s->rows[i].bound, &con->bound, con->place[k]);
     V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
     model_rows((int)i, x, u, numbers, con->shared, c);
-    for (int j = 0; j < con->rows; j++) slope[j] = pull(s, con->equality, c[j], lam[j], rho + j);
-    model_add_rows((int)i, x, u, numbers, con->shared, slope, rho, g, H);
-}
-
-static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {
-    const Constraint *con = s->of->constraint + i;
-    const Rows *rows = s->rows + i;
-    const V *lam = rows->lam + con->place[k] * con->rows;
-    if (con->kind == BOUNDS) {
-        for (int j = 0; j < con->rows; j++) total += worth(s, 0, bound(con, rows, j, k, x, u), lam[j]);
-#if DIM > 0
-    } else if (con->kind == SPHERES) {
-        total = spheres_value(s, con, rows, k, x, total);
-    } else if (con->kind == BOXES) {
-        total = boxes_value(s, con, rows, k, x, total);
-    } else if (con->kind == FIELD) {
-        total = field_value(s, con, rows, k, x, total);
-    } else if (con->kind == BODY) {
-        total = body_value(s, i, k, x, total);
-#endif
-    } else total = traced_value(s, i, k, x, u, lam, total);
+    for (int j = 0; j < con->rows; j++) {
+        if (g) slope[j] = pull(s, con->equality, c[j], lam[j], rho + j);
+        else total += worth(s, con->equality, c[j], lam[j]);
+    }
+    if (g) model_add_rows((int)i, x, u, numbers, con->shared, slope, rho, g, H);
     return total;
 }
 
-static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *g, V *H) {
+TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total, V *g, V *H) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     const V *lam = rows->lam + con->place[k] * con->rows;
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) {
             int v = con->variable[j];
-            V rho, slope = pull(s, 0, bound(con, rows, j, k, x, u), lam[j], &rho);
-            ADD(g[v], SET(con->sign[j]), slope);
+            V c = bound(con, rows, j, k, x, u), rho;
+            if (!g) { total += worth(s, 0, c, lam[j]); continue; }
+            ADD(g[v], SET(con->sign[j]), pull(s, 0, c, lam[j], &rho));
             H[v * S + v] += rho;
         }
+        return total;
+    }
 #if DIM > 0
-    } else if (con->kind == SPHERES) {
-        spheres_expand(s, con, rows, k, x, g, H);
-    } else if (con->kind == BOXES) {
-        boxes_expand(s, con, rows, k, x, g, H);
-    } else if (con->kind == FIELD) {
-        field_expand(s, con, rows, k, x, g, H);
-    } else if (con->kind == BODY) {
-        body_expand(s, i, k, x, g, H);
+    if (con->kind == SPHERES) return spheres_terms(s, con, rows, k, x, total, g, H);
+    if (con->kind == BOXES) return boxes_terms(s, con, rows, k, x, total, g, H);
+    if (con->kind == FIELD) return field_terms(s, con, rows, k, x, total, g, H);
+    if (con->kind == BODY) return body_terms(s, i, k, x, total, g, H);
 #endif
-    } else traced_expand(s, i, k, x, u, lam, g, H);
+    return traced_terms(s, i, k, x, u, lam, total, g, H);
 }
 
 #if DIM > 0
@@ -244,18 +191,31 @@ static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     const Problem *p = s->of;
     V more = SET(0.0);
     for (int64_t i = 0; i < p->constraints; i++)
-        if (p->constraint[i].place[k] != NOWHERE) more = rows_value(s, i, k, x, u, more);
+        if (p->constraint[i].place[k] != NOWHERE) more = rows_terms(s, i, k, x, u, more, 0, 0);
 #if DIM > 0
     if (p->guide != NO_GUIDE) more += guide_value(s, k, x);
 #endif
     return more;
 }
 
+/* L_M along X, U, and the cost in it. */
+static V merit_of(const Lanes *s, V *cost) {
+    int64_t N = s->of->N;
+    V more = SET(0.0);
+    *cost = SET(0.0);
+    for (int64_t k = 0; k <= N; k++) {
+        const V *x = s->X + k * NX, *u = k < N ? s->U + k * NU : 0;
+        *cost += cost_value(s, k, x, u);
+        more += knot_value(s, k, x, u);
+    }
+    return *cost + more;
+}
+
 /* Adds gradient g (S) and upper triangle H (S, S) of these terms. */
 static void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     const Problem *p = s->of;
     for (int64_t i = 0; i < p->constraints; i++)
-        if (p->constraint[i].place[k] != NOWHERE) rows_expand(s, i, k, x, u, g, H);
+        if (p->constraint[i].place[k] != NOWHERE) rows_terms(s, i, k, x, u, SET(0.0), g, H);
 #if DIM > 0
     if (p->guide != NO_GUIDE) guide_expand(s, k, x, g, H);
 #endif

@@ -1,5 +1,7 @@
 /* Obstacles as the balls of a body meet them (obstacles/body.py): the rows of each ball are those of its center, whose
    place is a function of the state that is traced. */
+#pragma once
+#include "rows.h"
 
 /* The obstacles of one ball: a share of the numbers and rows of all. x holds its center where kernels read a position. */
 typedef struct { Constraint con; Rows rows; V x[POSITION + DIM]; } Ball;

@@ -1,5 +1,8 @@
 /* The interior point's filter and its line search (Waechter and Biegler 2006), with second-order corrections and a
    watchdog. */
+#pragma once
+#include <float.h>
+#include "interior_memory.h"
 
 /* The filter ------------------------------------------------------------------------------------------------------ */
 
@@ -12,7 +15,7 @@ static int is_refused(const Track *k, int l, double theta, double phi) {
 
 static void remember(const Barrier *t, Track *k, int l) {
     const Interior *how = t->how;
-    Pair pair = {(1 - how->gain_theta) * k->theta[l], k->phi[l] - how->gain_phi * k->theta[l]};
+    Pair pair = {(1 - how->gamma_theta) * k->theta[l], k->phi[l] - how->gamma_phi * k->theta[l]};
     int count = 0;
     for (int i = 0; i < k->pairs[l]; i++) {
         Pair old = k->filter[l][i];
@@ -30,18 +33,18 @@ static void remember(const Barrier *t, Track *k, int l) {
 static int is_good(
     const Barrier *t, const Track *k, int l, double alpha, double slope, double theta, double phi, int *descends) {
     const Interior *how = t->how;
-    double old = k->theta[l], noise = how->noise * __DBL_EPSILON__ * __builtin_fabs(k->phi[l]);
+    double old = k->theta[l], noise = how->noise * DBL_EPSILON * fabs(k->phi[l]);
     *descends = 0;
     if (!(theta - theta == 0) || !(phi - phi == 0)) return 0;
-    if (k->restoring[l]) return theta <= (1 - how->armijo * alpha) * old;
+    if (k->restoring[l]) return theta <= (1 - how->eta_phi * alpha) * old;
     if (is_refused(k, l, theta, phi)) return 0;
-    double gain = slope < 0 ? alpha * __builtin_pow(-slope, how->power_phi) : 0;
-    int switches = gain > how->switching * __builtin_pow(old, how->power_theta);
+    double gain = slope < 0 ? alpha * pow(-slope, how->s_phi) : 0;
+    int switches = gain > how->delta * pow(old, how->s_theta);
     if (old <= k->lowest[l] && switches) {
         *descends = 1;
-        return phi - k->phi[l] - noise <= how->armijo * alpha * slope;
+        return phi - k->phi[l] - noise <= how->eta_phi * alpha * slope;
     }
-    return theta <= (1 - how->gain_theta) * old || phi - noise <= k->phi[l] - how->gain_phi * old;
+    return theta <= (1 - how->gamma_theta) * old || phi - noise <= k->phi[l] - how->gamma_phi * old;
 }
 
 /* The line search ------------------------------------------------------------------------------------------------- */
@@ -49,13 +52,13 @@ static int is_good(
 /* The longest steps that leave a share 1 - tau of slacks and multipliers. */
 static void longest(const Barrier *t, V tau, V *primal, V *dual) {
     *primal = *dual = SET(1.0);
-    ROWS(t, 0, {
+    EACH_ROW(t, 0, q) {
         V a = -tau * t->s[q] / t->ds[q], b = -tau * t->z[q] / t->dz[q];
         *primal = tgco_choose((t->ds[q] < SET(0.0)) & (a < *primal), a, *primal);
         I falls = t->dz[q] < SET(0.0);
         if (t->some_out) falls &= ~t->out[q];
         *dual = tgco_choose(falls & (b < *dual), b, *dual);
-    })
+    }
 }
 
 /* The trial at step lengths alpha: its theta and phi. */
@@ -66,14 +69,14 @@ static void attempt(Barrier *t, V alpha, V *theta, V *phi) {
     for (int64_t i = 0; i < N * NU; i++) s->Un[i] = s->U[i] + alpha * t->du[i];
     V cost = values(t, s->Xn, s->Un, t->cn, t->gapn);
     /* A slack that the row leaves more room for takes it: theta and phi fall both. */
-    ROWS(t, 0, {
+    EACH_ROW(t, 0, q) {
         V moved = t->s[q] + alpha * t->ds[q], roomy = tgco_choose(-t->cn[q] > moved, -t->cn[q], moved);
         t->sn[q] = t->some_out ? tgco_choose(t->out[q], t->s[q], roomy) : roomy;
-    })
+    }
     V sum = SET(0.0);
     for (int64_t i = 0; i < N * NX; i++) sum += tgco_fabs(t->gapn[i]);
-    ROWS(t, 0, sum += tgco_fabs(by_role(t, q, t->cn[q] + t->sn[q], t->cn[q])))
-    ROWS(t, 1, sum += tgco_fabs(t->cn[q]))
+    EACH_ROW(t, 0, q) sum += tgco_fabs(by_role(t, q, t->cn[q] + t->sn[q], t->cn[q]));
+    EACH_ROW(t, 1, q) sum += tgco_fabs(t->cn[q]);
     *theta = sum;
     *phi = cost - t->mu * logarithms(t, t->sn);
 }
@@ -87,7 +90,7 @@ static V descent(const Barrier *t) {
         for (int i = 0; i < NX; i++) ADD(sum, slope[i], t->dx[k * NX + i]);
         if (k < p->N) for (int j = 0; j < NU; j++) ADD(sum, slope[NX + j], t->du[k * NU + j]);
     }
-    ROWS(t, 0, sum -= t->mu * t->ds[q] / t->s[q])
+    EACH_ROW(t, 0, q) sum -= t->mu * t->ds[q] / t->s[q];
     return sum;
 }
 
@@ -95,11 +98,11 @@ static V descent(const Barrier *t) {
 static void correct(Barrier *t, I of, V alpha) {
     for (int64_t i = 0; i < t->lanes.of->N * NX; i++)
         t->aim[i] = tgco_choose(of, alpha * t->aim[i] + t->gapn[i], t->aim[i]);
-    ROWS(t, 0, {
+    EACH_ROW(t, 0, q) {
         V left = alpha * t->r[q] + t->cn[q];
         t->r[q] = tgco_choose(of, by_role(t, q, left + t->sn[q], left), t->r[q]);
-    })
-    ROWS(t, 1, t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q], t->r[q]))
+    }
+    EACH_ROW(t, 1, q) t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q], t->r[q]);
     expand(t);
     solve(t);
     solve_rows(t);
@@ -117,20 +120,20 @@ static void uncorrect(Barrier *t) {
 static void accept(Barrier *t, I won, V alpha, V dual) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
-    V bound = SET(t->how->central), step = alpha;
+    V bound = SET(t->how->kappa_sigma), step = alpha;
     for (int64_t i = 0; i < (N + 1) * NX; i++) {
         s->X[i] = tgco_choose(won, s->Xn[i], s->X[i]);
         t->y[i] = tgco_choose(won, t->y[i] + step * (t->yn[i] - t->y[i]), t->y[i]);
     }
     for (int64_t i = 0; i < N * NU; i++) s->U[i] = tgco_choose(won, s->Un[i], s->U[i]);
     for (int64_t i = 0; i < N * NX; i++) t->gap[i] = tgco_choose(won, t->gapn[i], t->gap[i]);
-    ROWS(t, 1, t->z[q] = tgco_choose(won, t->z[q] + step * t->dz[q], t->z[q]))
-    ROWS(t, 0, {
+    EACH_ROW(t, 1, q) t->z[q] = tgco_choose(won, t->z[q] + step * t->dz[q], t->z[q]);
+    EACH_ROW(t, 0, q) {
         V z = t->z[q] + dual * t->dz[q], center = t->mu / t->sn[q];
         z = most(least(z, bound * center), center / bound);
         t->z[q] = tgco_choose(won, by_role(t, q, z, t->z[q] + step * t->dz[q]), t->z[q]);
         t->s[q] = tgco_choose(won, t->sn[q], t->s[q]);
-    })
+    }
     for (int64_t q = 0; q < t->rows; q++) t->c[q] = tgco_choose(won, t->cn[q], t->c[q]);
 }
 
@@ -153,7 +156,8 @@ static void keep(Barrier *t, I of, int back) {
 static void watch(Barrier *t, Track *k, I moving, V slope, V full) {
     I begins = moving & ~moving;
     for (int l = 0; l < LANES; l++) {
-        if (!moving[l] || k->watching[l] || k->restoring[l] || k->shortened[l] < t->how->patience) continue;
+        int rarely = k->shortened[l] < t->how->watchdog_shortened_iter_trigger;
+        if (!moving[l] || k->watching[l] || k->restoring[l] || rarely) continue;
         begins[l] = k->watching[l] = -1;
         k->slope[l] = slope[l]; k->alpha[l] = full[l];
         k->ahead[l] = 0;
@@ -185,7 +189,8 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
             int accepted = is_good(t, k, l, length, from, theta[l], phi[l], &descends);
             if (watching && !accepted) {
                 int sound = theta[l] <= k->highest[l] && phi[l] - phi[l] == 0;
-                if (sound && k->ahead[l]++ < how->trials) { good[l] = -1; k->crawls[l] = 0; } else back[l] = -1;
+                int goes_on = sound && k->ahead[l]++ < how->watchdog_trial_iter_max;
+                if (goes_on) { good[l] = -1; k->crawls[l] = 0; } else back[l] = -1;
                 continue;
             }
             if (accepted) {
@@ -195,12 +200,12 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
                 good[l] = -1;
                 k->crawls[l] = alpha[l] < how->crawl * full[l] && !watching ? -1 : 0;
                 k->shortened[l] = alpha[l] < full[l] && !watching ? k->shortened[l] + 1 : 0;
-            } else if (tries == 0 && how->corrects && !k->restoring[l] && theta[l] >= k->theta[l]) {
+            } else if (tries == 0 && how->max_soc && !k->restoring[l] && theta[l] >= k->theta[l]) {
                 again[l] = -1;
             } else {
                 undo[l] = corrected[l];
                 alpha[l] = 0.5 * (corrected[l] ? full[l] : alpha[l]);
-                if (alpha[l] < how->smallest) open[l] = 0;
+                if (alpha[l] < how->alpha_min) open[l] = 0;
             }
         }
         if (any(good)) accept(t, good, alpha, dual);

@@ -1,4 +1,7 @@
 /* Boxes that may be turned, as obstacles: the rows of a knot, for problems with boxes (obstacles/boxes.py). */
+#pragma once
+#include "box.h"
+#include "penalty.h"
 
 /* First come the bounds of all boxes along the first axis of space, middle and half length, then along the second, ...:
    most boxes are too far away for more. Then the factor of each box, which turns a distance into a squared length, and
@@ -69,8 +72,8 @@ static inline int may_matter(const Constraint *con, const Rows *rows, const V *l
     return some_matter(con, rows, lam, pushed, j, j + 1, x);
 }
 
-__attribute__((noinline)) static V boxes_value(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
+TGCO_APART V boxes_terms(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total, V *g, V *H) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
     for (int64_t first = 0, last; first < con->rows; first = last) {
@@ -78,30 +81,11 @@ __attribute__((noinline)) static V boxes_value(
         if (!some_matter(con, rows, lam, pushed, first, last, x)) continue;
         for (int64_t j = first; j < last; j++) {
             if (!may_matter(con, rows, lam, pushed, j, x)) continue;
-            V c = solid(con, rows, j, k, x, 0);
-            if (any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) total += worth(s, 0, c, lam[j]);
+            V slopes[DIM], c = solid(con, rows, j, k, x, g ? slopes : 0);
+            if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
+            if (g) add_slopes(s, c, lam[j], slopes, g, H);
+            else total += worth(s, 0, c, lam[j]);
         }
     }
     return total;
-}
-
-__attribute__((noinline)) static void boxes_expand(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
-    const V *lam = rows->lam + con->place[k] * con->rows;
-    int pushed = any(rows->pushed[con->place[k]]);
-    V slopes[DIM], rho;
-    for (int64_t first = 0, last; first < con->rows; first = last) {
-        last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
-        if (!some_matter(con, rows, lam, pushed, first, last, x)) continue;
-        for (int64_t j = first; j < last; j++) {
-            if (!may_matter(con, rows, lam, pushed, j, x)) continue;
-            V c = solid(con, rows, j, k, x, slopes);
-            if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
-            V slope = pull(s, 0, c, lam[j], &rho);
-            for (int a = 0; a < DIM; a++) {
-                ADD(g[POSITION + a], slope, slopes[a]);
-                for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], rho * slopes[a], slopes[b]);
-            }
-        }
-    }
 }

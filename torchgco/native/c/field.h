@@ -1,9 +1,11 @@
 /* Maps as obstacles: the row of a knot, from a distance field (maps/field.py). maps/lookup.py does the same, and explains
    it. Numbers of type V are per problem, and so is the map that a lane reads. */
+#pragma once
+#include "penalty.h"
 
 /* The numbers of a problem: its first node (DIM), 1 / h, h^2, R^2, the factor a, the core, what counts as distance 0, and
    the distance of a node from which no point near it is in contact. a is negative where the map is empty. */
-enum { INVERSE = DIM, STEP_SQUARE, RADIUS_SQUARE, FACTOR, CORE, LIMIT, REACH, FIELD_NUMBERS };
+enum { INVERSE = DIM, STEP_SQUARE, RADIUS_SQUARE, SLOPE_SCALE, CORE, LIMIT, REACH, FIELD_NUMBERS };
 
 #define TAPS 3
 
@@ -111,19 +113,19 @@ SUM_OVER(0, sum_of_all, sum_of_plane)
 
 /* Whether the map counts at knot k: not where it is empty, or time has stopped. */
 static inline I map_counts(const Constraint *con, const Rows *rows, int64_t k) {
-    I here = rows->bound[FACTOR] >= SET(0.0);
+    I here = rows->bound[SLOPE_SCALE] >= SET(0.0);
     return con->stops.data ? here & (SET(k) <= rows->stops[0]) : here;
 }
 
 /* The row at knot k, with its derivatives by position, (DIM) and (DIM, DIM), where they aren't NULL; -1 where the map
    doesn't count. */
-__attribute__((noinline)) static V field_row(
+TGCO_APART V field_row(
     const Constraint *con, const Rows *rows, int64_t k, const V *x, V *slopes, V *curvature) {
     Axis axes[DIM];
     const V *at[DIM], *number = rows->bound;
     for (int a = 0; a < DIM; a++) axes[a] = axis_at(con, rows, x, a);
     Sums sums = sum_of_all(con, rows, axes, at, curvature ? 2 : slopes ? 1 : 0);
-    V factor = number[FACTOR], inverse = number[INVERSE], square = number[STEP_SQUARE];
+    V factor = number[SLOPE_SCALE], inverse = number[INVERSE], square = number[STEP_SQUARE];
     I here = map_counts(con, rows, k);
     for (int a = 0; a < DIM; a++) {
         ADD(sums.value, square, axes[a].more);
@@ -160,23 +162,15 @@ static inline V length_of(V square, V core) {
 /* How deep beneath the full surface a row c > 0 is, m. */
 static inline V depth_of(const Rows *rows, V c) {
     const V *number = rows->bound;
-    return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[FACTOR], number[CORE]);
+    return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[SLOPE_SCALE], number[CORE]);
 }
 
-__attribute__((noinline)) static V field_value(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
-    V lam = rows->lam[con->place[k]];
+TGCO_APART V field_terms(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total, V *g, V *H) {
+    V lam = rows->lam[con->place[k]], slopes[DIM];
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return total;
-    return total + worth(s, 0, field_row(con, rows, k, x, 0, 0), lam);
-}
-
-__attribute__((noinline)) static void field_expand(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
-    V lam = rows->lam[con->place[k]], slopes[DIM], rho;
-    if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return;
-    V c = field_row(con, rows, k, x, slopes, 0), slope = pull(s, 0, c, lam, &rho);
-    for (int a = 0; a < DIM; a++) {
-        ADD(g[POSITION + a], slope, slopes[a]);
-        for (int b = a; b < DIM; b++) ADD(H[(POSITION + a) * S + POSITION + b], rho * slopes[a], slopes[b]);
-    }
+    V c = field_row(con, rows, k, x, g ? slopes : 0, 0);
+    if (!g) return total + worth(s, 0, c, lam);
+    add_slopes(s, c, lam, slopes, g, H);
+    return total;
 }

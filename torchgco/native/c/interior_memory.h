@@ -1,6 +1,9 @@
 /* What the interior point remembers of each lane, its multipliers, and the test of its end. Names are those of the
    paper (Waechter and Biegler 2006): theta is the sum of all residuals, phi the cost less mu times the logarithms of
    the slacks. */
+#pragma once
+#include "interior_step.h"
+#include "memory.h"
 
 typedef struct { double theta, phi; } Pair;
 
@@ -30,6 +33,8 @@ static int64_t shape(Barrier *t, V *memory) {
     t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
+    for (int i = 0; i < 3; i++) t->across[i] = cut(&m, t->widest);
+    t->moves = (I *)cut(&m, t->widest);
     t->room = cut(&m, rows); t->relaxed = cut(&m, rows); t->gives = cut(&m, rows);
     t->out = (I *)cut(&m, rows); t->fixes = (I *)cut(&m, rows);
     t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
@@ -46,8 +51,9 @@ static int start_barrier(Barrier *t, const Interior *how) {
     t->first = calloc(p->constraints + 1, sizeof *t->first);
     if (!t->first) { finish(&t->lanes); return 0; }
     for (int64_t i = 0; i < p->constraints; i++) {
-        t->first[i] = t->rows;
-        t->rows += p->constraint[i].knots * p->constraint[i].rows;
+        const Constraint *con = p->constraint + i;
+        t->first[i + 1] = t->rows += con->knots * con->rows;
+        if (con->rows > t->widest) t->widest = con->rows;
     }
     int64_t count = shape(t, 0);
     t->memory = aligned_alloc(sizeof(V), (count + 1) * sizeof(V));
@@ -58,30 +64,37 @@ static int start_barrier(Barrier *t, const Interior *how) {
     return 1;
 }
 
+static void enter_barrier(Barrier *t, int lane, int64_t e) {
+    enter_iterate(&t->lanes, lane, e);
+    if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
+}
+
 static inline V most(V a, V b) { return tgco_choose((a > b) | (a != a), a, b); } /* NaN stays */
 static inline V least(V a, V b) { return tgco_choose(a < b, a, b); }
 
-/* The statement for every row q of an inequality, or of an equality. */
-#define ROWS(t, sense, ...) \
-    for (int64_t i_ = 0, q = 0; i_ < (t)->lanes.of->constraints; i_++) { \
-        const Constraint *con_ = (t)->lanes.of->constraint + i_; \
-        int64_t end_ = q + con_->knots * con_->rows; \
-        if (con_->equality != (sense)) { q = end_; continue; } \
-        for (; q < end_; q++) { __VA_ARGS__; } \
-    }
+/* The first constraint from i on that holds equalities, 1, or inequalities, 0. */
+static inline int64_t next_of(const Barrier *t, int equality, int64_t i) {
+    const Problem *p = t->lanes.of;
+    while (i < p->constraints && p->constraint[i].equality != equality) i++;
+    return i;
+}
+
+/* For every row q of them. */
+#define EACH_ROW(t, equality, q) \
+    for (int64_t i_ = next_of(t, equality, 0); i_ < (t)->lanes.of->constraints; i_ = next_of(t, equality, i_ + 1)) \
+        for (int64_t q = (t)->first[i_], end_ = (t)->first[i_ + 1]; q < end_; q++)
 
 /* Sum of the logarithms of the slacks, by their product: one logarithm for all rows. */
 static V logarithms(const Barrier *t, const V *s) {
     V product = SET(1.0), exponents = SET(0.0);
     int count = 0;
-    ROWS(t, 0, {
+    EACH_ROW(t, 0, q) {
         product *= s[q];
         if (++count % 8 == 0) {
-            I bits = (I)product, exponent = ((bits >> 52) & 0x7ff) - 1023;
-            exponents += __builtin_convertvector(exponent, V);
-            product = (V)((bits & 0x000fffffffffffffLL) | 0x3ff0000000000000LL);
+            exponents += tgco_exponent(product);
+            product = tgco_mantissa(product);
         }
-    })
+    }
     return tgco_log(product) + SET(0x1.62e42fefa39efp-1) * exponents;
 }
 
@@ -112,14 +125,14 @@ static void adjoin(Barrier *t, I of, const V *gains) {
             largest = most(tgco_fabs(y[i]), largest);
         }
     }
-    I sound = largest <= SET(t->how->largest_multiplier) * t->raised;
+    I sound = largest <= SET(t->how->constr_mult_init_max) * t->raised;
     for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->y[i] = tgco_choose(of, tgco_if(sound, t->yn[i]), t->y[i]);
 }
 
 /* Multipliers anew for the lanes `of`: those of the central path, and none of equalities. */
 static void renew(Barrier *t, I of) {
-    ROWS(t, 0, t->z[q] = tgco_choose(of, by_role(t, q, t->mu / t->s[q], SET(0.0)), t->z[q]))
-    ROWS(t, 1, t->z[q] = tgco_choose(of, SET(0.0), t->z[q]))
+    EACH_ROW(t, 0, q) t->z[q] = tgco_choose(of, by_role(t, q, t->mu / t->s[q], SET(0.0)), t->z[q]);
+    EACH_ROW(t, 1, q) t->z[q] = tgco_choose(of, SET(0.0), t->z[q]);
     V objective = t->objective;
     t->objective = tgco_choose(of, SET(1.0), objective);
     expand(t);
@@ -146,7 +159,7 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
         gap = most(tgco_fabs(t->r[q]), gap);
         sum_z += least(tgco_fabs(t->z[q]), SET(t->how->explodes) * t->raised); /* one that explodes says nothing of the others */
     }
-    V usual = SET(t->how->usual_multiplier), count = SET((double)(p->N * NX + t->rows));
+    V usual = SET(t->how->s_max), count = SET((double)(p->N * NX + t->rows));
     V mean = (sum_y + sum_z) / count, mean_z = sum_z / SET((double)(t->rows ? t->rows : 1));
     *dual = slope * usual / most(mean, usual);
     *primal = gap;
@@ -155,7 +168,7 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
 
 static V complementarity(const Barrier *t, V mu) {
     V worst = SET(0.0);
-    ROWS(t, 0, worst = most(by_role(t, q, tgco_fabs(t->s[q] * t->z[q] - mu), SET(0.0)), worst))
+    EACH_ROW(t, 0, q) worst = most(by_role(t, q, tgco_fabs(t->s[q] * t->z[q] - mu), SET(0.0)), worst);
     return worst;
 }
 

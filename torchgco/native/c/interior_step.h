@@ -1,5 +1,7 @@
 /* A Newton step of the interior point around its Riccati recursion: the model of all knots, and the step of slacks and
    multipliers. */
+#pragma once
+#include "interior_rows.h"
 
 /* Values along X, U into c and gap; returns the cost. */
 static V values(const Barrier *t, const V *X, const V *U, V *c, V *gap) {

@@ -1,0 +1,24 @@
+#pragma once
+
+#define ABSENT -0x1.0000000000000p+0
+#define NOWHERE -1
+#define PAIRS 64
+#define LONGEST_FALL 50
+#define PARTS 3
+#define COST_ARRAYS 10
+#define NUDGE 0x1.0624dd2f1a9fcp-10
+#define GOLDEN 0x1.3c6ef372fe950p-1
+#define ROUNDINGS 0x1.0000000000000p+12
+#define ORDINARY 0x1.47ae147ae147bp-7
+#define LEAST_SIZE 0x1.0c6f7a0b5ed8dp-20
+#define STOPPED -1
+#define STALLED -2
+#define MURMUR_1 0x85ebca6bu
+#define MURMUR_2 0xc2b2ae35u
+#define WEYL 0x9e3779b9u
+enum { BOUNDS = 0, SPHERES = 1, FUNCTION = 2, BOXES = 3, FIELD = 4, BODY = 5 };
+enum { NO_GUIDE = 0, REGION = 1, PATH = 2 };
+enum { RUNNING = 0, CONVERGED = 1, MAX_ITERATIONS = 2, LINE_SEARCH_FAILED = 3, NOT_POSITIVE_DEFINITE = 4, NON_FINITE = 5, INFEASIBLE = 6, INVALID_START = 7, FEASIBLE = 8, TIME_LIMIT = 9, UNBOUNDED = 10 };
+enum { ENDED = -1 };
+enum { Q = 0, R = 1, Q_LAST = 2, X_REF = 3, X_REF_LAST = 4, U_REF = 5, Q_LINEAR = 6, R_LINEAR = 7, Q_LINEAR_LAST = 8, CROSS = 9 };
+enum { FACTOR = 0, STAGE = 1, LAST = 2 };

@@ -1,0 +1,39 @@
+/* The search that lifts rollouts which diverge (ilqr/lifted.py). */
+#pragma once
+#include "ilqr.h"
+
+/* Up to `rounds` Gauss-Newton steps in states and controls together, where rollouts diverge (solvers/lifted.py). The
+   first rollout that lowers L_M by the share `gain` replaces the iterate; `converged` says whether there was one. */
+static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, double gain) {
+    const Problem *p = s->of;
+    int64_t N = p->N;
+    V *gap = aligned_alloc(sizeof(V), N * NX * sizeof(V));
+    if (!gap) return 0;
+    for (int64_t first = 0; first < count; first += LANES) {
+        int used = count - first < LANES ? (int)(count - first) : LANES;
+        for (int l = 0; l < LANES; l++) enter(s, l, number[first + (l < used ? l : 0)]);
+        s->mu_r = SET(0.0);
+        I open = SET(0.0) == SET(0.0);
+        for (int64_t round = 0; round < rounds && any(open); round++) {
+            V linear, squares, lowest, cost, merit, sum = SET(0.0);
+            gaps(s, gap);
+            backward(s, knot_expand, gap, &linear, &squares, &lowest);
+            if (round > 0) { /* the first gains are those that failed */
+                roll(s, knot_value, SET(1.0), SET(INFINITY), &cost, &merit);
+                I low = open & tgco_finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
+                for (int l = 0; l < used; l++) if (low[l]) {
+                    int64_t e = s->element[l];
+                    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->Xn[i][l];
+                    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = s->Un[i][l];
+                    p->cost[e] = cost[l]; p->merit[e] = merit[l]; p->converged[e] = 1;
+                }
+                open &= ~low;
+            }
+            linear_step(s, gap);
+            for (int64_t i = 0; i < (N + 1) * NX; i++) sum += SET(0.0) * s->X[i];
+            open &= (lowest > SET(0.0)) & (sum == SET(0.0));
+        }
+    }
+    free(gap);
+    return 1;
+}

@@ -1,0 +1,49 @@
+"""Whether problems look convex, by values on drawn segments: what is convex has one minimum, whatever the guess."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.base.draws import uniform
+from torchgco.base.shapes import MISTAKES
+from torchgco.problem.problem import Problem
+from torchgco.solvers.drawn import controls_of
+
+SEGMENTS = 4  # through all knots: a row that curves the wrong way does so along half of them or more
+CURVES = 1e-9  # share of the largest value by which one in the middle may differ from the mean of the ends
+
+
+def looks_convex(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """Whether problems whose time is held have affine models and equalities, and all else convex, (B,) bool.
+
+    Args:
+        X, U: trajectories (B, N+1, n), (B, N, m) in whose surroundings segments are drawn.
+    """
+    size = X.amax(1, keepdim=True) - X.amin(1, keepdim=True)
+    size = torch.where(size > 0, size, 1.0)
+    found = torch.isfinite(X).flatten(1).all(-1)
+    for number in range(SEGMENTS):
+        ends = [2.0 * uniform(2 * number + i, (problem.N + 1, problem.n + problem.m), X) - 1.0 for i in (0, 1)]
+        states = [X + size * end[:, : problem.n] for end in ends]
+        controls = [controls_of(problem, U, end[:-1, problem.n :]) for end in ends]
+        try:
+            values = [_values(problem, *z) for z in zip(states, controls, strict=True)]
+            middle = _values(problem, 0.5 * (states[0] + states[1]), 0.5 * (controls[0] + controls[1]))
+        except MISTAKES:  # code that refuses such values
+            return torch.zeros_like(found)
+        for (a, affine), (b, _), (m, _) in zip(*values, middle, strict=True):
+            most = CURVES * torch.maximum(a.abs().amax(-1), b.abs().amax(-1)).unsqueeze(-1)
+            gap = 0.5 * (a + b) - m
+            found &= ((gap.abs() if affine else -gap) <= most).all(-1)
+    return found
+
+
+def _values(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[Tensor, bool]]:
+    """Values (B, ...) of model, cost and rows, flat, and whether they must be affine."""
+    cost = problem.cost
+    with cost.precision(X.dtype):
+        stages = cost.stage(X[:, :-1], U, torch.arange(problem.N, device=X.device)), cost.terminal(X[:, -1])
+    rows = [(part.value(X, U), part.sense == "equality") for part in problem.constraints]
+    found = [(problem.dynamics.field(X[:, :-1], U), True), *((value, False) for value in stages), *rows]
+    return [(value.reshape(len(X), -1), affine) for value, affine in found if value.numel() > 0]

@@ -1,1 +1,0 @@
-"""Newton steps on the active rows of a solution."""
