@@ -135,7 +135,7 @@ BAD = {
     ),
     "missing rotation": (
         dict(rotations=[np.nan]),
-        "boxes.rotations: expected finite numbers for every box that is there",
+        "boxes.rotations: expected finite numbers for every obstacle that is there",
     ),
     "text": (dict(centers="here"), "boxes.centers: expected numbers"),
 }

@@ -246,7 +246,7 @@ class Obstacles(Distance):
             raise InputError("horizon", f"last knots at which {where} holds", horizon.unique().tolist())
         if "stops" not in field_names(type(self.inscribed)):
             got = type(self.inscribed).__name__
-            raise InputError("horizon", "obstacles that are Spheres, Boxes, Capsules or a Field", got)
+            raise InputError("horizon", "obstacles that can stop to count, such as Spheres, Boxes or a Field", got)
         return self.stopping_at(horizon)
 
     def stopping_at(self, knots: Tensor) -> Self:

@@ -11,18 +11,16 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number, numbers, present
-from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row
+from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Lowered, resolve_knots
-from torchgco.obstacles.attitude import in_plane
 from torchgco.obstacles.base import ABSENT, BOUND_SLACK, OwnKind, copied, marked, picked
 from torchgco.obstacles.body import Body
-from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
-from torchgco.obstacles.inputs import dimension, own_radii, points, rows, vehicle_radii
+from torchgco.obstacles.box_geometry import Cuboids
+from torchgco.obstacles.inputs import dimension, own_axes, own_radii, points, rows, vehicle_radii
 from torchgco.obstacles.measured import Distances, box_distances
 
 BOX_GAPS_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
-UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ class Boxes(Constraint):
         if bool(wrong.any()):
             expected = "finite half sides above 0 m; 0 m too where the box is rounded"
             raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
-        axes = _axes(self.rotations, absent, d, dims)
+        axes = own_axes(self.rotations, "boxes.rotations", absent, d, dims)
         return BoundBoxes.prepare(self, "boxes", dims, centers, half, axes, absent, radii)
 
 
@@ -206,22 +204,3 @@ class BoundBoxes(OwnKind):
         B, M = self.absent.shape
         size = max(B, 1) if self.absent.is_cuda else max(1, BOX_GAPS_AT_ONCE // max(1, points * M))
         return [slice(first, first + size) for first in range(0, max(B, 1), size)]
-
-
-def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
-    """The directions (B, M, d, d) of the sides; those of absent boxes are the axes of space."""
-    straight = torch.eye(d, dtype=dims.like.dtype, device=dims.like.device).expand(*absent.shape, d, d)
-    if rotations is None:
-        return straight.contiguous()
-    if d == 2:
-        axes = in_plane(per_row(rotations, "boxes.rotations", dims, absent.shape[1])).mT
-    else:
-        turns = per_row(rotations, "boxes.rotations", dims, absent.shape[1], 4)
-        length = turns.square().sum(-1, keepdim=True).sqrt()
-        wrong = ((length - 1.0).abs() > UNIT_WITHIN).squeeze(-1) & ~absent
-        if bool(wrong.any()):
-            raise InputError("boxes.rotations", "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
-        axes = from_quaternions(turns / length)
-    axes = torch.where(absent[..., None, None], straight, axes)
-    check_finite(axes, "boxes.rotations", "finite numbers for every box that is there")
-    return axes.contiguous()

@@ -1,4 +1,4 @@
-"""What all kinds of obstacles check and shape of a user's numbers: points, radii, and the vehicle's radius."""
+"""What all kinds of obstacles check and shape of a user's numbers: points, velocities, turns, and radii."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, per_row, space_of, tensor
+from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of, tensor
+from torchgco.obstacles.attitude import in_plane
+from torchgco.obstacles.box_geometry import from_quaternions
+
+UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
 
 
 def dimension(dims: Dimensions, name: str) -> int:
@@ -81,3 +85,43 @@ def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:
     if not bool((radius >= 0).all()):
         raise InputError(name, "a number of at least 0 m", float(radius.min()))
     return radius.reshape(-1).expand(dims.B).contiguous()
+
+
+def own_velocities(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor | None:
+    """The obstacles' velocities (B, M, d), 0 where absent; None where none is given, or there is no obstacle.
+
+    Raises:
+        InputError: another shape, NaN or infinity of an obstacle that is there, dynamics without a time step.
+    """
+    if value is None:
+        return None
+    velocities = per_row(value, name, dims, absent.shape[1], space_of(dims, name))
+    velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
+    check_finite(velocities, name, "finite velocities of every obstacle that is there")
+    if dims.dt is None:
+        raise InputError(name, "dynamics with a time step dt", "dynamics without one")
+    # None of none moves: what is asked of moving obstacles alone isn't asked of them.
+    return velocities if absent.shape[1] > 0 else None
+
+
+def own_axes(rotations: Any, name: str, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
+    """The directions (B, M, d, d) of the obstacles' axes, as rows; those of absent ones are the axes of space.
+
+    Raises:
+        InputError: another shape, quaternions of another length than 1, NaN or infinity of one that is there.
+    """
+    straight = torch.eye(d, dtype=dims.like.dtype, device=dims.like.device).expand(*absent.shape, d, d)
+    if rotations is None:
+        return straight.contiguous()
+    if d == 2:
+        axes = in_plane(per_row(rotations, name, dims, absent.shape[1])).mT
+    else:
+        turns = per_row(rotations, name, dims, absent.shape[1], 4)
+        length = turns.square().sum(-1, keepdim=True).sqrt()
+        wrong = ((length - 1.0).abs() > UNIT_WITHIN).squeeze(-1) & ~absent
+        if bool(wrong.any()):
+            raise InputError(name, "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
+        axes = from_quaternions(turns / length)
+    axes = torch.where(absent[..., None, None], straight, axes)
+    check_finite(axes, name, "finite numbers for every obstacle that is there")
+    return axes.contiguous()

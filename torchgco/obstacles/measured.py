@@ -7,6 +7,7 @@ of a problem, where bodies may touch and where they are below 0; others may be l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -28,11 +29,12 @@ def segment_distance(a: Tensor, b: Tensor) -> Tensor:
 
 def sphere_distances(relative: Tensor, radii: Tensor, absent: Tensor) -> Distances:
     """Of spheres with full radii (B, M), from places (B, K, M, d) relative to their centres."""
-    ends = (relative.norm(dim=-1) - radii.unsqueeze(1)).masked_fill(absent.unsqueeze(1), torch.inf)
-    ways = _bounds(ends, relative.diff(dim=1).norm(dim=-1))
-    i, k, j = _near(ends, ways, radii)
-    ways[i, k, j] = segment_distance(relative[i, k, j], relative[i, k + 1, j]) - radii[i, j]
-    return ends, ways
+
+    def nearest(i: Tensor, k: Tensor, j: Tensor) -> Tensor:
+        return segment_distance(relative[i, k, j], relative[i, k + 1, j]) - radii[i, j]
+
+    ends = relative.norm(dim=-1) - radii.unsqueeze(1)
+    return along_ways(ends, relative, TOUCH * radii, absent, nearest)
 
 
 def box_distances(boxes: Any, away: Tensor, bulge: Tensor | None = None) -> Distances:
@@ -40,27 +42,44 @@ def box_distances(boxes: Any, away: Tensor, bulge: Tensor | None = None) -> Dist
     lines by a `bulge` (B, M), m."""
     radii = boxes.inflated_radii
     local = (boxes.axes.unsqueeze(1) @ away.unsqueeze(-1)).squeeze(-1)
+
+    def nearest(i: Tensor, k: Tensor, j: Tensor) -> Tensor:
+        a, along = away[i, k, j], away[i, k + 1, j] - away[i, k, j]
+        return closest(boxes.axes[i, j], torch.zeros_like(a), boxes.half_sizes[i, j], a, along) - radii[i, j]
+
     ends = _distance(local, boxes.half_sizes.unsqueeze(1)) - radii.unsqueeze(1)
-    ends = ends.masked_fill(boxes.absent.unsqueeze(1), torch.inf)
-    along = away.diff(dim=1)
-    ways = _bounds(ends, along.norm(dim=-1))
-    i, k, j = _near(ends, ways, radii, bulge)
-    origin = torch.zeros_like(away[i, k, j])
-    near = closest(boxes.axes[i, j], origin, boxes.half_sizes[i, j], away[i, k, j], along[i, k, j])
-    ways[i, k, j] = near - radii[i, j]
+    return along_ways(ends, away, TOUCH * radii, boxes.absent, nearest, bulge)
+
+
+def along_ways(
+    ends: Tensor,
+    away: Tensor,
+    depths: Tensor,
+    absent: Tensor,
+    nearest: Callable[[Tensor, Tensor, Tensor], Tensor],
+    bulge: Tensor | None = None,
+) -> Distances:
+    """Distances of bodies from places, and between them along straight ways, of which only those near are measured.
+
+    Args:
+        ends: (B, K, M), m, of places `away` (B, K, M, d) relative to the bodies, of any number where `absent` (B, M).
+        depths: (B, M), m, beneath the full surfaces at which bodies touch.
+        nearest: close lower bounds (P,) along the ways from places k to k + 1, of problems i and bodies j, (P,) each.
+        bulge: (B, M), m, by which ways may leave their straight lines.
+    """
+    ends = ends.masked_fill(absent.unsqueeze(1), torch.inf)
+    # The distance changes no faster than a point moves.
+    ways = 0.5 * (ends[:, :-1] + ends[:, 1:] - away.diff(dim=1).norm(dim=-1))
+    i, k, j = _near(ends, ways, depths, bulge)
+    ways[i, k, j] = nearest(i, k, j)
     return ends, ways if bulge is None else ways - bulge.unsqueeze(1)
 
 
-def _bounds(ends: Tensor, lengths: Tensor) -> Tensor:
-    """Lower bounds (B, K-1, M) along ways of these lengths: the distance changes no faster than the point moves."""
-    return 0.5 * (ends[:, :-1] + ends[:, 1:] - lengths)
-
-
-def _near(ends: Tensor, bounds: Tensor, radii: Tensor, bulge: Tensor | None = None) -> tuple[Tensor, ...]:
+def _near(ends: Tensor, bounds: Tensor, depths: Tensor, bulge: Tensor | None) -> tuple[Tensor, ...]:
     """Which ways (B, K-1, M) may be the nearest, or touch, by their lower bounds."""
     if ends.numel() == 0:
         return bounds.nonzero(as_tuple=True)
-    most = TOUCH * radii.amax(-1) + (0.0 if bulge is None else bulge.amax(-1))
+    most = depths.amax(-1) + (0.0 if bulge is None else bulge.amax(-1))
     close = (ends.flatten(1).amin(-1) + most).clamp(min=0.0)
     return (bounds < close.view(-1, 1, 1)).nonzero(as_tuple=True)
 

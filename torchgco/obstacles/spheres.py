@@ -14,16 +14,15 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number, lengths, numbers, present
-from torchgco.base.shapes import Dimensions, check_finite, per_row, space_of
+from torchgco.base.shapes import Dimensions, space_of
 from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint, Lowered, resolve_knots
 from torchgco.constraints.norms import NO_ROW
 from torchgco.costs.base import add_at
 from torchgco.obstacles.base import TOUCH, Obstacles, OwnKind, Solids, copied, least, marked, picked
 from torchgco.obstacles.body import Body
-from torchgco.obstacles.inputs import own_radii, points, vehicle_radii
+from torchgco.obstacles.inputs import own_radii, own_velocities, points, vehicle_radii
 from torchgco.obstacles.measured import Distances, sphere_distances
 from torchgco.obstacles.shapes import RoundedBoxes, array
 
@@ -59,15 +58,7 @@ class Spheres(Constraint):
         centers, absent = points(self.centers, "obstacles.centers", d, dims)
         radii = own_radii(self.radii, "obstacles.radii", absent, dims)
         vehicle = vehicle_radii(self.vehicle_radius, "obstacles.vehicle_radius", dims)
-        velocities = None
-        if self.velocities is not None:
-            velocities = per_row(self.velocities, "obstacles.velocities", dims, *centers.shape[1:])
-            velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
-            check_finite(velocities, "obstacles.velocities", "finite velocities of every sphere")
-            if dims.dt is None:
-                raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
-        if centers.shape[1] == 0:
-            velocities = None  # none of them moves: what is asked of moving obstacles alone isn't asked of none
+        velocities = own_velocities(self.velocities, "obstacles.velocities", absent, dims)
         centers = torch.where(absent.unsqueeze(-1), 0.0, centers)
         inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
         knots, dt = (

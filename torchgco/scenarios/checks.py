@@ -16,7 +16,7 @@ import numpy as np
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import INCREASING, Above, AtMost, Within, check_value
 from torchgco.base.shapes import bound_of
-from torchgco.obstacles.boxes import UNIT_WITHIN
+from torchgco.obstacles.inputs import UNIT_WITHIN
 
 TOO_LARGE = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
 MOST_OBSTACLES = 100_000  # in a layout that is drawn

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchgco.base.tree import put
 from torchgco.constraints.base import Constraint
@@ -42,7 +43,9 @@ class Nearby:
     """
 
     def __init__(self, given: Call, places: list[Tensor | None]) -> None:
-        parts = list(zip(given.problem.constraints, places, strict=True))
+        parts = [
+            (c, None if at is None else _filled(c, at)) for c, at in zip(given.problem.constraints, places, strict=True)
+        ]
         self.given, self.places = given, [None if at is None else _rows(part, at) for part, at in parts]
         constraints = tuple(c if at is None or not isinstance(c, Obstacles) else c.chosen(at) for c, at in parts)
         problem = _among(given.problem, constraints)
@@ -108,7 +111,15 @@ def without_obstacles(problem: Problem) -> Problem | None:
     if any(type(part.inscribed).chosen is Obstacles.chosen for part in problem.obstacles):
         return None
     none = torch.full((problem.B, 1), -1, dtype=torch.int64, device=problem.x0.device)
-    return _among(problem, tuple(c.chosen(none) if isinstance(c, Obstacles) else c for c in problem.constraints))
+    bare = (c.chosen(_filled(c, none)) if isinstance(c, Obstacles) else c for c in problem.constraints)
+    return _among(problem, tuple(bare))
+
+
+def _filled(part: Constraint, at: Tensor) -> Tensor:
+    """Places (B, M') with as many columns as there are obstacles where C traces rows: their number is in its code."""
+    if part.kernel != "function" or not isinstance(part, Obstacles):
+        return at
+    return pad(at, (0, part.inscribed.absent.shape[1] - at.shape[1]), value=-1)
 
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
