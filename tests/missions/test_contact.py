@@ -98,7 +98,7 @@ def test_several_kinds_count_together_and_none_is_far_away() -> None:
 def test_a_kind_of_ones_own_counts_once_the_judge_knows_it(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = far()
     problem = Problem(plain.dynamics, plain.cost, [HalfPlane(1.0)], plain.x0, plain.N, plain.goal)
-    with pytest.raises(InputError, match=r"HalfPlane\.measured"):
+    with pytest.raises(InputError, match="got HalfPlane"):
         Contact.among(problem)
 
     def measured(wall: HalfPlane, X: Tensor) -> tuple[Tensor, Tensor]:

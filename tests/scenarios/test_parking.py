@@ -86,7 +86,7 @@ def test_pictures_show_the_rectangle() -> None:
     body = body_of(setup.task(layouts).problem)
     X = np.zeros((1, 5, 5))
     X[0] = np.linspace(layouts.start[0], [-1.3, -0.6, 0.3, 0, 0], 5)
-    rows = trials(*flights("gco", [True])).assign(scenario="parking", model="car")
+    rows = trials(*flights("gco", [False])).assign(scenario="parking", model="car")
     figure = layout_grid(layouts.arrays(), {"gco": X}, rows, body=body)
     (ax,) = figure.axes
     drawn = next(held for held in ax.collections if isinstance(held, PolyCollection) and len(held.get_paths()) == 5)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError, undefined
+from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.planning_problem import airframe_of, planning_state
@@ -42,7 +42,7 @@ class Contact(PerElement):
         found = tuple(part for part in problem.constraints if isinstance(part, Obstacles))
         for part in found:
             if type(part).measured is Obstacles.measured:
-                raise undefined(part, "measured")
+                raise InputError("constraints", "obstacles that say their distances, `measured`", type(part).__name__)
         maps = [part.map is not None for part in found]  # flown at 0.95 of the radius, too
         shrunk = (part.grown(ADMITTED - TOUCH * part.vehicle_radius) for part in found)
         found = tuple(less if is_map else part for less, is_map, part in zip(shrunk, maps, found, strict=True))
