@@ -166,9 +166,9 @@ def test_files_and_functions_are_short() -> None:
 
 
 # Files of the package that name a kind, at most: what else there is to know of it, the kind says itself. Pictures hand
-# a vehicle's body on, and each kind of obstacles looks whether its vehicle is one.
+# a vehicle's body on.
 NAMED_IN = 6
-NAMED_MORE = {"Body": 7, "BoundBody": 9}
+NAMED_MORE = {"BoundBody": 9}
 ROOMS_OF_KINDS = "constraints", "obstacles", "costs", "maps/field.py", "problem/goal.py"
 
 

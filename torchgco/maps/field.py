@@ -20,8 +20,7 @@ from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
 from torchgco.maps.measured import segment_distances
 from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import ABSENT, ADMITTED, BOUND_SLACK, CONTACT_FACTOR, TOUCH, OwnKind, least
-from torchgco.obstacles.body import Body
-from torchgco.obstacles.inputs import dimension, vehicle_radii
+from torchgco.obstacles.inputs import dimension, is_body, vehicle_radii
 from torchgco.obstacles.measured import Distances
 
 Interpolation = Literal["smooth", "linear"]
@@ -66,7 +65,7 @@ class Field(Constraint):
         check_value(self.interpolation, Interpolation, "field.interpolation")
 
     def bind(self, dims: Dimensions) -> Constraint:
-        if isinstance(self.vehicle_radius, Body):
+        if is_body(self.vehicle_radius):
             return self.vehicle_radius.around(self, dims)
         d, field, like = dimension(dims, "field.field"), self.field, dims.like
         if field.d != d:

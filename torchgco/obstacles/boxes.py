@@ -15,9 +15,8 @@ from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Lowered, resolve_knots
 from torchgco.obstacles.base import ABSENT, BOUND_SLACK, OwnKind, copied, marked, picked
-from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids
-from torchgco.obstacles.inputs import dimension, own_axes, own_radii, points, rows, vehicle_radii
+from torchgco.obstacles.inputs import dimension, is_body, own_axes, own_radii, points, rows, vehicle_radii
 from torchgco.obstacles.measured import Distances, box_distances
 
 BOX_GAPS_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
@@ -59,7 +58,7 @@ class Boxes(Constraint):
     knots: Any = None
 
     def bind(self, dims: Dimensions) -> Constraint:
-        if isinstance(self.vehicle_radius, Body):
+        if is_body(self.vehicle_radius):
             return self.vehicle_radius.around(self, dims)
         d = dimension(dims, "boxes.centers")
         centers, absent = points(self.centers, "boxes.centers", d, dims)

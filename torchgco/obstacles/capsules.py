@@ -11,10 +11,9 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.constraints.base import Constraint
-from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import from_quaternions
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.inputs import dimension, own_radii, points
+from torchgco.obstacles.inputs import dimension, is_body, own_radii, points
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Capsules(Constraint):
     knots: Any = None
 
     def bind(self, dims: Dimensions) -> Constraint:
-        if isinstance(self.vehicle_radius, Body):
+        if is_body(self.vehicle_radius):
             return self.vehicle_radius.around(self, dims)
         d = dimension(dims, "capsules.starts")
         starts, absent = points(self.starts, "capsules.starts", d, dims)

@@ -19,9 +19,8 @@ from torchgco.base.numbers import Number, above_zero, lengths, numbers, present
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.obstacles.base import ABSENT, OwnKind, copied, least, picked
-from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids
-from torchgco.obstacles.inputs import dimension, own_axes, own_velocities, points, rows, vehicle_radii
+from torchgco.obstacles.inputs import dimension, is_body, own_axes, own_velocities, points, rows, vehicle_radii
 from torchgco.obstacles.measured import Distances, along_ways
 
 REACH_STEPS = 3  # towards h; what they leave is told in `Ellipsoids`
@@ -66,7 +65,7 @@ class Ellipsoids(Constraint):
     knots: Any = None
 
     def bind(self, dims: Dimensions) -> Constraint:
-        if isinstance(self.vehicle_radius, Body):
+        if is_body(self.vehicle_radius):
             return self.vehicle_radius.around(self, dims)
         d = dimension(dims, "ellipsoids.centers")
         assert dims.position is not None

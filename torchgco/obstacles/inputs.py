@@ -15,6 +15,11 @@ from torchgco.obstacles.box_geometry import from_quaternions
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
 
 
+def is_body(radius: Any) -> bool:
+    """Whether a vehicle's radius is a `Body`, which binds obstacles to each of its balls."""
+    return hasattr(radius, "around")
+
+
 def dimension(dims: Dimensions, name: str) -> int:
     """d of the space that the vehicle moves in.
 

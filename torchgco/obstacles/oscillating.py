@@ -17,9 +17,9 @@ from torchgco.base.shapes import Dimensions, check_finite, per_row
 from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ABSENT, OwnKind, least, picked
-from torchgco.obstacles.body import Body
 from torchgco.obstacles.box_geometry import Cuboids, segment_distance
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
+from torchgco.obstacles.inputs import is_body
 from torchgco.obstacles.measured import Distances, box_distances
 from torchgco.obstacles.shapes import RoundedBoxes, array
 
@@ -43,7 +43,7 @@ class OscillatingBoxes(Constraint):
     phases: Any
 
     def bind(self, dims: Dimensions) -> Constraint:
-        if isinstance(self.boxes.vehicle_radius, Body):
+        if is_body(self.boxes.vehicle_radius):
             return self.boxes.vehicle_radius.around(self, dims)
         boxes = self.boxes.bind(dims)
         assert isinstance(boxes, BoundBoxes)

@@ -21,8 +21,7 @@ from torchgco.constraints.base import Constraint, Lowered, resolve_knots
 from torchgco.constraints.norms import NO_ROW
 from torchgco.costs.base import add_at
 from torchgco.obstacles.base import TOUCH, Obstacles, OwnKind, Solids, copied, least, marked, picked
-from torchgco.obstacles.body import Body
-from torchgco.obstacles.inputs import own_radii, own_velocities, points, vehicle_radii
+from torchgco.obstacles.inputs import is_body, own_radii, own_velocities, points, vehicle_radii
 from torchgco.obstacles.measured import Distances, sphere_distances
 from torchgco.obstacles.shapes import RoundedBoxes, array
 
@@ -51,7 +50,7 @@ class Spheres(Constraint):
     knots: Any = None
 
     def bind(self, dims: Dimensions) -> Constraint:
-        if isinstance(self.vehicle_radius, Body):
+        if is_body(self.vehicle_radius):
             return self.vehicle_radius.around(self, dims)
         d = space_of(dims, "obstacles.centers")
         assert dims.position is not None
