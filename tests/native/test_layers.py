@@ -133,10 +133,15 @@ CASES: dict[str, tuple[Callable[[], tuple[Step, int, int]], str]] = {
 }
 
 
+MODEL = """
+static void model_jacobian(const V *x, const V *u, const V *p, const double *w, V *f) { tgco_jacobian(x, u, p, w, f); }
+"""
+
+
 def compiled(model: FunctionDynamics) -> Callable[[Tensor, Tensor, Tensor], list[Tensor]]:
     """Step (B, n), Jacobian twice (B, n, n+m), and second derivatives (B, n+m, n+m) of y' step, of x, u, y in C."""
     source, n, s = trace_dynamics(model), model.n, model.n + model.m
-    code = source.code + curvature_code(source, [])
+    code = source.code + MODEL + curvature_code(source, [])
     wrapped = f"""
 static void tgco_all(
     const V *x, const V *u, const V *p, const double *w, const V *y, V *next, V *first, V *f, V *H) {{

@@ -209,7 +209,9 @@ def test_no_problems_have_no_paths() -> None:
         assert paths.shape == (0, 2, HOPS + 1, 2) and found.shape == (0,)
 
 
-def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pytorch_searches_in_single_precision_and_without_a_compiler(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     s = SCENES["in the middle"]
     single = Scene(s.start.float(), s.goal.float(), Inflated(*cast(s.obstacles, torch.float32)), flat)
     assert library_for(single.start) is None
@@ -219,7 +221,8 @@ def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch
     assert library_for(s.start) is None
     paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
-    monkeypatch.setattr(native, "SEARCH_SOURCE", Path(__file__))  # not C code
+    (tmp_path / "search.c").write_text("not C code")
+    monkeypatch.setattr(native, "C", tmp_path)
     native._library.cache_clear()
     with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
         assert library_for(s.start) is None
