@@ -139,6 +139,7 @@ def test_no_problem_depends_on_the_others() -> None:
 
 @compiled
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::torchgco.StepWarning")
 @pytest.mark.parametrize("name", FAMILIES)
 def test_general_families_end_as_with_native_kernels(name: str) -> None:
     problem = FAMILIES[name].problem(0)
