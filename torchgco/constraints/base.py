@@ -51,6 +51,7 @@ class Constraint(PerElement):
     knots: Any  # a slice, or an int64 tensor (K,), once bound
     is_goal: ClassVar[bool] = False  # whether it is the row of a required goal
     says_where: ClassVar[bool] = False  # whether it says where to be, not how fast
+    in_place: ClassVar[bool] = False  # whether it finds its states and controls where others follow them
     joins_knots: ClassVar[bool] = False  # whether its rows are of two knots
 
     @property
@@ -150,11 +151,11 @@ class Constraint(PerElement):
 
     def with_more(self, n: int, m: int) -> Constraint:
         """The same rows in a form of the problem with further states and controls after the first n and m."""
-        return FirstRows(self, n, m)
+        return self if self.in_place and not is_users(self) else FirstRows(self, n, m)
 
     def in_free_time(self, n: int, m: int, later: int) -> Constraint:
         """The same where state n is the factor of time, followed by controls, and `later` factors are to be chosen."""
-        return FirstRowsInTime(self, n, m)
+        return self if self.in_place and not is_users(self) else FirstRowsInTime(self, n, m)
 
     def paced(self, factor: Tensor) -> Constraint:
         """The same for obstacles that move `factor` (B,) times as far from knot to knot."""

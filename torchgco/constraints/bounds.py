@@ -42,6 +42,7 @@ class _Bounds(Constraint):
     below: slice | Tensor | None = field(default=None, repr=False)
 
     per_element: ClassVar[tuple[str, ...]] = ("lower", "upper")
+    in_place: ClassVar[bool] = True
     of: ClassVar[Literal["x", "u"]]
     label: ClassVar[str]  # in errors
 
@@ -96,14 +97,9 @@ class _Bounds(Constraint):
         named = getattr(dynamics, f"{kind}_names")
         return f"{side} bound of {kind} {component}{f' ({of(dynamics)[component].label})' if len(named) else ''}"
 
-    def with_more(self, n: int, m: int) -> Constraint:
-        return super().with_more(n, m) if is_users(self) else self
-
     def in_free_time(self, n: int, m: int, later: int) -> Constraint:
-        if is_users(self):
+        if is_users(self) or self.of == "x" or later == 0:
             return super().in_free_time(n, m, later)
-        if self.of == "x" or later == 0:
-            return self
         sides = {side: pad(getattr(self, side), (0, 1), value=free) for side, free in (("lower", -inf), ("upper", inf))}
         return replace(self, **sides)
 

@@ -25,7 +25,6 @@ from torchgco.base.numbers import (
     numbers,
 )
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, tensor
-from torchgco.base.tree import is_users
 from torchgco.constraints.base import NO_ROW, Constraint, count_of, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
@@ -41,6 +40,7 @@ class Vectors(Constraint):
 
     components: Tensor | None = field(default=None, repr=False, kw_only=True)  # (c,) int64, once bound
 
+    in_place: ClassVar[bool] = True
     label: ClassVar[str]  # in errors
 
     def _vectors(self, X: Tensor, U: Tensor) -> Tensor:
@@ -55,12 +55,6 @@ class Vectors(Constraint):
         x, u = ((gradient, curvature), (None, None)) if self.of == "x" else ((None, None), (gradient, curvature))  # type: ignore[attr-defined]
         add_blocks(add, X.shape[-1], x[0], u[0], x[1], u[1])
         H[:, self.knots] += add
-
-    def with_more(self, n: int, m: int) -> Constraint:
-        return super().with_more(n, m) if is_users(self) else self
-
-    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
-        return super().in_free_time(n, m, later) if is_users(self) else self
 
     def numbers(self, where: str, place: int) -> list[Number]:
         checks: dict[str, Check] = {

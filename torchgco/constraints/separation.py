@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, tensor
-from torchgco.base.tree import is_users
-from torchgco.constraints.base import CONTACT_FACTOR, TOUCH, Constraint, Distance, resolve_knots, whole
+from torchgco.constraints.base import CONTACT_FACTOR, TOUCH, Distance, resolve_knots, whole
 from torchgco.costs.base import add_blocks
 
 
@@ -40,6 +39,7 @@ class Separation(Distance):
     pairs: Any = None
     knots: Any = None
 
+    in_place: ClassVar[bool] = True
     per_element: ClassVar[tuple[str, ...]] = ("min_distance",)
 
     def bind(self, dims: Dimensions) -> Self:
@@ -79,12 +79,6 @@ class Separation(Distance):
         gradient = (g.unsqueeze(-1) * slopes).sum(-2)
         add_blocks(add, X.shape[-1], gradient, None, slopes.mT @ (h.unsqueeze(-1) * slopes), None)
         H[:, self.knots] += add
-
-    def with_more(self, n: int, m: int) -> Constraint:
-        return super().with_more(n, m) if is_users(self) else self
-
-    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
-        return super().in_free_time(n, m, later) if is_users(self) else self
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, min_distance=self.min_distance + by)

@@ -114,5 +114,6 @@ def clearance_of(parts: list[Any], X: Tensor, share: float | None, least: Tensor
     least = X.new_full(X.shape[:1], torch.inf) if least is None else least
     for part in parts:
         if isinstance(part, Distance):
-            least = torch.minimum(least, part.chord_clearance(X, share))
+            away = part.chord_clearance(X) if share is None else part.chord_clearance(X, share)
+            least = torch.minimum(least, away)
     return least

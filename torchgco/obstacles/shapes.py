@@ -30,8 +30,8 @@ class RoundedBoxes:
     sines: np.ndarray | None = None
 
     @classmethod
-    def of(cls, solids: Any, vehicle_radius: Tensor, b: int, **motion: np.ndarray | None) -> Self:
-        """Problem b's of `Solids`, those that are there; their motion as arrays of all."""
+    def of(cls, solids: Any, vehicle_radius: Tensor, b: int, velocity: Any = None, sines: Any = None) -> Self:
+        """Problem b's of `Solids`, those that are there; velocities (M, d) and sines (3, M, S, d) are those of all."""
         here = ~solids.absent[b].cpu().numpy()
         center, radius = (array(part[b])[here] for part in (solids.centers, solids.radii))
         M, d = center.shape
@@ -39,9 +39,8 @@ class RoundedBoxes:
         if hasattr(solids, "half_sizes"):
             half, sides = array(solids.half_sizes[b])[here], array(solids.axes[b])[here]
         radius = (radius - float(vehicle_radius[b])).clip(min=0.0)
-        moved = {name: None if part is None else part[..., here, :] for name, part in motion.items() if name != "sines"}
-        sines = motion.get("sines")
-        return cls(center, half, sides, radius, **moved, sines=None if sines is None else sines[:, here])
+        velocity, sines = (None if velocity is None else velocity[here]), (None if sines is None else sines[:, here])
+        return cls(center, half, sides, radius, velocity, sines)
 
 
 def array(values: Tensor) -> np.ndarray:
