@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.constraints.base import Distance
 from torchgco.dynamics import rollout
 from torchgco.eager import sampling
-from torchgco.eager.kernels import EagerInterior
+from torchgco.native.called import CalledInterior
 from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.riccati import BackwardPass, backward
 from torchgco.ilqr.step import iterate
@@ -24,7 +24,7 @@ from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.problem.problem import Problem
 
-InteriorKernels: TypeAlias = InteriorEngine | EagerInterior
+InteriorKernels: TypeAlias = InteriorEngine
 
 
 class Kernels:
@@ -97,7 +97,7 @@ class Kernels:
         """
         known = problem.known
         if known.interior is None:
-            known.interior = EagerInterior.of(problem)
+            known.interior = CalledInterior(problem)
         return known.interior
 
     def sample(self, problem: Problem, U: Tensor, how: sampling.Sampling) -> Tensor:

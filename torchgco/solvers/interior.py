@@ -11,11 +11,9 @@ from torchgco.base.options import Count, Positive
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
-from torchgco.eager.fixed import GOLDEN, ROUNDINGS
-from torchgco.eager.kernels import least_violation
 from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
 from torchgco.kernels.in_pytorch import InteriorKernels
-from torchgco.lagrangian.barrier import BarrierOptions
+from torchgco.lagrangian.barrier import GOLDEN, ROUNDINGS, BarrierOptions, least_violation
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd

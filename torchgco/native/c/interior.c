@@ -10,7 +10,7 @@
 static void settle(Barrier *t, Track *k, I of, int anew) {
     const Interior *how = t->how;
     Lanes *s = &t->lanes;
-    V cost = values(t, s->X, s->U, t->c, t->gap);
+    V cost = values(t, t->live, s->X, s->U, t->c, t->gap);
     if (anew) {
         sort_rows(t, of);
         EACH_ROW(t, 0, q) {
@@ -146,6 +146,7 @@ static void begin(Barrier *t, Track *k, I of) {
             for (int l = 0; l < LANES; l++)
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
+    ask(t, DERIVATIVES, t->live, t->lanes.X, t->lanes.U);
     largest = steepest(t, &plain);
     V scale = SET(how->nlp_scaling_obj_target_gradient) / largest;
     I scaled = of & tgco_finite(scale) & (largest > zero);
@@ -187,7 +188,7 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
         lowered |= low;
     }
     if (!any(lowered)) return;
-    V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn);
+    V cost = values(t, lowered, t->lanes.X, t->lanes.U, t->cn, t->gapn);
     k->phi = tgco_choose(lowered, cost - t->mu * logarithms(t, t->s), k->phi);
     for (int l = 0; l < LANES; l++) if (lowered[l]) k->pairs[l] = 0;
 }
@@ -266,7 +267,7 @@ static I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
     if (t->how->smoothing > 0) return of & ~of; /* it is to stay */
     if (!any(of)) return of;
-    V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
+    V cost = values(t, of, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
     EACH_ROW(t, 0, q) *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]);
     EACH_ROW(t, 1, q) *left += tgco_fabs(t->z[q] * t->r[q]);
     for (int l = 0; l < LANES; l++) {
@@ -447,18 +448,20 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
     memset(k, 0, sizeof *k);
     I running = SET(0.0) == SET(0.0), fresh = running;
     int64_t next = first;
-    double until = seconds_now() + how->seconds;
+    double begun = seconds_now();
     int64_t own = last - first < LANES ? last - first : LANES;
     for (int l = 0; l < LANES; l++) { /* lanes without a problem repeat the first problem: its networks are computed once */
         enter_barrier(t, l, l < own ? first + l : first);
         if (l < own) next++;
+        else if (how->ask) running[l] = 0;
     }
+    t->live = running;
     begin(t, k, fresh);
     while (any(running)) {
         int32_t status[LANES];
         V error;
         I ended = iterate(t, k, running, status, &error);
-        int late = seconds_now() > until;
+        int late = seconds_now() - begun > how->seconds; /* which Python makes shorter where a function has failed */
         if (late) for (int l = 0; l < LANES; l++) if (running[l] && !ended[l]) { status[l] = TIME_LIMIT; ended[l] = -1; }
         fresh &= ~fresh;
         I falls = how->minimum && any(ended) ? find_falls(t, ended) : fresh & ~fresh;
@@ -473,6 +476,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
             if (next < last && !late) { enter_barrier(t, l, next++); fresh[l] = -1; }
             else running[l] = 0;
         }
+        t->live = running;
         if (any(fresh)) begin(t, k, fresh);
     }
     for (; next < last; next++) how->of->status[next] = TIME_LIMIT; /* not begun */
