@@ -8,13 +8,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.eager.curvature import Expansion, expansion_of
 from torchgco.obstacles.base import OwnKind
+from torchgco.problem.border import ONE_KNOT
+from torchgco.problem.joined import scattered
 from torchgco.problem.problem import Problem
+
+STATE_OFFSET = 1e-3  # of the states at which rows are looked at, as a share of 1 + |x|
 
 
 @dataclass(frozen=True)
@@ -34,9 +39,16 @@ class Functions:
 
     @classmethod
     def of(cls, problem: Problem, called: Iterable[int]) -> Functions:
-        """The functions of a form of problems, with the constraints of these numbers."""
+        """The functions of a form of problems, with the constraints of these numbers.
+
+        Raises:
+            InputError: rows of a constraint that join knots.
+        """
         one = problem.take(slice(0, 1))
         n, (X, U) = problem.n, one.at_rest
+        for i in called:
+            if is_users(part := one.constraints[i]) and not is_function(part) and joins_knots(part, one):
+                raise InputError(f"constraints[{i}].value", ONE_KNOT, "rows that change with other knots")
         rows = {i: expansion_of(*_by_knots(one.constraints[i], X, U)[:2]) for i in called}
         step = lambda z: one.along.step(z[..., :n], z[..., n:])
         return cls(problem, rows, expansion_of(step, torch.cat((X[:, :-1], U), dim=-1)))
@@ -95,13 +107,32 @@ def joined(X: Tensor, U: Tensor) -> Tensor:
     return torch.cat((X, torch.nn.functional.pad(U, (0, 0, 0, 1))), dim=-1)
 
 
+def joins_knots(part: Constraint, problem: Problem) -> bool:
+    """Whether rows of a constraint of one problem change with another knot than their own.
+
+    Any two knots differ in a digit of their numbers: knots with that digit change, and rows of the others are looked
+    at.
+    """
+    z = joined(*problem.at_rest)
+    z = z + STATE_OFFSET * (1.0 + z.abs()) * (1.0 + 0.5 * scattered(z))
+    value, n = lambda z: part.value(z[..., :n], z[:, :-1, n:]), problem.n
+    place = torch.arange(problem.N + 1, device=z.device)
+    for digit in range(problem.N.bit_length()):
+        for moves in ((place >> digit & 1).bool(), ~(place >> digit & 1).bool()):
+            tangent = moves.to(z.dtype).view(1, -1, 1) * (1.0 + 0.5 * scattered(z))
+            change = torch.func.jvp(value, (z,), (tangent,))[1]
+            if bool((change[:, ~moves[part.knots]] != 0).any()):
+                return True
+    return False
+
+
 def is_function(part: Constraint) -> bool:
     """Whether rows are a function of their own knot's x, u or both."""
     return isinstance(part, FunctionConstraint) and type(part).value is FunctionConstraint.value
 
 
 def _by_knots(part: Constraint, X: Tensor, U: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor, slice]:
-    """Rows (b, K, p) as a function of the columns of z that they read, w, of their knots or of all; and these columns."""
+    """Rows (b, K, p) as a function of w, columns of z at their knots or at all; w, and which columns these are."""
     n, S = X.shape[-1], X.shape[-1] + U.shape[-1]
     if is_function(part):
         assert isinstance(part, FunctionConstraint)

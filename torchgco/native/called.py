@@ -16,7 +16,9 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.shapes import computing_on
@@ -28,7 +30,7 @@ from torchgco.native import structures
 from torchgco.native.codegen.source import CalledForm, lanes_for
 from torchgco.native.compiler import build
 from torchgco.native.engine import NO_MEMORY
-from torchgco.native.interior import InteriorEngine
+from torchgco.native.interior import InteriorKernels
 from torchgco.native.packing import constraint_of, kind_of, numbers_of, quadratic_arrays
 from torchgco.native.structures import Array, Asked, Interior, Kind, Kkt, Quadratic, Request, TracedCost, array
 from torchgco.problem.problem import Problem
@@ -38,17 +40,19 @@ IN_C = Kind.BOUNDS, Kind.SPHERES, Kind.BOXES, Kind.FIELD  # rows that C computes
 CPU, DOUBLE = torch.device("cpu"), torch.float64
 OVER = -1.0  # seconds of a solve that is to end
 _ASK = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+Numbers = NDArray[np.float64]
 
 
-class CalledInterior(InteriorEngine):
-    """See `InteriorEngine`; for problems of any device and dtype, whose functions are evaluated there.
+class CalledInterior(InteriorKernels):
+    """That whose functions Python computes, for problems of any device and dtype.
 
-    All else is computed on the CPU in float64. Options that rounding in the problem's dtype can't meet are raised to
-    what it can (`fitted`). Where PyTorch differentiates a function once only, its curvature counts as 0. The result of
-    a problem does not depend on the rest of the batch, bit by bit, as far as this holds for its own code: a shared
-    matrix times a batch, as in a net, rounds differently in batches of other sizes.
+    Functions are evaluated there, all else on the CPU in float64. Options that rounding in the problem's dtype can't
+    meet are raised to what it can (`fitted`). Where PyTorch differentiates a function once only, its curvature counts
+    as 0. The result of a problem does not depend on the rest of the batch, bit by bit, as far as this holds for its own
+    code: a shared matrix times a batch, as in a net, rounds differently in batches of other sizes.
 
     Raises:
+        InputError: rows of a constraint that join knots.
         NativeError: no compiler.
     """
 
@@ -69,7 +73,7 @@ class CalledInterior(InteriorEngine):
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor,
         scale: CostScale, options: BarrierOptions,
     ) -> dict[str, Tensor]:  # fmt: skip
-        """As `InteriorEngine.solve`."""
+        """As `InteriorKernels.solve`."""
         user = X, U, barrier, *multipliers
         with computing_on(CPU):
             X_c, U_c, barrier_c, *lam = (part.to(CPU, DOUBLE).contiguous() for part in user)
@@ -83,7 +87,7 @@ class CalledInterior(InteriorEngine):
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
         right: RightSides, give: Tensor | None = None, K: Tensor | None = None,
     ) -> KktSolve:  # fmt: skip
-        """As `InteriorEngine.kkt`."""
+        """As `InteriorKernels.kkt`."""
         with computing_on(CPU):
             put = lambda part: part.to(CPU, DOUBLE)
             sides = RightSides(*map(put, (right.a, right.b, right.c)))
@@ -112,10 +116,11 @@ class CalledInterior(InteriorEngine):
         return structures.Problem(N=N, constraints=len(rows), parameters=parameters, cost_data=cost, **values)
 
     def _run(self, function: Any, problem: Problem, how: Interior | Kkt) -> None:
-        answers = _Answers(self._functions, problem, self.lanes, self._calls_cost)
-        spans = [(first, min(first + self.lanes, problem.B)) for first in range(0, problem.B, self.lanes)]
+        heard, B = SimpleQueue[_Loop](), problem.B
+        spans = [(first, min(first + self.lanes, B)) for first in range(0, B, self.lanes)]
         with computing_on(problem.x0.device):
-            _conduct([_Loop(function, how, *span) for span in spans], answers)
+            answers = _Answers(self._functions, problem, self.lanes, self._calls_cost)
+            _run_loops([_Loop(function, how, *span, heard) for span in spans], heard, answers)
 
 
 def _like(X: Tensor, part: Tensor) -> Tensor:
@@ -132,24 +137,33 @@ def _numbers(K: int, count: int) -> Array:
 
 
 class _Loop:
-    """A function of the library on some problems, in a thread of its own, which waits where it asks for an answer."""
+    """A function of the library on some problems, in a thread of its own, which waits where it asks for an answer.
 
-    def __init__(self, function: Any, how: Interior | Kkt, first: int, last: int) -> None:
-        self.request, self.over, self.done, self.before = Request(), False, False, None
-        self._stopped, self._answered, self.heard = False, SimpleQueue[None](), SimpleQueue[_Loop]()
+    Attributes:
+        request: the last one.
+        over: it has ended.
+        done: it has had the memory that it needs.
+        before: what the last derivatives were computed from, for `_Answers`.
+    """
+
+    def __init__(self, function: Any, how: Interior | Kkt, first: int, last: int, heard: SimpleQueue[_Loop]) -> None:
+        self.request, self.over, self.done = Request(), False, False
+        self.before: Numbers | None = None
+        self._heard, self._answered, self._stopped = heard, SimpleQueue[None](), False
         self._ask, self._how = _ASK(self._asked), how.copy()
         self._how.ask = ctypes.cast(self._ask, ctypes.c_void_p).value
         self._call = lambda: function(ctypes.byref(self._how), ctypes.c_int64(first), ctypes.c_int64(last))
         self.thread = Thread(target=self._run, daemon=True)
 
     def _run(self) -> None:
-        self.done, self.over = bool(self._call()), True
-        self.heard.put(self)
+        self.done = bool(self._call())
+        self.over = True
+        self._heard.put(self)
 
     def _asked(self, address: int) -> None:
         self.request = Request.from_address(address)
         if not self._stopped:
-            self.heard.put(self)
+            self._heard.put(self)
             self._answered.get()
 
     def go_on(self) -> None:
@@ -157,22 +171,21 @@ class _Loop:
         self._answered.put(None)
 
     def stop(self) -> None:
-        """Nothing will be answered: end soon."""
+        """Nothing more will be answered: end after this iteration."""
         self._stopped = True
         if isinstance(self._how, Interior):
             self._how.seconds = OVER
-        self._answered.put(None)
+        self.go_on()
 
 
-def _conduct(loops: Sequence[_Loop], answer: Callable[[Sequence[_Loop]], None]) -> None:
-    """Run loops to their end; `answer` is called on all that run, whenever each of them waits.
+def _run_loops(loops: Sequence[_Loop], heard: SimpleQueue[_Loop], answer: Callable[[list[_Loop]], None]) -> None:
+    """Run loops to their end; `answer` is called on all that haven't ended, whenever each of them waits.
 
     What it raises, and Ctrl-C, ends them, and is raised.
     """
-    heard, running, waiting = SimpleQueue[_Loop](), len(loops), list[_Loop]()
+    running, waiting = len(loops), list[_Loop]()
     try:
         for loop in loops:
-            loop.heard = heard
             loop.thread.start()
         while running:
             loop = heard.get()
@@ -184,11 +197,11 @@ def _conduct(loops: Sequence[_Loop], answer: Callable[[Sequence[_Loop]], None]) 
                     loop.go_on()
                 waiting.clear()
     except BaseException:
-        for loop in loops:
+        started = [loop for loop in loops if loop.thread.ident is not None]
+        for loop in started:
             loop.stop()
-        for loop in loops:
-            if loop.thread.ident is not None:
-                loop.thread.join()
+        for loop in started:
+            loop.thread.join()
         raise
     if not all(loop.done for loop in loops):
         raise MemoryError(NO_MEMORY)
@@ -198,12 +211,9 @@ def _conduct(loops: Sequence[_Loop], answer: Callable[[Sequence[_Loop]], None]) 
 
 
 @lru_cache(maxsize=4096)
-def _view(address: int, *shape: int) -> Tensor:
+def _view(address: Any, *shape: int) -> Numbers:
     """Numbers in the memory of a loop."""
-    if prod(shape) == 0:
-        return torch.zeros(shape, dtype=DOUBLE, device=CPU)
-    memory = (ctypes.c_double * prod(shape)).from_address(address)
-    return torch.frombuffer(memory, dtype=DOUBLE).view(shape)
+    return np.ctypeslib.as_array((ctypes.c_double * prod(shape)).from_address(address)).reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -222,24 +232,28 @@ class _Answers:
     """What functions give for the problems of a solve, where loops ask for it."""
 
     def __init__(self, functions: Functions, problem: Problem, lanes: int, calls_cost: bool) -> None:
-        self._lanes, self._calls_cost = lanes, calls_cost
-        self.problem, self._called = problem, functions.rows
-        self.sizes = problem.n, problem.m, problem.n + problem.m, problem.N
-        self._first = list(accumulate((K * p for K, p in problem.row_shapes), initial=0))
-        like = problem.x0.device
-        take = lambda rows: functions.among(problem.take(torch.tensor(rows, dtype=torch.int64, device=like)))
-        self._among = lru_cache(maxsize=8)(take)
+        n, S, shapes = problem.n, problem.n + problem.m, problem.row_shapes
+        self._problem, self._called, self._calls_cost, self._lanes = problem, functions.rows, calls_cost, lanes
+        self._first = list(accumulate((K * p for K, p in shapes), initial=0))  # rows of each constraint
+        self._counts: dict[str | int, int] = {i: p + p * S + S * S for i, (_, p) in enumerate(shapes)}
+        self._counts |= {"step": n + n * S + S * S, "stage": 1 + S + S * S, "last": 1 + S + S * S, "Xn": n}
+        self._shapes = {
+            "X": (problem.N + 1, n), "U": (problem.N, problem.m), "y": (problem.N + 1, n), "z": (self._first[-1],),
+            "objective": (1,),
+        }  # fmt: skip
+        self._shapes |= {"Xn": self._shapes["X"], "Un": self._shapes["U"]}
+        index = lambda numbers: torch.tensor(numbers, dtype=torch.int64, device=problem.x0.device)
+        self._among = lru_cache(maxsize=8)(lambda numbers: functions.among(problem.take(index(numbers))))
 
     def __call__(self, loops: Sequence[_Loop]) -> None:
-        ways = {Asked.VALUES: self._values, Asked.DERIVATIVES: self._derivatives, Asked.NEARBY: self._nearby}
-        for asked, way in ways.items():
+        for asked, way in zip(Asked, (self._values, self._derivatives, self._nearby), strict=True):
             some = [_Asking(loop, _bits(loop.request.lanes)) for loop in loops if loop.request.asked == asked]
             if asked is Asked.DERIVATIVES:
                 some = [_Asking(one.loop, self._changed(one)) for one in some]
             some = [one for one in some if one.lanes]
             if some:
-                X, U = self._read(some, "X", self.sizes[3] + 1, self.sizes[0]), self._read(some, "U", *self.sizes[3:0:-2])
-                way(some, self._among(tuple(number for one in some for number in one.problems)), X, U)
+                of = self._among(tuple(number for one in some for number in one.problems))
+                way(some, of, self._read(some, "X"), self._read(some, "U"))
 
     def _values(self, asked: list[_Asking], of: Functions, X: Tensor, U: Tensor) -> None:
         self._write(asked, "step", 0, of.step(X, U))
@@ -249,60 +263,59 @@ class _Answers:
             self._write(asked, "stage", 0, of.cost(X, U).view(-1, 1, 1))  # all of it; that of other knots stays 0
 
     def _derivatives(self, asked: list[_Asking], of: Functions, X: Tensor, U: Tensor) -> None:
-        n, _, S, N = self.sizes
-        by = self._read(asked, "objective", 1)
-        y, z = self._read(asked, "y", N + 1, n), by * self._read(asked, "z", self._first[-1])
-        F, H = of.expand_step(X, U, by.unsqueeze(-1) * y[:, 1:])
-        self._write(asked, "step", n, F.flatten(2), H.flatten(2))
+        weight = self._read(asked, "objective")
+        y, z = weight.unsqueeze(-1) * self._read(asked, "y"), weight * self._read(asked, "z")
+        self._write(asked, "step", X.shape[-1], *of.expand_step(X, U, y[:, 1:]))
         for i in self._called:
-            p = self.problem.row_shapes[i][1]
-            J, H = of.expand_row(i, X, U, z[:, self._first[i] : self._first[i + 1]].unflatten(-1, (-1, p)))
-            self._write(asked, i, p, J.flatten(2), H.flatten(2))
+            p = self._problem.row_shapes[i][1]
+            lam = z[:, self._first[i] : self._first[i + 1]].unflatten(-1, (-1, p))
+            self._write(asked, i, p, *of.expand_row(i, X, U, lam))
         if self._calls_cost:
             g, H = of.expand_cost(X, U)
-            self._write(asked, "stage", 1, g[:, :-1], H[:, :-1].flatten(2))
-            self._write(asked, "last", 1, g[:, -1:], H[:, -1:].flatten(2))
+            self._write(asked, "stage", 1, g[:, :-1], H[:, :-1])
+            self._write(asked, "last", 1, g[:, -1:], H[:, -1:])
 
     def _nearby(self, asked: list[_Asking], of: Functions, X: Tensor, U: Tensor) -> None:
-        n, m, _, N = self.sizes
-        start, controls = self._read(asked, "Xn", N + 1, n)[:, 0], self._read(asked, "Un", N, m)
+        start, controls = self._read(asked, "Xn")[:, 0], self._read(asked, "Un")
         self._write(asked, "Xn", 0, of.nearby(X, U, start, controls))
 
     def _changed(self, one: _Asking) -> list[int]:
         """The lanes in which a problem, its iterate or its multipliers are others than at the last derivatives."""
-        n, m, _, N = self.sizes
-        shapes = {"X": (N + 1) * n, "U": N * m, "y": (N + 1) * n, "z": self._first[-1], "objective": 1}
-        views = [_view(getattr(one.loop.request, name), size, self._lanes) for name, size in shapes.items()]
-        numbers = torch.full((1, self._lanes), torch.nan, dtype=DOUBLE, device=CPU)
-        numbers[0, one.lanes] = torch.tensor(one.problems, dtype=DOUBLE, device=CPU)
-        found, before = torch.cat((*views, numbers)), one.loop.before
-        if before is None:
-            before = one.loop.before = torch.full_like(found, torch.nan)
-        others = (found != before).any(0).tolist()
+        parts = [self._view(one, name) for name in ("X", "U", "y", "z", "objective")]
+        numbers = np.full((1, self._lanes), np.nan)
+        numbers[0, one.lanes] = one.problems
+        found = np.concatenate([*(part.reshape(-1, self._lanes) for part in parts), numbers])
+        before = np.full_like(found, np.nan) if one.loop.before is None else one.loop.before
+        others = (found != before).any(0)
         lanes = [lane for lane in one.lanes if others[lane]]
         before[:, lanes] = found[:, lanes]
+        one.loop.before = before
         return lanes
 
-    def _read(self, asked: list[_Asking], field: str, *shape: int) -> Tensor:
+    def _view(self, one: _Asking, field: str) -> Numbers:
+        """An array of a request, (..., lanes)."""
+        return _view(getattr(one.loop.request, field), *self._shapes[field], self._lanes)
+
+    def _read(self, asked: list[_Asking], field: str) -> Tensor:
         """An array of the requests, (b, ...), for the problem's functions."""
-        parts = [_view(getattr(one.loop.request, field), *shape, self._lanes)[..., one.lanes] for one in asked]
-        like = self.problem.x0
-        return torch.cat(parts, dim=-1).movedim(-1, 0).contiguous().to(like.device, like.dtype)
+        whole = np.concatenate([self._view(one, field)[..., one.lanes] for one in asked], axis=-1)
+        like = self._problem.x0
+        return torch.from_numpy(np.ascontiguousarray(np.moveaxis(whole, -1, 0))).to(like.device, like.dtype)
 
     def _write(self, asked: list[_Asking], where: str | int, first: int, *values: Tensor) -> None:
-        """Write numbers (b, K, q) of K knots, from the one of number `first` on, to where requests say."""
-        whole = torch.cat(values, dim=-1).to(CPU, DOUBLE).movedim(0, -1)
-        (K, q, _), at, (n, _, S, _) = whole.shape, 0, self.sizes
-        more = {"step": n + n * S + S * S, "stage": 1 + S + S * S, "last": 1 + S + S * S, "Xn": n}
+        """Write numbers (b, K, ...) of K knots, from the one of number `first` on, to where requests say."""
+        joined = torch.cat([part.flatten(2) for part in values], dim=-1).detach().to(CPU, DOUBLE)
+        whole, at = np.moveaxis(joined.numpy(), 0, -1), 0
+        K, count, _ = whole.shape
         for one in asked:
-            request = one.loop.request
+            request, end = one.loop.request, at + len(one.lanes)
             if isinstance(where, int):
-                p = self.problem.row_shapes[where][1]
-                address, count = ctypes.c_void_p.from_address(request.rows + 8 * where).value, p + p * S + S * S
+                address = ctypes.c_void_p.from_address(request.rows + ctypes.sizeof(ctypes.c_void_p) * where).value
             else:
-                address, count = getattr(request, where), more[where]
-            _view(address, K, count, self._lanes)[:, first : first + q, one.lanes] = whole[..., at : at + len(one.lanes)]
-            at += len(one.lanes)
+                address = getattr(request, where)
+            room = _view(address, K, self._counts[where], self._lanes)
+            room[:, first : first + count, one.lanes] = whole[..., at:end]
+            at = end
 
 
 def _bits(lanes: int) -> list[int]:

@@ -23,18 +23,15 @@ from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
 
 
-class InteriorEngine:
-    """The library of a form of problems, for as many as `engine` serves; compiled when it is made.
+class InteriorKernels:
+    """The interior point for the problems of a form.
 
-    Raises:
-        InputError: a part without a counterpart in C.
-        NativeError: no compiler, or it refuses the source.
+    Attributes:
+        library: that it is compiled to, with so many `lanes`.
     """
 
-    def __init__(self, engine: Engine) -> None:
-        self.engine, self.lanes = engine, lanes_for(engine.B)
-        units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
-        self.library: ctypes.CDLL = engine.further(("interior", self.lanes), units)
+    library: ctypes.CDLL
+    lanes: int
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor,
@@ -97,6 +94,32 @@ class InteriorEngine:
         for row, lam in zip(rows, multipliers, strict=True):
             row.lam = lam
         return self._with(problem, X=X, U=U, constraint=rows, **out), out
+
+    def _rows(self, problem: Problem) -> list[structures.Constraint]:
+        """Constraints without multipliers."""
+        raise NotImplementedError
+
+    def _with(self, problem: Problem, **values: Any) -> structures.Problem:
+        """A problem with further fields."""
+        raise NotImplementedError
+
+    def _run(self, function: Any, problem: Problem, how: Interior | Kkt) -> None:
+        """Call a function of the library on all problems."""
+        raise NotImplementedError
+
+
+class InteriorEngine(InteriorKernels):
+    """That whose functions are compiled, for as many problems as `engine` serves; compiled when it is made.
+
+    Raises:
+        InputError: a part without a counterpart in C.
+        NativeError: no compiler, or it refuses the source.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine, self.lanes = engine, lanes_for(engine.B)
+        units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
+        self.library = engine.further(("interior", self.lanes), units)
 
     def _rows(self, problem: Problem) -> list[structures.Constraint]:
         return self.engine._rows(problem)[1]

@@ -65,8 +65,10 @@ static void infer_sizes(const Barrier *t, V *size) {
     }
 }
 
-/* The largest slope or curvature of the cost in any one variable, in units in which none of these is small, and `plain`
-   in its own: eager/sizes.py says how. */
+/* The largest slope or curvature of the cost in any one variable, and `plain` in its own units. The cost is scaled by it.
+   In a variable of small units, a length in tens of kilometres, curvatures are large though it moves little: the scaled
+   cost would be tiny beside barrier and multipliers. So a variable whose numbers are all small counts in units of the
+   largest of them: in the guess, in its bounds, and in the step to the minimum of the cost alone. */
 static V steepest(const Barrier *t, V *plain) {
     const Lanes *s = &t->lanes;
     V largest = SET(0.0), zero = SET(0.0), one = SET(1.0), g[S], H[S * S], slope[S], bend[S], size[S];
@@ -100,7 +102,10 @@ static double first_barrier(const Barrier *t, int l) {
     return own > end ? own : end;
 }
 
-/* Multipliers of bounds begin at 1 where the cost hardly holds a step back: eager/loose.py says why. */
+/* Multipliers of bounds begin at 1 where the cost hardly holds a step back. Those of the central path, mu / s, are tiny at
+   a bound far away: in a linear programme, and with tiny weights, steps leave the bounds a hundredfold, as little of them
+   is taken, and iterations grow with the horizon. Elsewhere 1 would bend the model for nothing. What moving a variable
+   leads to counts, too, and a slack as 1 at least: at a bound nearby small slacks hold a step. */
 static void hold_loose(Barrier *t, I of) {
     const Lanes *s = &t->lanes;
     I some = of & ~of;

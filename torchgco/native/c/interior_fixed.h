@@ -281,8 +281,11 @@ static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, const V *acti
     return hold;
 }
 
-/* Rows of the lanes `of` that hold as equalities give way more where units are small: eager/softness.py says why, and what
-   `moves` are. The slopes f are those of the iterate. */
+/* Rows of the lanes `of` that hold as equalities give way more where units are small: their stiffness is added to the
+   curvature of the cost, of which rounding would leave nothing where that is many times smaller. The cost lets a row give
+   way by about J^2 `moves`; of that, a `share` is enough. `moves` is how far the cost lets a variable move, squared, the
+   inverse of its curvature: of controls that of all they lead to, of states no farther than what controls lead to them.
+   Products of different variables don't count, so it is right but for a factor. The slopes f are those of the iterate. */
 static void soften_rows(Barrier *t, I of, V share, const V *active) {
     const Problem *p = t->lanes.of;
     int some = active != 0;
