@@ -71,7 +71,8 @@ class Box:
     """A box, rounded outwards by `radius`; lengths in metres.
 
     center, half (d,): half the sides' lengths; sides (d, d): their directions, as rows
-    swing: amplitudes, rates and phases (3, S, d) of the sines along which the centre moves; None: it rests
+    swing: amplitudes, rates and phases (3, S, d) of the sines along which the centre moves; None: of none
+    velocity: (d,), m/s, with which it moves beside; None: 0
     """
 
     center: np.ndarray
@@ -79,10 +80,12 @@ class Box:
     sides: np.ndarray
     radius: float = 0.0
     swing: np.ndarray | None = None
+    velocity: np.ndarray | None = None
 
     @property
     def moving(self) -> bool:
-        return self.swing is not None and bool(self.swing[0].any())
+        swings = self.swing is not None and bool(self.swing[0].any())
+        return swings or (self.velocity is not None and bool(self.velocity.any()))
 
     @property
     def corners(self) -> np.ndarray:
@@ -95,10 +98,13 @@ class Box:
 
     def at(self, t: np.ndarray | float) -> np.ndarray:
         """Centres (..., d) at times t (...), s."""
+        t, center = np.asarray(t), np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+        if self.velocity is not None:
+            center = center + t[..., None] * self.velocity
         if self.swing is None:
-            return np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+            return center
         amplitudes, rates, phases = self.swing
-        return self.center + (amplitudes * np.sin(np.asarray(t)[..., None, None] * rates + phases)).sum(axis=-2)
+        return center + (amplitudes * np.sin(t[..., None, None] * rates + phases)).sum(axis=-2)
 
     def distance(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Signed distances (K,) of points (K, d) from the box before rounding."""

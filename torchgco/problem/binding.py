@@ -27,8 +27,8 @@ OF_FIELDS = {"bind", "batched", "per_element"}
 # Methods that say what a part is, and those that a class of ours computes beside them from its own fields alone.
 SAID = "stage", "terminal", "total", "value", "at", "signed_distance", "field", "step"
 COMPUTED = (
-    "expand", "scaled", "value", "accumulate", "violation", "worst", "at", "signed_distance", "segment_clearance",
-    "chord_clearance", "jacobians",
+    "expand", "scaled", "value", "rows", "accumulate", "violation", "worst", "at", "signed_distance",
+    "segment_clearance", "chord_clearance", "jacobians",
 )  # fmt: skip
 INTERFACES = Cost, Constraint, Obstacles, Dynamics  # what these compute, they compute by a part's own methods
 
@@ -104,6 +104,7 @@ def _torn(found: Any) -> Iterator[tuple[str, str, str]]:
     for name in COMPUTED:
         at = next((i for i, cls in enumerate(line) if name in vars(cls)), None)
         unused = name == "at" and isinstance(found, Constraint) and not found.geometric
+        unused |= name == "rows" and getattr(type(found), "value", None) is not Obstacles.value
         if at is None or unused or line[at] in INTERFACES or not _is_ours(line[at]):
             continue
         users = [cls for cls in line[:at] if not _is_ours(cls)]
