@@ -1,4 +1,4 @@
-"""A kind of obstacles that a user writes: rings in space, at rest or moving, by the methods that each kind must have."""
+"""A kind of obstacles that a user writes: rings in space, at rest or moving, by the methods that each must have."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class Rings(Obstacles):
     stops: Tensor | None = None
 
     batched = ("centers", "ring_radii", "tube_radii", "vehicle_radius", "velocities", "stops")
-    margins = property(lambda self: self.tube_radii + self.vehicle_radius.unsqueeze(-1))
-    absent = property(lambda self: torch.zeros_like(self.margins, dtype=torch.bool))
-    moving = property(lambda self: self.velocities is not None)
+    margins = property(lambda self: self.tube_radii + self.vehicle_radius.unsqueeze(-1))  # type: ignore[assignment]
+    absent = property(lambda self: torch.zeros_like(self.margins, dtype=torch.bool))  # type: ignore[assignment]
+    moving = property(lambda self: self.velocities is not None)  # type: ignore[assignment]
 
     def bind(self, dims: Dimensions) -> Self:
         return replace(self, knots=slice(1, dims.N + 1), position=dims.position, dt=dims.dt)
