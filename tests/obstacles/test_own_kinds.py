@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import ControlBounds, FunctionDynamics, Goal, Problem, QuadraticCost, judge
+from torchgco import Body, Constraint, ControlBounds, FunctionDynamics, Goal, Problem, QuadraticCost, judge
 from torchgco.base.shapes import Dimensions
 from torchgco.compiled.numbered import with_own_numbers
 from torchgco.obstacles import Obstacles
@@ -35,7 +35,7 @@ class Rings(Obstacles):
     centers: Tensor  # (B, M, 3), m
     ring_radii: Tensor  # (B, M), m
     tube_radii: Tensor  # (B, M), m
-    vehicle_radius: Tensor  # (B,), m
+    vehicle_radius: Any  # (B,), m; or a `Body`
     velocities: Tensor | None = None  # (B, M, 3), m/s
     knots: Any = None
     position: Any = None
@@ -47,7 +47,9 @@ class Rings(Obstacles):
     absent = property(lambda self: torch.zeros_like(self.margins, dtype=torch.bool))  # type: ignore[assignment]
     moving = property(lambda self: self.velocities is not None)  # type: ignore[assignment]
 
-    def bind(self, dims: Dimensions) -> Self:
+    def bind(self, dims: Dimensions) -> Constraint:
+        if isinstance(self.vehicle_radius, Body):
+            return self.vehicle_radius.around(self, dims)
         return replace(self, knots=slice(1, dims.N + 1), position=dims.position, dt=dims.dt)
 
     def grown(self, by: Tensor) -> Self:
@@ -116,7 +118,7 @@ class Rings(Obstacles):
         return RoundedBoxes(center, half, sides, radius, velocity)
 
 
-def flight(moving: bool) -> Problem:
+def flight(moving: bool, body: Body | None = None, horizon: list[int] | None = None) -> Problem:
     """Three flights to x = 4 through or past two rings, from y = 0, 0.5 and 0.9 m."""
     model = FunctionDynamics(
         lambda x, u: torch.cat((x[..., 3:], u), -1), n=6, m=3, dt=0.1, integrator="rk4", position=slice(0, 3)
@@ -125,11 +127,11 @@ def flight(moving: bool) -> Problem:
     x0[:, 1] = torch.tensor([0.0, 0.5, 0.9])
     each = lambda rows: torch.tensor(rows, dtype=D).expand(3, *np.shape(rows)).contiguous()
     velocities = each([[0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]) if moving else None
-    rings = Rings(
-        each([[2.0, 0.6, 0.0], [3.0, -0.3, 0.2]]), each([0.6, 0.5]), each([0.1, 0.08]), each(0.15), velocities
-    )
+    centers, radius = each([[2.0, 0.6, 0.0], [3.0, -0.3, 0.2]]), each(0.15) if body is None else body
+    rings = Rings(centers, each([0.6, 0.5]), each([0.1, 0.08]), radius, velocities)
     cost = QuadraticCost(Q=[0.1] * 6, R=[0.1] * 3, Qf=[50] * 3 + [5] * 3, x_ref=[4, 0, 0, 0, 0, 0])
-    return Problem(model, cost, [ControlBounds([-3] * 3, [3] * 3), rings], x0, N=50, goal=Goal([4, 0, 0], radius=0.2))
+    parts = [ControlBounds([-3] * 3, [3] * 3), rings]
+    return Problem(model, cost, parts, x0, N=50, goal=Goal([4, 0, 0], radius=0.2), horizon=horizon)
 
 
 @pytest.mark.parametrize("moving", [False, True])
@@ -145,6 +147,25 @@ def test_it_is_solved_judged_and_drawn(moving: bool) -> None:
     assert len(scene.bodies[0]) == 2 * BARS and all(body.moving == moving for body in scene.bodies[0])
     if moving:
         np.testing.assert_allclose(scene.bodies[0][0].at(2.0) - scene.bodies[0][0].center, [0.0, 0.2, 0.0])
+
+
+def level(x: Tensor) -> Tensor:
+    """A vehicle that doesn't turn."""
+    return torch.eye(3, dtype=x.dtype).expand(*x.shape[:-1], 3, 3)
+
+
+def test_it_is_met_by_a_body_and_ends_with_each_horizon() -> None:
+    long = Body([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]], [0.1, 0.1], level)
+    for problem in (flight(False, body=long), flight(False, horizon=[50, 40, 35])):
+        verdict = judge(problem, torchgco.solve(problem, solver="al_ilqr").U)
+        assert bool((verdict.reached & verdict.clear_95).all())
+    by_hand = flight(False).constraints[1]
+    assert isinstance(by_hand, Rings)
+    X, U = torch.randn(3, 51, 6, dtype=D, generator=torch.Generator().manual_seed(2)), torch.zeros(3, 50, 3, dtype=D)
+    ball = by_hand.grown(torch.full((3,), -0.05, dtype=D))
+    ahead = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=D)
+    due = torch.cat([ball.value(X + side * ahead, U) for side in (1.0, -1.0)], dim=-1)
+    torch.testing.assert_close(flight(False, body=long).constraints[1].value(X, U), due)
 
 
 def test_rows_are_minus_the_distances_with_their_slopes() -> None:

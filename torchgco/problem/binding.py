@@ -85,7 +85,8 @@ def _origin(part: Any) -> Any:
 
 def _lost(part: Any, found: Any) -> Iterator[str]:
     """Names that a user's class redefines and that are other ones in the class of what its `bind` returned."""
-    if isinstance(found, type(part)) or not _is_ours(type(found)):
+    held = found.inscribed if isinstance(found, Obstacles) else found  # a body's balls meet obstacles of the class
+    if isinstance(held, type(part)) or not _is_ours(type(found)):
         return
     values = {field.name for field in fields(part)} if is_dataclass(part) else set[str]()
     for cls in type(part).__mro__:
