@@ -126,13 +126,19 @@ def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Te
     rows = ((status == Status.CONVERGED) | (status == Status.FEASIBLE)).nonzero().flatten()
     if rows.numel() == 0:
         return status
-    part, X, U = problem.take(rows), X[rows], U[rows]
-    bad = path_clearance(part, X, U) < 0 if all(one.has_chords for one in part.obstacles) else rows < 0
-    for way in passages(part, X, U).values():
-        bad = bad | ~way.passed.all(-1)
+    bad = fails_between(problem.take(rows), X[rows], U[rows])
     status = status.clone()
     status[rows[bad]] = int(Status.INFEASIBLE)
     return status
+
+
+def fails_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """Whether trajectories touch an obstacle between two knots, of a kind that can be measured, or miss a gate, (B,)."""
+    chords = all(one.has_chords for one in problem.obstacles)
+    bad = path_clearance(problem, X, U) < 0 if chords else torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    for way in passages(problem, X, U).values():
+        bad = bad | ~way.passed.all(-1)
+    return bad
 
 
 def touches(problem: Problem, found: Solution) -> Tensor:
