@@ -79,7 +79,7 @@ class BoundOscillatingBoxes(OwnKind):
     margins, sizes = passed_on("boxes", "margins", "sizes")
     moving = property(lambda self: bool((self.amplitudes != 0).any()))  # type: ignore[assignment]
 
-    def places(self, t: Tensor) -> Tensor:
+    def centers_at(self, t: Tensor) -> Tensor:
         """Centres (B, K, M, d), m, at times t (K,), s."""
         angle = t.view(1, -1, 1, 1, 1) * self.rates.unsqueeze(1) + self.phases.unsqueeze(1)
         return self.boxes.centers.unsqueeze(1) + (self.amplitudes.unsqueeze(1) * angle.sin()).sum(-2)
@@ -95,7 +95,7 @@ class BoundOscillatingBoxes(OwnKind):
         return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p, t))
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        now = self.places(a.new_zeros(1))[:, 0]
+        now = self.centers_at(a.new_zeros(1))[:, 0]
         return replace(self.boxes, centers=now).segment_clearance(a, b)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
@@ -147,7 +147,7 @@ class BoundOscillatingBoxes(OwnKind):
 
     def _local(self, p: Tensor, t: Tensor) -> list[Tensor]:
         """Coordinates along the sides from where the centres are, d tensors (B, K, M), of points p (B, K, d)."""
-        return self._solids.local((p.unsqueeze(2) - self.places(t)).unbind(-1))
+        return self._solids.local((p.unsqueeze(2) - self.centers_at(t)).unbind(-1))
 
     def _outside(self, p: Tensor, t: Tensor) -> Tensor:
         """Distances (B, K, M) from the full surfaces, as if none were absent."""
