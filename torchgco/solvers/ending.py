@@ -133,7 +133,7 @@ def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Te
 
 
 def fails_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """Whether trajectories touch an obstacle between two knots, of a kind that can be measured, or miss a gate, (B,)."""
+    """Whether trajectories touch an obstacle that can be measured between two knots, or miss a gate, (B,) bool."""
     chords = all(one.has_chords for one in problem.obstacles)
     bad = path_clearance(problem, X, U) < 0 if chords else torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
     for way in passages(problem, X, U).values():
