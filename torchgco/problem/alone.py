@@ -115,7 +115,7 @@ def _stages(problem: Problem, X: Tensor, U: Tensor, at_once: bool) -> Tensor:
 
 
 def _told(whole: Tensor, alone: Tensor, wrong: Tensor, rows: Tensor) -> str:
-    """What an error says of values (b, ...) of problems `rows` (b,) that are `own` where each row is by itself."""
+    """What an error says of values (b, ...) of problems `rows` (b,) that are `alone` where each row is by itself."""
     if whole.shape != alone.shape:
         return f"values of shape {tuple(whole.shape)} along the trajectories found, {tuple(alone.shape)} row by row"
     b, *k = wrong.nonzero()[0].tolist()

@@ -321,7 +321,7 @@ def _check_slope(
 ) -> None:
     """Compare derivatives of function(x, u) (2,) in two directions with differences, where two steps of these agree.
 
-    `own` (dx, du) is the derivative by the part's own code; None: by PyTorch, in reverse mode.
+    `slope` (dx, du) is the derivative by the part's own code; None: by PyTorch, in reverse mode.
     """
     eps, readers = torch.finfo(x.dtype).eps, WithoutReading()
     expected = "a function with derivatives by PyTorch, or the part's own, that agree with differences"
