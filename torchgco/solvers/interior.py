@@ -168,14 +168,12 @@ class InteriorPoint(Solver, named="solver"):
             if call.late:
                 end.status[rows] = Status.TIME_LIMIT
                 return
-            old, retry = take(end.best, rows), call.take(rows)
-            retry = replace(retry, U0=_beside(retry.problem, old.U, share), warm=None, X0=None, callback=None)
-            new = SolveEnd.blank(retry.problem, retry.U0)
-            fell = self._some(
-                kernels, retry, open_loop(retry.problem, retry.U0), torch.arange(len(rows)), new, 0.0, True
-            )
+            old, near = take(end.best, rows), call.take(rows)
+            near = replace(near, U0=_beside(near.problem, old.U, share), warm=None, X0=None, callback=None)
+            new = SolveEnd.blank(near.problem, near.U0)
+            fell = self._some(kernels, near, open_loop(near.problem, near.U0), torch.arange(len(rows)), new, 0.0, True)
             cheaper = new.best.cost < old.cost - STATIONARY * old.cost.abs()
-            better = (new.status == SOLVED) & cheaper & (new.best.violation <= self.admitted(retry.problem))
+            better = (new.status == SOLVED) & cheaper & (new.best.violation <= self.admitted(near.problem))
             end.iterations[rows] += new.iterations
             kept = better.nonzero().flatten()
             put(end.best, rows[kept], take(new.best, kept))
@@ -282,8 +280,8 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
         (lower, upper), size = bounds.by_knot, bounds.lower.shape[-1]
         half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
         low, high = (
-            torch.where(bound.isinf(), 0.0, push * torch.minimum(bound.abs().clamp(min=1.0), half))
-            for bound in (lower, upper)
+            torch.where(end.isinf(), 0.0, push * torch.minimum(end.abs().clamp(min=1.0), half))
+            for end in (lower, upper)
         )
         values = z[:, bounds.knots, :size]
         z[:, bounds.knots, :size] = torch.minimum(torch.maximum(values, lower + low), upper - high)
