@@ -280,8 +280,7 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
         (lower, upper), size = bounds.by_knot, bounds.lower.shape[-1]
         half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
         low, high = (
-            torch.where(end.isinf(), 0.0, push * torch.minimum(end.abs().clamp(min=1.0), half))
-            for end in (lower, upper)
+            torch.where(b.isinf(), 0.0, push * torch.minimum(b.abs().clamp(min=1.0), half)) for b in (lower, upper)
         )
         values = z[:, bounds.knots, :size]
         z[:, bounds.knots, :size] = torch.minimum(torch.maximum(values, lower + low), upper - high)
