@@ -42,13 +42,13 @@ class Session:
     """
 
     def __init__(
-        self, call: Call, as_printed: bool = False, own_units: bool = False, record: bool = False,
+        self, given: Call, as_printed: bool = False, own_units: bool = False, record: bool = False,
         by_kernels: bool = False,
     ) -> None:  # fmt: skip
-        self.given, self.as_printed, self.by_kernels = call, as_printed, by_kernels
-        self.call, self.unit = call, torch.ones_like(call.problem.x0[:, 0])
+        self.given, self.as_printed, self.by_kernels = given, as_printed, by_kernels
+        self.call, self.unit = given, torch.ones_like(given.problem.x0[:, 0])
         if not (as_printed or own_units):
-            self.call, self.unit = call.in_cost_units()
+            self.call, self.unit = given.in_cost_units()
         self.recorder = Recorder() if record else None
 
     @property
