@@ -43,8 +43,8 @@ class PlannerPolicy:
     def __init__(self, env: Any, planner: Planner | None = None, seed: int = 0) -> None:
         env = env.unwrapped
         if not isinstance(env, MissionVectorEnv) or env.episodes.control != "rates":
-            given = type(env).__name__ if not isinstance(env, MissionVectorEnv) else 'control "rotors"'
-            raise InputError("env", 'a MissionVectorEnv with control "rates"', given)
+            got = type(env).__name__ if not isinstance(env, MissionVectorEnv) else 'control "rotors"'
+            raise InputError("env", 'a MissionVectorEnv with control "rates"', got)
         self.env, self.seed = env, seed
         self.planner = env.episodes.mission.planner if planner is None else planner
         self._plan: MissionPlan | None = None
@@ -65,10 +65,10 @@ class PlannerPolicy:
             action = torch.zeros(len(x), 4, dtype=x.dtype)
             action[:, 3] = flying.airframe.gravity
             for rows, anew in ((begun, True), (~begun & ~waiting, False)):
-                at = rows.nonzero().flatten()
-                if len(at) > 0:
-                    X = self._planned(x, at, anew).X
-                    action[at] = X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
+                indices = rows.nonzero().flatten()
+                if len(indices) > 0:
+                    X = self._planned(x, indices, anew).X
+                    action[indices] = X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
             self._number, self._step = torch.where(waiting, self._number, flying.number), self._step + 1
             return action.clamp(*self.env._bounds).to(torch.float32).numpy()
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -55,32 +55,32 @@ class Multipliers:
         if problem is None:
             return Multipliers(tuple(shifted(lam, steps) for lam in self.lam), self.mu)
         all_knots, lam = torch.arange(problem.N + 1, device=problem.x0.device), []
-        for own, part in zip(self.lam, problem.constraints, strict=True):
-            knots = all_knots[part.knots]
+        for values, constraint in zip(self.lam, problem.constraints, strict=True):
+            knots = all_knots[constraint.knots]
             last = None
             if problem.horizon is not None:
-                last = counted(part, problem.horizon, problem.N).long().cumprod(-1).sum(-1) - 1
-            lam.append(shifted(own, steps, knots.tolist(), last))
+                last = counted(constraint, problem.horizon, problem.N).long().cumprod(-1).sum(-1) - 1
+            lam.append(shifted(values, steps, knots.tolist(), last))
         return Multipliers(tuple(lam), self.mu)
 
     def check(self, problem: Problem) -> None:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
-        if not isinstance(self.lam, tuple) or not all(isinstance(part, Tensor) for part in (*self.lam, self.mu)):
+        if not isinstance(self.lam, tuple) or not all(isinstance(values, Tensor) for values in (*self.lam, self.mu)):
             raise InputError("warm", "multipliers that are tensors", type(self.lam).__name__)
         want = [(problem.B, *shape) for shape in problem.row_shapes]
         for mine, expected in ((self.lam, want), ((self.mu,), [(problem.B,)])):
-            got = [tuple(part.shape) for part in mine]
+            got = [tuple(values.shape) for values in mine]
             if got != expected:
                 raise InputError("warm", f"multipliers of shapes {expected}", got)
-        for part in (*self.lam, self.mu):
-            check_tensor(part, "warm", problem.x0)
+        for values in (*self.lam, self.mu):
+            check_tensor(values, "warm", problem.x0)
 
 
 def later(knots: Sequence[int], steps: int) -> list[int]:
     """The places of the knots `steps` stages later: the last one beyond the end, a knot's own where there is none."""
-    place, end = {knot: i for i, knot in enumerate(knots)}, len(knots) - 1
+    index, end = {knot: i for i, knot in enumerate(knots)}, len(knots) - 1
     last = max(knots, default=0)
-    return [place.get(knot + steps, end if knot + steps > last else i) for i, knot in enumerate(knots)]
+    return [index.get(knot + steps, end if knot + steps > last else i) for i, knot in enumerate(knots)]
 
 
 def shifted(values: Tensor, steps: float = 1, knots: Sequence[int] | None = None, last: Tensor | None = None) -> Tensor:
@@ -158,6 +158,7 @@ class Lagrangian:
     multipliers: Multipliers
     penalty: Penalty | None
     phr: bool
+    derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # of these very parts
 
     def take(self, index: Rows) -> Lagrangian:
         """The same for the problems in `index`."""
