@@ -6,6 +6,7 @@ stages stays shared. Each part names its own in `numbers`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -174,3 +175,17 @@ def angles(new: Floats) -> Wrong:
 
 def directions(new: Floats) -> Wrong:
     return finite(new) or (None if (np.abs(new).max(-1) > 0).all() else ("vectors other than 0", new.tolist()))
+
+
+def measured(x: Any, B: int, n: int) -> Floats:
+    """States (B, n), or (n,) of all vehicles.
+
+    Raises:
+        InputError: another shape, no numbers, NaN or infinity.
+    """
+    state = as_floats(x, "x")
+    if state.shape not in ((B, n), (n,)):
+        raise InputError("x", f"shape ({B}, {n}), or ({n},) for all vehicles", state.shape)
+    if not math.isfinite(state.sum()) and not np.isfinite(state).all():  # a sum takes a third of the time
+        raise InputError("x", "finite states", "NaN or infinity")
+    return state
