@@ -27,6 +27,7 @@ ROOM = 0.1  # share of a cell's side that ways keep clear, as distances are inte
 AROUND = 3.0  # sizes of the largest obstacle that the lattice extends beyond start, goal and the way without obstacles;
 # at most half of the distance, within which ways up to sqrt(2) times as long stay
 FASTER = 1.25  # times as fast as without obstacles, at most
+SIDEWAYS = 0.5  # share of that speed by which in space the velocity along an axis may leave its range there
 THIN = 0.25  # share of the smallest obstacle's size that a cell of a vehicle without a radius measures
 
 
@@ -113,11 +114,11 @@ def _sizes(problem: Problem, free: Tensor, finer: float) -> Sizes:
     beyond = min(AROUND * (_largest(problem) + radius), 0.5 * float(np.linalg.norm(np.ptp(points, axis=0))))
     low, high = (part[0, at].double().cpu().numpy() for part in bounds_at_inner_knots(problem))
     speed = FASTER * np.linalg.norm(v, axis=1).max(initial=0.0)
-    most = np.full(d, speed)
-    return Sizes(
-        spacing, push, stages * dt, np.maximum(low, points.min(0) - beyond), np.minimum(high, points.max(0) + beyond),
-        -most, most,
-    )  # fmt: skip
+    slowest, fastest = np.full(d, -speed), np.full(d, speed)
+    if d == 3 and len(v) > 0:
+        slowest, fastest = v.min(0) - SIDEWAYS * speed, v.max(0) + SIDEWAYS * speed
+    low, high = np.maximum(low, points.min(0) - beyond), np.minimum(high, points.max(0) + beyond)
+    return Sizes(spacing, push, stages * dt, low, high, slowest, fastest)
 
 
 def _largest(problem: Problem) -> float:

@@ -88,6 +88,8 @@ class Velocity:
 
     def admitted(self, v: Array) -> Array:
         """Which velocities v (M, d) the constraints on states admit at some knot, (M,) bool."""
+        if not any(map(_limits_speed, self.problem.constraints)):
+            return np.ones(len(v), dtype=bool)
         rest = self.problem.take(torch.zeros(len(v) + 1, dtype=torch.int64, device=self.problem.x0.device))
         X = repeated(self.states(np.vstack((v, np.zeros_like(v[:1])))), rest.N + 1)
         U = rest.cost.rest_controls(X.new_zeros(rest.B, rest.N, rest.m))
