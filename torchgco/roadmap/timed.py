@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -154,19 +155,21 @@ class TimedWays:
     tau: float
 
 
-def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[TimedWays] | None:
-    """Up to `most` ways of each scene that cost at most a share `dearer` more than its cheapest; None without a library.
+def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[TimedWays]:
+    """Up to `most` ways of each scene that cost at most a share `dearer` more than its cheapest.
 
-    Scenes are searched by as many threads as PyTorch uses; what is found in one doesn't depend on the others.
+    There must be a library (`library_for`). Scenes are searched by as many threads as PyTorch uses; what is found in one
+    doesn't depend on the others.
 
     Raises:
         MemoryError: C could not allocate 8 bytes for each state.
     """
-    library = library_for(scenes[0].lattice.d) if scenes else None
-    if library is None:
-        return None
+    if not scenes:
+        return []
+    library = library_for(scenes[0].lattice.d)
+    assert library is not None
     own = [scene.arguments(most, dearer) for scene in scenes]
-    every = (Timed * len(own))(*own)
+    every: Any = (Timed * len(own))(*own)
     run(library.tgco_timed, len(own), 1, every)
     found = []
     for scene, one, end in zip(scenes, own, every, strict=True):
@@ -176,7 +179,7 @@ def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[T
     return found
 
 
-def clearances(parts: Sequence, lattice: TimedLattice) -> Tensor:
+def clearances(parts: Sequence[Any], lattice: TimedLattice) -> Tensor:
     """Distances (layers PARTS + 1, cells), float32, m, of a lattice's cells at its times from the obstacles of one
     problem: infinite where there is none.
 

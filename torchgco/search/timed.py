@@ -50,7 +50,7 @@ class Timed(Row):
 
     Args:
         ways: classes of ways that are solved, at most.
-        gap: trajectories that have arrived and cost at most this share more than without obstacles are left as they are.
+        gap: share by which what has arrived may cost more than without obstacles, and is left as it is.
         dearer: share by which ways may cost more than the cheapest.
 
     Raises:
@@ -106,11 +106,11 @@ class Timed(Row):
             if rows.numel() == 0 or search.call.late:
                 return
 
-    def _ways(self, problem: Problem, X: Tensor, finer: float) -> list[TimedWays | None]:
+    def _ways(self, problem: Problem, X: Tensor, finer: float) -> list[TimedWays]:
         """The ways of every problem."""
         each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
         scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
-        return timed_ways(scenes, self.ways, self.dearer) or [None] * len(scenes)
+        return timed_ways(scenes, self.ways, self.dearer)
 
 
 def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -127,19 +127,23 @@ def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
     return X, torch.where(good, end.best.cost, none)
 
 
-def _solve_along(search: Search, rows: Tensor, found: list[TimedWays | None]) -> Tensor:
+def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor:
     """Solve along the ways of the problems in `rows`; whether each has a trajectory that arrives now, (b,).
 
     Where the cheapest of a problem touch an obstacle between two knots, they are solved again among larger ones.
     """
-    each = torch.tensor([b for b, ways in enumerate(found) for _ in (() if ways is None else ways.points)])
+    each = torch.tensor([b for b, ways in enumerate(found) for _ in ways.points])
     done = torch.zeros_like(rows, dtype=torch.bool)
     if each.numel() == 0:
         return done
     each = each.to(rows.device)
     X, U = _guesses(search.call.problem.take(rows), each, found)
     call = replace(search.call.take(rows[each]), U0=U, warm=None, callback=None)
-    grown, made, left = torch.zeros_like(X[:, 0, 0]), torch.zeros_like(each), torch.arange(len(each), device=each.device)
+    grown, made, left = (
+        torch.zeros_like(X[:, 0, 0]),
+        torch.zeros_like(each),
+        torch.arange(len(each), device=each.device),
+    )
     least = torch.full_like(search.best.end.best.cost[rows], torch.inf)
     for _ in range(ROUNDS):
         part = call.take(left)
@@ -159,7 +163,7 @@ def _solve_along(search: Search, rows: Tensor, found: list[TimedWays | None]) ->
 
 
 def _solved(call: Call, X: Tensor, grown: Tensor) -> SolveEnd:
-    """Solves of a call from states X (C, N+1, n) among obstacles that have grown (C,), m, rated among those as they are."""
+    """Solves of a call from X (C, N+1, n) among obstacles that have grown (C,), m, rated among those as they are."""
     if not bool(grown.any()):
         return solved_nearby(SOLVER, call, X)
     end = solved_nearby(SOLVER, replace(call, problem=call.problem.grown(grown)), X)
@@ -198,11 +202,11 @@ def _keep(search: Search, rows: Tensor, each: Tensor, merit: Tensor, end: SolveE
     return done
 
 
-def _guesses(problem: Problem, each: Tensor, found: list[TimedWays | None]) -> tuple[Tensor, Tensor]:
+def _guesses(problem: Problem, each: Tensor, found: list[TimedWays]) -> tuple[Tensor, Tensor]:
     """States (C, N+1, n) and controls (C, N, m) along the ways of all problems in turn; `each` says whose way it is."""
-    states, t = [], float(problem.dynamics.dt) * np.arange(problem.N + 1)
+    states, t = [], float(problem.dynamics.dt) * np.arange(problem.N + 1.0)
     for b, ways in enumerate(found):
-        if ways is None or len(ways.points) == 0:
+        if len(ways.points) == 0:
             continue
         velocity = Velocity.of(problem.take(torch.tensor([b], device=each.device)))
         for points in ways.points:

@@ -56,16 +56,15 @@ def can_search(problem: Problem) -> bool:
     )
 
 
-def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedScene | None:
-    """The scene of a batch of one; None where nothing says how far it goes.
+def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedScene:
+    """The scene of a batch of one.
 
     Args:
         free: states (N+1, n) of the trajectory without obstacles.
         finer: share of the usual spacing.
     """
-    velocity = Velocity.of(problem)
-    sizes = _sizes(problem, free, finer)
-    lattice = _lattice(sizes, problem.x0[0, problem.position].double().cpu().numpy(), velocity)
+    velocity, start = Velocity.of(problem), problem.x0[0, problem.position].double().cpu().numpy()
+    lattice = _lattice(_sizes(problem, free, finer), start, velocity)
     stages = lattice.tau / float(problem.dynamics.dt)
     parts = [part.inscribed if isinstance(part, Obstacles) else part for part in problem.geometric]
     parts = [part for part in parts if isinstance(part, Obstacles | BoundField)]
@@ -79,7 +78,6 @@ def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedSc
     change[: lattice.d] = np.where(np.isfinite(own), own, bend)
     if not change.any() and not move.any():  # the way alone counts
         move = (lattice.velocities**2).sum(1) * lattice.tau
-    start = problem.x0[0, problem.position].double().cpu().numpy()
     return TimedScene(
         lattice, clearances(parts, lattice), cell_cost,
         _costs(np.where(fast, FAR, move)), _costs(last), _costs(change), lattice.cell(start),
@@ -140,7 +138,10 @@ def _lattice(sizes: Sizes, start: Array, velocity: Velocity) -> TimedLattice:
         tau = np.sqrt(spacing / (PUSH_SHARE * sizes.push))
         layers = max(2, round(sizes.duration / tau))
         tau = sizes.duration / layers
-        before, behind = (np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64) for part in (start - sizes.low, sizes.high - start))
+        before, behind = (
+            np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64)
+            for part in (start - sizes.low, sizes.high - start)
+        )
         unit = spacing / tau
         least, most = np.floor(sizes.slowest / unit + 0.5), np.ceil(sizes.fastest / unit - 0.5)
         least, most = (part.astype(np.int64) for part in (np.minimum(least, -1), np.maximum(most, 1)))
