@@ -10,7 +10,7 @@ import torch
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.shapes import RoundedBoxes
-from torchgco.plotting.bodies import Ball, Box, Plane, Solid
+from torchgco.plotting.bodies import Ball, Box, Plane, Solid, Track
 from torchgco.plotting.scene import Scene
 from torchgco.plotting.silhouettes import body_of
 from torchgco.problem.problem import Problem
@@ -78,8 +78,11 @@ def _bodies(shapes: RoundedBoxes) -> list[Solid]:
     for i in range(M):
         center, half, radius = shapes.center[i], shapes.half[i], float(shapes.radius[i])
         swing = None if shapes.sines is None else shapes.sines[:, i]
-        is_box = half.any() or swing is not None
-        found.append(Box(center, half, shapes.sides[i], radius, swing) if is_box else Ball(center, radius, moves[i]))
+        track = None if shapes.track is None else Track(shapes.track[:, i], shapes.step)
+        if half.any() or swing is not None:
+            found.append(Box(center, half, shapes.sides[i], radius, swing, track))
+        else:
+            found.append(Ball(center, radius, moves[i], track))
     return found
 
 
