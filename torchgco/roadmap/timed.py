@@ -202,7 +202,10 @@ def clearances(parts: Sequence, lattice: TimedLattice) -> Tensor:
 
 def _nearest(part, p: Tensor, t: Tensor) -> Tensor:
     """Distances (K,) of points p (K, d) at times t (K,) from the nearest obstacle."""
-    some = [part.signed_distance(a.unsqueeze(0), b)[0] for a, b in zip(p.split(POINTS_AT_ONCE), t.split(POINTS_AT_ONCE), strict=True)]
+    some = [
+        part.signed_distance(a.unsqueeze(0), b)[0]
+        for a, b in zip(p.split(POINTS_AT_ONCE), t.split(POINTS_AT_ONCE), strict=True)
+    ]
     away = torch.cat(some)
     return away.amin(-1) if away.shape[-1] > 0 else away.new_full(away.shape[:1], torch.inf)
 

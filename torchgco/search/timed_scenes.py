@@ -139,7 +139,10 @@ def _lattice(sizes: Sizes, start: Array, velocity: Velocity) -> TimedLattice:
         tau = np.sqrt(spacing / (PUSH_SHARE * sizes.push))
         layers = max(2, round(sizes.duration / tau))
         tau = sizes.duration / layers
-        before, behind = (np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64) for part in (start - sizes.low, sizes.high - start))
+        before, behind = (
+            np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64)
+            for part in (start - sizes.low, sizes.high - start)
+        )
         unit = spacing / tau
         least, most = np.floor(sizes.slowest / unit + 0.5), np.ceil(sizes.fastest / unit - 0.5)
         least, most = (part.astype(np.int64) for part in (np.minimum(least, -1), np.maximum(most, 1)))

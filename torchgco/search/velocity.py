@@ -118,7 +118,9 @@ class Velocity:
         more = torch.linalg.pinv(B).T * a  # controls of each, (c, m)
         does = (more @ B.T - a * torch.eye(len(states)).to(B)).abs().amax(-1) <= 1e-6 * a
         here = repeated(x[:, 0], len(states))
-        cost = self.problem.cost.stage(here, u + more, 0) - self.problem.cost.stage(here, u.expand(-1, len(states), -1), 0)
+        cost = self.problem.cost.stage(here, u + more, 0) - self.problem.cost.stage(
+            here, u.expand(-1, len(states), -1), 0
+        )
         found = torch.where(does, stages * cost[0], torch.nan).double().cpu().numpy()
         return np.broadcast_to(found, unknown.shape).copy()
 
@@ -134,8 +136,12 @@ def _slopes(model, x: Tensor, u: Tensor, i: int) -> tuple[Tensor, Tensor]:
 
 def _limits_speed(part: Constraint) -> bool:
     """Whether a constraint's rows are of states, and say more than where to be."""
-    return not part.geometric and not part.joins_knots and not part.is_goal and getattr(part, "of", "x") == "x" and (
-        part.sense == "inequality"
+    return (
+        not part.geometric
+        and not part.joins_knots
+        and not part.is_goal
+        and getattr(part, "of", "x") == "x"
+        and (part.sense == "inequality")
     )
 
 
