@@ -131,9 +131,13 @@ class Constraint(PerElement):
         """Whether violations are lengths."""
         return self.geometric
 
-    def of_both_sides(self, sizes: Tensor) -> Tensor:
-        """Sizes (B, 1, p) of rows, of the two sides of a bound the larger one."""
-        return sizes
+    def sizes(self, at_rest: Tensor, along: Tensor) -> Tensor:
+        """Sizes (B, 1, p) of rows with these values (B, K, p) at rest, and along a trajectory, by their largest value.
+
+        Of equalities at rest alone: along a trajectory they are met.
+        """
+        sizes = at_rest.abs().amax(1, keepdim=True)
+        return sizes if self.sense == "equality" else torch.maximum(sizes, along.abs().amax(1, keepdim=True))
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         """A row at a knot in words."""
