@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.numbers import Floats, Number, as_floats
+from torchgco.base.numbers import Floats, Number
 
 
 class Numbers(Mapping[str, Floats]):
