@@ -17,8 +17,8 @@ typedef struct {
     double *lam, *best; /* (E, knots, rows): multipliers, NULL where all are 0; and those of an outer loop's best */
     const int32_t *variable; /* BOUNDS: (rows) index into [x, u] */
     const double *sign; /* BOUNDS: (rows) +1 for an upper bound, -1 for a lower one */
-    /* BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES, FIELD: see
-       boxes.h, field.h. */
+    /* BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM), or (E, knots, rows * DIM) where they are `moved`;
+       FUNCTION: p (E, knots, ...); BOXES, FIELD: see boxes.h, field.h. */
     Array bound;
     Array squares; /* SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none */
     Array velocities; /* SPHERES: as centres, or NULL */
@@ -33,6 +33,7 @@ typedef struct {
     /* BODY: its balls, each with an equal share of rows and numbers, and the kind that all of them are; the function
        that places them is traced, with p as of a FUNCTION (E, knots, ...). */
     int32_t balls, kind_of_balls;
+    int32_t moved; /* SPHERES: whether centres are those of the constraint's knots */
     Array lift;
 } Constraint;
 
