@@ -72,7 +72,7 @@ class NativeKernels(Kernels):
     def scale(self, problem: Problem) -> None:
         if self.engine.cost is not None:
             slopes, H = self.expand(problem, *problem.at_rest)
-            object.__setattr__(problem, "cost_scale", problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1)))
+            problem.derived["cost_scale"] = problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1))
 
     def expand(
         self, problem: Problem, X: Tensor, U: Tensor, lagrangian: Lagrangian | None = None

@@ -70,7 +70,7 @@ def cost_unit(problem: Problem) -> Tensor:
 
 def cost_scale(problem: Problem) -> CostScale:
     """`problem.cost_scale`, computed without autodiff where compiled code can; the problem keeps it."""
-    if "cost_scale" not in vars(problem):
+    if "cost_scale" not in problem.derived:
         kernels_of(problem).scale(problem)
     return problem.cost_scale
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -152,6 +152,7 @@ class Lagrangian:
     multipliers: Multipliers
     penalty: Penalty | None
     phr: bool
+    derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # of these very parts
 
     def take(self, index: Rows) -> Lagrangian:
         """The same for the problems in `index`."""

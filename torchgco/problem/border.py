@@ -21,6 +21,7 @@ from torchgco.base.shapes import MISTAKES, check_tensor, describe
 from torchgco.base.tree import is_users
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost
 from torchgco.costs.function import FunctionCost
 from torchgco.dynamics.base import Dynamics
@@ -388,3 +389,20 @@ def _along(H: Tensor, dX: Tensor, dU: Tensor) -> Tensor:
     n = dX.shape[-1]
     by_x, by_u = H[..., :n, n], H[:, :-1, n + 1 :, n]
     return (by_x * dX).flatten(1).sum(-1) + (by_u * dU).flatten(1).sum(-1)
+
+
+def check_constraints(constraints: Any) -> None:
+    """Raise InputError unless these are constraints in a list, one `RateBounds` at most."""
+    # A generator is refused, too: this first look would use it up.
+    if not isinstance(constraints, Sequence) or isinstance(constraints, str):
+        raise InputError("constraints", "a list of Constraint", kind_of(constraints))
+    for constraint in constraints:
+        if not isinstance(constraint, Constraint):
+            raise InputError("constraints", "a list of Constraint", kind_of(constraint))
+    if (rates := sum(isinstance(constraint, RateBounds) for constraint in constraints)) > 1:
+        raise InputError("constraints", "one RateBounds at most", rates)
+
+
+def kind_of(part: object) -> str:
+    """A part's class, as errors name it."""
+    return f"the class {part.__name__}" if isinstance(part, type) else type(part).__name__

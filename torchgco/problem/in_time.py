@@ -59,10 +59,10 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
         "free_start": pad(pad(free, (0, 1), value=True), (0, x0.shape[1] - problem.n - 1)),
         "time": None,
     }
-    whole = problem._with(parts, known=problem.known.of_lifted(f"{FREE_TIME_FORM} {time.segments}"))
+    known = problem.known.of_lifted(f"{FREE_TIME_FORM} {time.segments}")
     rows = [c.in_free_time(problem.n, problem.m, time.count - 1) for c in rows_of_one_knot(problem, problem.n + 1)]
-    object.__setattr__(whole, "constraints", (*rows, *_bounds(whole, time, problem.n)))
-    return whole
+    bounds = _bounds(problem._with(parts, known), time, problem.n)
+    return problem._with(parts | {"constraints": (*rows, *bounds)}, known)
 
 
 def states_in_time(problem: Problem, X: Tensor, U: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
