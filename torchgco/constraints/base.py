@@ -223,8 +223,8 @@ class Distance(Constraint):
 
     def clearances(self, X: Tensor) -> tuple[Tensor, Tensor]:
         """The smallest of these (B,) to where bodies touch: at the states, and there and between; infinite without."""
-        at, between = (least(part + self.contact_depths.unsqueeze(1)) for part in self.measured(X))
-        return at, torch.minimum(at, between)
+        at_knots, between = (least(gap + self.contact_depths.unsqueeze(1)) for gap in self.measured(X))
+        return at_knots, torch.minimum(at_knots, between)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """Smallest distance (B,) of the straight lines between knots from where bodies touch, m; negative in contact.
@@ -310,8 +310,8 @@ class CountedRows(WrappedConstraint):
 
     def at(self, x: Tensor, k: int) -> Tensor:
         rows, knots = self.constraint.at(x, k), self.knots
-        place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
-        return torch.where(self.counts[:, place, None, None] > 0, rows, NO_ROW)
+        index = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
+        return torch.where(self.counts[:, index, None, None] > 0, rows, NO_ROW)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)

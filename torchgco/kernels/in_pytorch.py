@@ -112,8 +112,8 @@ class Kernels:
 def clearance_of(parts: list[Any], X: Tensor, share: float | None, least: Tensor | None = None) -> Tensor:
     """Smallest distance (B,) from the lines between knots to those of the parts that keep a distance; or `least`."""
     least = X.new_full(X.shape[:1], torch.inf) if least is None else least
-    for part in parts:
-        if isinstance(part, Distance):
-            away = part.chord_clearance(X) if share is None else part.chord_clearance(X, share)
+    for row in parts:
+        if isinstance(row, Distance):
+            away = row.chord_clearance(X) if share is None else row.chord_clearance(X, share)
             least = torch.minimum(least, away)
     return least

@@ -25,6 +25,7 @@ from torchgco.search.proposals import PathProposals
 from torchgco.search.reach import Horizon, horizon_of
 from torchgco.search.rows import Tighten
 from torchgco.search.search import Late, Search
+from torchgco.search.settled import settle
 from torchgco.search.starts import Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.suitability import suited_paths
@@ -172,15 +173,22 @@ class Restarts(Solver):
         return search.best.end
 
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
-        """All passes, until the time is over."""
+        """All passes, until the time is over; and in the last, what was sound before it is looked at again."""
+        begun: tuple[int, str] | None = None
         for number, (name, one) in enumerate(zip(self.passes.names, passes, strict=True), start=1):
             if search.begun and search.call.late:
-                return
-            search.next_pass(number, name)
+                break
+            if begun is not None:
+                search.end_pass(*begun)
+            begun = number, name
+            search.next_pass(*begun)
             with suppress(Late):
                 if one is not None:
                     one.run(search)
-            search.end_pass(number, name)
+        if self._finishes:
+            settle(search, next((one for one in self.passes.steps if isinstance(one, ClearChords)), None))
+        if begun is not None:
+            search.end_pass(*begun)
 
     def _suited(self, problem: Problem) -> tuple[Sequence[Row | None], Guidance | None]:
         """The passes, None for those that can't serve these problems, and the guidance, None where it can't.

@@ -81,15 +81,15 @@ class Traced:
             if not operation.outputs and not followers.isdisjoint(operation.inputs):
                 what = f"one that fails for some values of its arguments: {operation.title}"
                 raise InputError(field, "a function that can be traced", what)
-        self._symbolic = [one for one in operations if followers.issuperset(one.outputs)]
-        self._plain = [one for one in operations if not followers.issuperset(one.outputs)]
+        self._symbolic = [op for op in operations if followers.issuperset(op.outputs)]
+        self._plain = [op for op in operations if not followers.issuperset(op.outputs)]
         for operation in self._symbolic:
             if name_of(operation.function) not in OPERATIONS:
                 raise _unknown(field, operation)
         # Where PyTorch's part ends and CasADi's begins.
-        border = dict.fromkeys(slot for one in self._symbolic for slot in one.inputs) | {self._result: None}
+        border = dict.fromkeys(slot for op in self._symbolic for slot in op.inputs) | {self._result: None}
         border = [slot for slot in border if slot not in followers]
-        places = {id(tensor): place for place, tensor in enumerate(own)}
+        places = {id(tensor): i for i, tensor in enumerate(own)}
         self._named = {slot: places[id(tensor)] for slot, tensor in self._captured.items() if id(tensor) in places}
         self._of_one_row, named = [_one_row(tensor) for tensor in own], list(self._named)
         varying = _followers(self._plain, [self._index, *named])
@@ -112,7 +112,7 @@ class Traced:
         outside = _followers(self._plain, outer)
         self._fixed = {slot: computed[slot].detach().clone() for slot in others if slot in outside}
         # What Python code has read is part of the trace, too; of problems' own numbers it has read a first problem's.
-        every = [one for one in recording.operations if one.outputs and not followers.issuperset(one.outputs)]
+        every = [op for op in recording.operations if op.outputs and not followers.issuperset(op.outputs)]
         of_problems = _followers(every, [self._index, *named])
         self.reads_own = not of_problems.isdisjoint(recording.read)
         self._fixed |= self._replayed(every, [slot for slot in recording.read if slot not in of_problems])
@@ -125,9 +125,9 @@ class Traced:
         self.pattern = _pattern(self._numbers, np.repeat([slot in learned for slot in self._shared], sizes))
         if (alike := _earlier(field, self.pattern.shape)) is not None:
             self.pattern = np.where(np.isnan(alike.pattern), np.nan, self.pattern)
-        indices = {slot for one in self._symbolic if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
+        indices = {slot for op in self._symbolic if name_of(op.function) in INDEXING for slot in op.inputs[1:]}
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
-        self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
+        self._indexed = {slot for op in self._plain if self._index in op.inputs for slot in op.inputs}
         self._shapes = [tuple(example.shape) for example in examples]
 
     def _replayed(self, operations: list[Operation], wanted: Sequence[Slot]) -> dict[Slot, Tensor]:
@@ -205,38 +205,38 @@ class Traced:
         These are the ones at the places `named`, in turn. None where a number is computed, or chosen by others.
         """
         operations = _needed(self._plain, *self._own)
-        at = {slot for one in operations if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
-        chosen = at & (_followers(operations, [self._index, *self._named]) - {self._index})
+        indices = {slot for op in operations if name_of(op.function) in INDEXING for slot in op.inputs[1:]}
+        chosen = indices & (_followers(operations, [self._index, *self._named]) - {self._index})
         if not _followers(operations, self._named).issuperset(self._own):
             return None
-        if chosen or not self._named or any(name_of(one.function) not in PICKING for one in operations):
+        if chosen or not self._named or any(name_of(op.function) not in PICKING for op in operations):
             return None
-        others = self._captured.keys() & {slot for one in operations for slot in one.inputs} - self._named.keys()
-        own = {slot: self._captured[slot] for slot in self._named}
-        rows = {slot: PROBED if slot in self._indexed else 1 for slot in own}
-        odd = any(part.dim() == 0 or (len(part) > 1 and rows[slot] == 1) for slot, part in own.items())
+        others = self._captured.keys() & {slot for op in operations for slot in op.inputs} - self._named.keys()
+        tensors = {slot: self._captured[slot] for slot in self._named}
+        rows = {slot: PROBED if slot in self._indexed else 1 for slot in tensors}
+        odd = any(tensor.dim() == 0 or (len(tensor) > 1 and rows[slot] == 1) for slot, tensor in tensors.items())
         if odd or any(slot.dtype.is_floating_point for slot in others):
             return None
-        sizes = {slot: math.prod(part.shape[1:]) for slot, part in own.items()}
+        sizes = {slot: math.prod(tensor.shape[1:]) for slot, tensor in tensors.items()}
         known: dict[Slot, Any] = {slot: self._captured[slot] for slot in others}
         total, first, row_of = sum(sizes.values()), 0, list[int]()  # row_of: 1 for numbers of a problem's own row
-        for slot, part in own.items():
+        for slot, tensor in tensors.items():
             places = torch.arange(first, first + sizes[slot], dtype=torch.float64)
             numbers = total * torch.arange(rows[slot]).unsqueeze(-1) + places
-            known[slot] = numbers.reshape(rows[slot], *part.shape[1:]).to(part.device)
+            known[slot] = numbers.reshape(rows[slot], *tensor.shape[1:]).to(tensor.device)
             row_of, first = row_of + [int(rows[slot] > 1)] * sizes[slot], first + sizes[slot]
         try:
-            found = torch.stack([self._picked(operations, known, i) for i in range(PROBED)])
+            picked = torch.stack([self._picked(operations, known, i) for i in range(PROBED)])
         except (RuntimeError, IndexError):  # other shapes than these
             return None
-        if not bool((found[0] < total).all()):
+        if not bool((picked[0] < total).all()):
             return None
-        moved = total * torch.tensor(row_of)[found[0]]
-        return found[0] if torch.equal(found, found[0] + torch.arange(PROBED).unsqueeze(-1) * moved) else None
+        moved = total * torch.tensor(row_of)[picked[0]]
+        return picked[0] if torch.equal(picked, picked[0] + torch.arange(PROBED).unsqueeze(-1) * moved) else None
 
     def _picked(self, operations: list[Operation], known: dict[Slot, Any], i: int) -> Tensor:
-        some = next(iter(known.values()))
-        known = {**known, self._index: torch.full((1,), i, dtype=torch.int64, device=some.device)}
+        first = next(iter(known.values()))
+        known = {**known, self._index: torch.full((1,), i, dtype=torch.int64, device=first.device)}
         replay_all(operations, known)
         return torch.cat([known[slot].flatten().long().cpu() for slot in self._own])
 
@@ -253,8 +253,8 @@ class Traced:
         if len(own) != len(self._of_one_row):
             return None
         tensors, indexed = [], {self._named[slot] for slot in self._indexed if slot in self._named}
-        for place, (tensor, was_row) in enumerate(zip(own, self._of_one_row, strict=True)):
-            if was_row and not _one_row(tensor) and place not in indexed:
+        for i, (tensor, was_row) in enumerate(zip(own, self._of_one_row, strict=True)):
+            if was_row and not _one_row(tensor) and i not in indexed:
                 return None
             # The row of a single problem stands for all of its repetitions.
             is_spread = _one_row(tensor) and not was_row
@@ -262,7 +262,7 @@ class Traced:
         _ = self.picks  # once for all copies
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
-        copy._captured = self._captured | {slot: tensors[place] for slot, place in self._named.items()}
+        copy._captured = self._captured | {slot: tensors[i] for slot, i in self._named.items()}
         return copy
 
     def forget_values(self) -> None:
@@ -285,7 +285,7 @@ class Traced:
     def kin(self) -> str:
         """A text that functions share which differ in numbers alone, and few others."""
         shapes = self._shapes, self._own_shapes, [*self._shared_shapes.values(), *self._nets.shapes.values()]
-        return f"{shapes} {' '.join(name_of(one.function) for one in self._symbolic)}"
+        return f"{shapes} {' '.join(name_of(op.function) for op in self._symbolic)}"
 
     def __call__(
         self,
@@ -315,10 +315,10 @@ class Traced:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
         if calls is None:
             known |= self._weights
-        for part, operation in self._nets.steps(self._symbolic, calls is not None):
+        for net, operation in self._nets.steps(self._symbolic, calls is not None):
             try:
-                if part is not None and calls is not None:
-                    self._nets.call(part, known, len(self.pattern), self._precision, calls)
+                if net is not None and calls is not None:
+                    self._nets.call(net, known, len(self.pattern), self._precision, calls)
                 else:
                     replay(operation, known, self._precision)
             except NoCounterpart as error:
@@ -354,10 +354,10 @@ _EARLIER: ContextVar[list[Traced]] = ContextVar("earlier")
 def _earlier(field: str, shape: tuple[int, ...]) -> Traced | None:
     """The first of the earlier traces that is of this function, each once."""
     left = _EARLIER.get([])
-    found = next((one for one in left if one.field == field and one.pattern.shape == shape), None)
-    if found is not None:
-        left.remove(found)
-    return found
+    trace = next((trace for trace in left if trace.field == field and trace.pattern.shape == shape), None)
+    if trace is not None:
+        left.remove(trace)
+    return trace
 
 
 def _one_row(value: Tensor) -> bool:
@@ -366,14 +366,14 @@ def _one_row(value: Tensor) -> bool:
 
 def own_tensors(part: PerElement) -> list[Tensor]:
     """The tensors of a part of a problem, and of parts within it, that may differ from problem to problem."""
-    found: list[Tensor] = []
+    tensors: list[Tensor] = []
     for value in (getattr(part, name) for name in (*part.batched, *part.per_element)):
         for leaf in value if isinstance(value, tuple) else (value,):
             if isinstance(leaf, PerElement):
-                found += own_tensors(leaf)
+                tensors += own_tensors(leaf)
             elif isinstance(leaf, Tensor):
-                found.append(leaf)
-    return found
+                tensors.append(leaf)
+    return tensors
 
 
 def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
@@ -384,12 +384,12 @@ def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
     return pattern
 
 
-def _is_same(one: Tensor, other: Tensor) -> bool:
+def _is_same(a: Tensor, b: Tensor) -> bool:
     """Whether two tensors have the same shape and numbers, be they NaN."""
-    if torch.equal(one, other):
+    if torch.equal(a, b):
         return True
-    known = torch.where(one == other, one, torch.nan) if one.shape == other.shape and one.is_floating_point() else None
-    return known is not None and torch.equal(known.isnan(), one.isnan()) and torch.equal(one.isnan(), other.isnan())
+    known = torch.where(a == b, a, torch.nan) if a.shape == b.shape and a.is_floating_point() else None
+    return known is not None and torch.equal(known.isnan(), a.isnan()) and torch.equal(a.isnan(), b.isnan())
 
 
 def _flat(values: Sequence[Tensor]) -> Tensor:
@@ -419,11 +419,11 @@ def _followers(operations: Iterable[Operation], sources: Iterable[Slot]) -> set[
 
 def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict[Slot, np.ndarray]:
     """One array per slot, cut from `numbers` in turn."""
-    arrays, place = {}, 0
+    arrays, start = {}, 0
     for slot, shape in shapes.items():
         size = int(np.prod(shape))
-        arrays[slot] = numbers[place : place + size].reshape(shape)
-        place += size
+        arrays[slot] = numbers[start : start + size].reshape(shape)
+        start += size
     return arrays
 
 

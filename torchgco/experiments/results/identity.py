@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Self
@@ -87,7 +88,7 @@ class Manifest:
     solvers: dict[str, Any]
     layouts: dict[int, str]
 
-    @property
+    @cached_property
     def settings(self) -> dict[str, str]:
         """Digest of each solver's settings, by its name."""
         return {name: digest(settings) for name, settings in self.solvers.items()}
