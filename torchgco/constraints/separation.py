@@ -62,7 +62,13 @@ class Separation(Distance):
             raise InputError("separation.min_distance", "finite numbers above 0 m", distance.tolist())
         knots = resolve_knots(self.knots, dims.N, "separation.knots", distance.device)
         states, pairs = states.to(distance.device), pairs.to(distance.device)
-        return replace(self, positions=states, pairs=pairs, min_distance=distance if of_pairs else distance.reshape(-1), knots=knots)
+        return replace(
+            self,
+            positions=states,
+            pairs=pairs,
+            min_distance=distance if of_pairs else distance.reshape(-1),
+            knots=knots,
+        )
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self.kept.square() - self.away(X[:, self.knots]).square().sum(-1)
@@ -82,7 +88,9 @@ class Separation(Distance):
         H[:, self.knots] += add
 
     def grown(self, by: Tensor) -> Self:
-        return replace(self, min_distance=self.min_distance + (by if self.min_distance.dim() == 1 else by.unsqueeze(-1)))
+        return replace(
+            self, min_distance=self.min_distance + (by if self.min_distance.dim() == 1 else by.unsqueeze(-1))
+        )
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where bodies touch at the start, (B,)."""

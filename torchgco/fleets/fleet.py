@@ -170,8 +170,8 @@ def _check_starts(fleet: Fleet) -> None:
     close = (gap < CONTACT_FACTOR * fleet.distances).nonzero()
     if len(close):
         b, i, j = close[0].tolist()
-        wanted = f"starts {float(fleet.distances[i, j]):g} m apart"
-        raise InputError("fleet.vehicles", wanted, f"vehicles {i} and {j} of fleet {b}, {float(gap[b, i, j]):.3g} m apart")
+        got = f"vehicles {i} and {j} of fleet {b}, {float(gap[b, i, j]):.3g} m apart"
+        raise InputError("fleet.vehicles", f"starts {float(fleet.distances[i, j]):g} m apart", got)
 
 
 def _forms(members: tuple[Problem, ...]) -> tuple[tuple[Problem, tuple[int, ...]], ...]:

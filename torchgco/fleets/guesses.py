@@ -43,8 +43,8 @@ def widths(fleet: Fleet, conflicts: Tensor) -> Tensor:
 
 def late(X: Tensor, U: Tensor, stages: int) -> tuple[Tensor, Tensor]:
     """Trajectories X (B, N+1, n), U (B, N, m) that begin some stages later, and end where they are then."""
-    first = X[:, :1].expand(-1, stages, -1), U[:, :1].expand(-1, stages, -1)
-    return torch.cat((first[0], X[:, : X.shape[1] - stages]), dim=1), torch.cat((first[1], U[:, : U.shape[1] - stages]), dim=1)
+    held = (torch.cat((z[:, :1].expand(-1, stages, -1), z[:, : z.shape[1] - stages]), dim=1) for z in (X, U))
+    return next(held), next(held)
 
 
 def in_conflict(fleet: Fleet, plans: Plans) -> Tensor:

@@ -1,7 +1,7 @@
 """All vehicles of a fleet as one problem, in whose state their states follow each other.
 
-Pairs keep their distance at the knots and halfway between them: two discs that meet at 5 m/s come half a metre nearer in
-a stage of 0.1 s.
+Pairs keep their distance at the knots and halfway between them: two discs that meet at 5 m/s come half a metre nearer
+in a stage of 0.1 s.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class JointCost(Cost):
         return any(part.reads_knots for part in self.parts)
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        states, controls = (z.split(list(size), -1) for z, size in zip((x, u), zip(*self.sizes, strict=True), strict=True))
+        states, controls = x.split([n for n, _ in self.sizes], -1), u.split([m for _, m in self.sizes], -1)
         return sum_of([part.stage(a, b, k) for part, a, b in zip(self.parts, states, controls, strict=True)])
 
     def terminal(self, x: Tensor) -> Tensor:
@@ -170,8 +170,12 @@ class Halfway(Constraint):
         return self.separation.away(later)
 
 
-def joint_problem(fleet: Fleet) -> Problem | None:
-    """B problems, one per fleet; None where vehicles have costs or rows that are theirs alone to compute."""
+def joint_problem(fleet: Fleet, halfway: bool) -> Problem | None:
+    """B problems, one per fleet; None where vehicles have costs, rows or maps that are theirs alone to compute.
+
+    Args:
+        halfway: whether there are rows halfway between the knots, too, where the models allow.
+    """
     members = fleet.members
     if any(type(one.cost).total is not Cost.total for one in members):
         return None
@@ -186,13 +190,14 @@ def joint_problem(fleet: Fleet) -> Problem | None:
     for one, begin, size in zip(members, first, sizes, strict=True):
         rows += [VehicleRows(part, begin, size) for part in one.constraints if not isinstance(part, Bounds)]
     pairs = fleet.distances.triu().nonzero().tolist()
-    places = [[i + k for k in range(one.position.start, one.position.stop)] for (i, _), one in zip(first, members, strict=True)]
+    at = [(i, one.position) for (i, _), one in zip(first, members, strict=True)]
+    places = [[i + k for k in range(where.start, where.stop)] for i, where in at]
     keep = fleet.distances[tuple(zip(*pairs, strict=True))].unsqueeze(0)
     problem = Problem(
         model, JointCost(tuple(one.cost for one in members), tuple(sizes)),
         [*rows, Separation(places, keep, pairs)], torch.cat([one.x0 for one in members], dim=-1), fleet.N,
     )  # fmt: skip
-    if not model.stretches:
+    if not (halfway and model.stretches):
         return problem
     *_, apart = problem.constraints
     assert isinstance(apart, Separation)

@@ -24,7 +24,9 @@ def merged(one: Problem, other: Problem) -> Problem | None:
     if one.N != other.N or one.x0.dtype != other.x0.dtype:
         return None
     try:
-        parts = {name: _rows(getattr(one, name), getattr(other, name), one.B, other.B) for name in PARTS}
+        parts: dict[str, Any] = {
+            name: _rows(getattr(one, name), getattr(other, name), one.B, other.B) for name in PARTS
+        }
     except _Unlike:
         return None
     return one._with(parts | {"x0": torch.cat((one.x0, other.x0))})

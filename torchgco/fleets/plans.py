@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -66,8 +66,3 @@ class Plans:
             X, U, self.K[v], torch.zeros_like(U), Multipliers.zero(one, 1.0), one.cost.total(X, U), violation, status,
             self.iterations[:, v], none, none,
         )  # fmt: skip
-
-
-def stacked(fleet: Fleet, parts: Sequence[Tensor], whose: Sequence[int]) -> Tensor:
-    """Tensors (B, ...) of some vehicles after each other, as a form of the fleet has its problems."""
-    return torch.cat([parts[v] for v in whose])

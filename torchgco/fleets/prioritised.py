@@ -1,7 +1,7 @@
 """Prioritised planning: one vehicle after the other, each among the planned motions of those before it.
 
-M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987). Vehicles that find no plan move to the
-front, and their fleet begins again.
+M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987). Vehicles that find no plan move to
+the front, and their fleet begins again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchgco.constraints.base import ADMITTED
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, bent, in_conflict, late, widths
 from torchgco.fleets.plans import Plans, Solve
-from torchgco.fleets.verdict import states_goal
+from torchgco.fleets.verdict import leaves_chords, states_goal
 from torchgco.judging.judge import judge
 from torchgco.obstacles.moved import Moved
 from torchgco.problem.known import Known
@@ -53,17 +53,17 @@ class Among:
 class Prioritised:
     """Planning of all fleets of a batch side by side; their vehicles have turns of their own."""
 
-    def __init__(self, fleet: Fleet, alone: Plans, solve: Solve, seed: int, ids: Tensor, **options: Any) -> None:
+    def __init__(self, fleet: Fleet, alone: Plans, solve: Solve, seed: int, ids: Tensor, solver: Any) -> None:
         B, V = fleet.B, fleet.V
         self.fleet, self.alone, self.ids = fleet, alone, ids
-        self.solve = partial(solve, verbose=False)
-        self.search = partial(solve, verbose=False, seed=seed, **options)
+        self.solve, self.search = solve, partial(solve, seed=seed, solver=solver)
         self.forms = [Among(problem, Known()) for problem, _ in fleet.forms]
         self.form_of = {v: (i, at) for i, (_, whose) in enumerate(fleet.forms) for at, v in enumerate(whose)}
         self.order = [np.random.default_rng((seed, int(i))).permutation(V).tolist() for i in ids]
         self.at, self.restarts = [0] * B, [0] * B
         self.plans = alone.take(torch.arange(B))
         self.known = torch.zeros(B, V, dtype=torch.bool)
+        self.off = alone.X[0].new_zeros(B, V)  # by which paths leave the chords that others know, m
         self.wide = widths(fleet, in_conflict(fleet, alone))
 
     def run(self) -> Plans:
@@ -82,6 +82,8 @@ class Prioritised:
         for b, v, ok in zip(fleets.tolist(), vehicles.tolist(), found.tolist(), strict=True):
             if ok or self.restarts[b] >= RESTARTS:
                 self.known[b, v], self.at[b] = True, self.at[b] + 1
+                row, one = torch.tensor([b]), self.fleet.members[v]
+                self.off[b, v] = leaves_chords(one.take(row), self.plans.X[v][row], self.plans.U[v][row])[0]
                 continue
             self.restarts[b] += 1
             self.order[b].remove(v)
@@ -95,6 +97,7 @@ class Prioritised:
         radii = self.fleet.distances[vehicles]
         there = self.known[fleets] & (radii > 0)
         there[torch.arange(len(fleets)), vehicles] = False
+        radii = radii + self.off[fleets]
         p, radii = torch.where(there[:, None, :, None], p, torch.nan), torch.where(there, radii, torch.nan)
         among = self.forms[form]
         found = self._near(among, rows, p, radii, fleets, vehicles)
@@ -109,9 +112,7 @@ class Prioritised:
             found[left] = fine
         return found
 
-    def _near(
-        self, among: Among, rows: Tensor, p: Tensor, radii: Tensor, fleets: Tensor, vehicles: Tensor
-    ) -> Tensor:
+    def _near(self, among: Among, rows: Tensor, p: Tensor, radii: Tensor, fleets: Tensor, vehicles: Tensor) -> Tensor:
         """The cheapest plans from guesses near those alone; which of the vehicles have one."""
         pairs = list(zip(fleets.tolist(), vehicles.tolist(), strict=True))
         X, U = (torch.stack([part[v][b] for b, v in pairs]) for part in (self.alone.X, self.alone.U))

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgco.base import clock
 from torchgco.base.tree import put, take
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.guesses import in_conflict
+from torchgco.fleets.guesses import SIDES
 from torchgco.fleets.plans import Plans, Solve
 from torchgco.fleets.prioritised import Prioritised
 from torchgco.fleets.solution import FleetSolution
@@ -52,35 +53,50 @@ def _rank(verdict: FleetVerdict, rows: Tensor | None = None) -> list[Tensor]:
     return [(~verdict.reached[at]).to(cost.dtype), miss.nan_to_num(torch.inf)[at], cost[at]]
 
 
-def solve_fleet(fleet: Fleet, solve: Solve, seed: int, ids: Tensor | None, **options: Any) -> FleetSolution:
-    """The best plans found for every fleet of the batch."""
+def solve_fleet(
+    fleet: Fleet, solve: Solve, seed: int, ids: Tensor | None, solver: Any, ends: float | None = None
+) -> FleetSolution:
+    """The best plans found for every fleet of the batch.
+
+    Args:
+        solve: `torchgco.solve`.
+        ids: (B,), of the random draws; None: 0..B-1.
+        solver: of vehicles alone, and among others where guesses don't do.
+        ends: the time of the clock after which nothing more is begun, s.
+    """
     ids = torch.arange(fleet.B) if ids is None else ids
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        best = _Best(fleet, alone(fleet, solve, seed, ids, **options))
-        first = best.plans.take(torch.arange(fleet.B))
+        first = alone(fleet, solve, seed, ids, solver)
+        best = _Best(fleet, first.take(torch.arange(fleet.B)))
+        is_small = fleet.states <= MOST_STATES
+        for side in SIDES if is_small else ():
+            rows = best.open
+            if len(rows) and not _late(ends):
+                some, plans = fleet.take(rows.tolist()), first.take(rows)
+                for found in around(some, plans, side, solve):
+                    best.offer(rows, found)
         rows = best.open
-        if len(rows) and fleet.states <= MOST_STATES:
-            some, plans = fleet.take(rows.tolist()), first.take(rows)
-            for found in around(some, plans, in_conflict(some, plans), solve):
-                best.offer(rows, found)
-        rows = best.open
-        if len(rows):
+        if len(rows) and not _late(ends):
             some = fleet.take(rows.tolist())
-            found = Prioritised(some, first.take(rows), solve, seed, ids[rows], **options).run()
+            found = Prioritised(some, first.take(rows), solve, seed, ids[rows], solver).run()
             best.offer(rows, found)
-            if fleet.states <= MOST_STATES:
-                for polished in together(some, [found.X], [found.U], found, solve):
+            if is_small and not _late(ends):
+                for polished in together(some, found.X, found.U, found, solve):
                     best.offer(rows, polished)
     return FleetSolution(fleet, best.plans.solutions(fleet), best.verdict)
 
 
-def alone(fleet: Fleet, solve: Solve, seed: int, ids: Tensor, **options: Any) -> Plans:
+def _late(ends: float | None) -> bool:
+    return ends is not None and clock.seconds() >= ends
+
+
+def alone(fleet: Fleet, solve: Solve, seed: int, ids: Tensor, solver: Any) -> Plans:
     """Each vehicle as if there were no other."""
     plans = Plans.at_rest(fleet)
     for problem, whose in fleet.forms:
         own = torch.cat([ids * fleet.V + v for v in whose])
-        found = solve(problem, seed=seed, ids=own, verbose=False, **options)
+        found = solve(problem, seed=seed, ids=own, solver=solver)
         for place, v in enumerate(whose):
             rows = torch.arange(fleet.B)
             plans.set(v, rows, found, place * fleet.B + rows)

@@ -71,7 +71,7 @@ def states_goal(one: Problem) -> bool:
 
 
 def makespan(fleet: Fleet, X: Sequence[Tensor]) -> Tensor:
-    """When the last vehicle comes to stay within its goal's radius, (B,), s; NaN where one doesn't, or none is given."""
+    """When the last vehicle comes to stay within its goal's radius, (B,), s; NaN where one doesn't, or states none."""
     last = X[0].new_zeros(fleet.B)
     for one, x in zip(fleet.members, X, strict=True):
         if not states_goal(one):
@@ -96,8 +96,7 @@ def rollout(one: Problem, U: Tensor) -> Tensor:
 def _least(fleet: Fleet, X: Sequence[Tensor], U: Sequence[Tensor]) -> Tensor:
     """Smallest distances (B, V, V), along chords that paths leave by no more than 1e-3 m."""
     p = fleet.places(X)
-    middle = _places_within(fleet, fleet.members, X, U, 2)
-    off = (middle - 0.5 * (p[:, :, :-1] + p[:, :, 1:])).norm(dim=-1).flatten(1).amax(-1)
+    off = torch.stack([leaves_chords(*part) for part in zip(fleet.members, X, U, strict=True)]).amax(0)
     pieces = (off / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, PIECES_AT_MOST).long()
     found = p.new_empty(fleet.B, fleet.V, fleet.V)
     for count in pieces.unique().tolist():
@@ -110,6 +109,12 @@ def _least(fleet: Fleet, X: Sequence[Tensor], U: Sequence[Tensor]) -> Tensor:
             fine = torch.cat((ahead, fine[:, :, -1:]), dim=2)
         found[rows] = _gaps(fine, fine)
     return found
+
+
+def leaves_chords(one: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """By how much the positions of a vehicle leave their chords halfway between knots, (B,), m."""
+    p, middle = X[..., one.position], _within(one, X, U, 2)[..., one.position]
+    return (middle - 0.5 * (p[:, :-1] + p[:, 1:])).norm(dim=-1).amax(-1)
 
 
 def _places_within(
