@@ -104,6 +104,7 @@ class VehicleRows(WrappedConstraint):
     batched: ClassVar[tuple[str, ...]] = ("constraint",)
     keeps_rows: ClassVar[bool] = True
     geometric = False  # type: ignore[assignment]
+    bare = property(lambda self: self)  # type: ignore[assignment]  # the joint problem has no position to measure
 
     def bind(self, dims: Dimensions) -> VehicleRows:
         return self
