@@ -73,7 +73,7 @@ def _costs(
     count, S = len(layers), len(sides)
     aside = points[layers][:, None] + sides  # (L, S, 3)
     rest = static(aside.reshape(-1, 3)).reshape(count, S)
-    behind = np.maximum(np.arange(count)[:, None] - np.arange(DELAYS), 0)  # (L, D): which place
+    behind = np.maximum(np.arange(count)[:, None] - np.arange(DELAYS), 0)  # (L, D): which layer
     nodes = aside[behind]  # (L, D, S, 3)
     times = np.repeat(dt * layers, DELAYS * S)
     gaps = moving.gaps(nodes.reshape(-1, 3), times).reshape(count, DELAYS, S)

@@ -103,7 +103,7 @@ class Rooms(Quadrotor):
         """Centres and half sides of the boxes of a room's upper wall along an axis.
 
         Args:
-            place: where its opening is, shares (2,) of the room that it has along the wall's two axes; None: closed.
+            share: where its opening is, shares (2,) of the room that it has along the wall's two axes; None: closed.
         """
         low, high = np.array(self.region).T
         size = (high - low) / self.rooms
