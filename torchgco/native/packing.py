@@ -21,7 +21,7 @@ def quadratic_arrays(cost: Any) -> list[c.Array]:
 
 def is_bounded(cost: Any) -> bool:
     """Whether no stage of a quadratic cost can be below 0, rounding included; unknown of weights that are matrices."""
-    if not cost.diagonal or any(part is not None for part in (cost.q, cost.r, cost.qf, cost.H)):
+    if not cost.diagonal or any(term is not None for term in (cost.q, cost.r, cost.qf, cost.H)):
         return False
     return all(bool((weights.numpy() >= 0).all()) for weights in (cost.Q, cost.R, cost.Qf))
 
@@ -49,11 +49,11 @@ def numbers_of(constraint: Any, numbers: Tensor | None, problem: Problem) -> dic
     if kind is Kind.FUNCTION:
         return {"bound": array(numbers, knots=True)}
     of = constraint.lowered(problem.n)
-    own = {name: array(value, knots=True) for name, value in of.by_knot.items()}
-    own |= {name: array(value, knots=False) for name, value in of.by_problem.items()} | of.plain
+    fields = {name: array(value, knots=True) for name, value in of.by_knot.items()}
+    fields |= {name: array(value, knots=False) for name, value in of.by_problem.items()} | of.plain
     if kind is Kind.BODY:
-        own |= {"lift": array(numbers, knots=True), "kind_of_balls": kind_of(constraint.balls[0])}
-    return own
+        fields |= {"lift": array(numbers, knots=True), "kind_of_balls": kind_of(constraint.balls[0])}
+    return fields
 
 
 def kind_of(constraint: Any) -> Kind:
@@ -70,7 +70,7 @@ def guide_of(guide: Penalty | None) -> dict[str, Any]:
     """The fields of a problem that hold the penalty of guidance."""
     if guide is None:
         return {}
-    own = {"center": array(guide.center, knots=True), "weight": array(guide.weight.unsqueeze(-1), knots=False)}
+    fields = {"center": array(guide.center, knots=True), "weight": array(guide.weight.unsqueeze(-1), knots=False)}
     if isinstance(guide, GuideRegion):
-        return {**own, "guide": Guide.REGION, "radius": array(guide.radius.unsqueeze(-1), knots=True)}
-    return {**own, "guide": Guide.PATH}
+        return {**fields, "guide": Guide.REGION, "radius": array(guide.radius.unsqueeze(-1), knots=True)}
+    return {**fields, "guide": Guide.PATH}
