@@ -336,7 +336,7 @@ def _held() -> Iterator[None]:
     """Ctrl-C and SIGTERM wait for the end of this block."""
     came: list[int] = []
     try:
-        with handled(lambda number, frame: came.append(number), lambda own: own not in (signal.SIG_IGN, None)):
+        with handled(lambda number, frame: came.append(number), lambda handler: handler not in (signal.SIG_IGN, None)):
             yield
     finally:
         for number in came:
@@ -363,7 +363,7 @@ def _ending_by_sigterm(started: Sequence[subprocess.Popen[str]]) -> Iterator[Non
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
-    with handled(end, lambda own: own == signal.SIG_DFL, [signal.SIGTERM]):
+    with handled(end, lambda handler: handler == signal.SIG_DFL, [signal.SIGTERM]):
         yield
 
 
