@@ -47,7 +47,7 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
         cells = [chosen[i, task] for task in flown]
         of_row = np.zeros(len(run.trials), dtype=int)
         if len(flown) > 1:
-            of_row = run.trials.groupby(TASK, sort=False, dropna=False, observed=True).ngroup()  # numbers `found`
+            of_row = run.trials.groupby(TASK, sort=False, dropna=False, observed=True).ngroup()  # numbers `flown`
         arrays = {
             key: pd.array([_cell(cell.get(key), key in cell, kinds[key]) for cell in cells], dtype=kinds[key])
             for key in columns
