@@ -71,7 +71,7 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
     Raises:
         InputError: missions with a sensor, whose search is that for a path on the map.
     """
-    found: dict[int, SearchPart] = {}
+    by_number: dict[int, SearchPart] = {}
     for name in study.manifest.solvers:
         solver, seen = study.solver(name).recording(), []
         if isinstance(solver, AugmentedLagrangian):
@@ -85,11 +85,11 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
                 record = search_of(solution, problem, b) or SearchPart()
                 guides = [g for g in seen if g.number == number]
                 if record.passes or record.rounds or guides:
-                    whole = found.setdefault(number, SearchPart())
+                    whole = by_number.setdefault(number, SearchPart())
                     whole.passes.extend(f"{name}: {text}" for text in record.passes)
                     whole.rounds.extend((f"{name}: {text}", lines) for text, lines in record.rounds)
                     whole.guides.extend((f"outer iteration {g.outer}, {name}", g.balls, g.sample) for g in guides)
-    return found
+    return by_number
 
 
 def _alike(study: Study, numbers: Sequence[int]) -> list[list[int]]:
