@@ -226,10 +226,10 @@ class Engine:
 
     def _row(self, problem: Problem, i: int) -> c.Constraint:
         """Constraint i without multipliers."""
-        part = problem.constraints[i]
-        place = part, problem.row_shapes[i], problem.N, kind_of(part)
+        constraint = problem.constraints[i]
+        described = constraint, problem.row_shapes[i], problem.N, kind_of(constraint)
         return _of_last(
-            problem, i, part, i in self.functions, lambda: constraint_of(*place, self.row_numbers(problem, i))
+            problem, i, constraint, i in self.functions, lambda: constraint_of(*described, self.row_numbers(problem, i))
         )
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:

@@ -35,11 +35,11 @@ def shared_fields(shared: Shared) -> dict[str, Any]:
 def constraint_of(constraint: Any, shape: tuple[int, int], N: int, kind: Kind, own: dict[str, Any]) -> c.Constraint:
     """A constraint with rows of a shape (K, p) without multipliers, with the fields that `numbers_of` gives."""
     knots, rows = shape
-    place = torch.full((N + 1,), NOWHERE, dtype=torch.int32)
+    slots = torch.full((N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
-        place[constraint.knots] = torch.arange(knots, dtype=torch.int32)
+        slots[constraint.knots] = torch.arange(knots, dtype=torch.int32)
     equality, geometric = constraint.sense == "equality", constraint.geometric
-    return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
+    return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=slots, **own)
 
 
 def numbers_of(constraint: Any, numbers: Tensor | None, problem: Problem) -> dict[str, Any]:

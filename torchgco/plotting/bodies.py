@@ -101,7 +101,7 @@ class Box:
     @property
     def moving(self) -> bool:
         parts = self.velocity, None if self.swing is None else self.swing[0]
-        return self.track is not None or any(part is not None and bool(part.any()) for part in parts)
+        return self.track is not None or any(array is not None and bool(array.any()) for array in parts)
 
     @property
     def corners(self) -> np.ndarray:

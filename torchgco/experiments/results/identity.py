@@ -178,8 +178,8 @@ def _shared(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[str, Any]:
         model["dynamics"] = {key: value for key, value in dict(model["dynamics"]).items() if key != "dt"}
     values: dict[str, Any] = {"model": model, "dt": layouts.dt}
     for key, field in OVERRULED.items():
-        values[key] = vehicle.get(key) if (own := getattr(layouts, field)) is None else own
-    values |= {name: own for name in (TIME, BINDS) if (own := getattr(layouts, name)) is not None}
+        values[key] = vehicle.get(key) if (value := getattr(layouts, field)) is None else value
+    values |= {name: value for name in (TIME, BINDS) if (value := getattr(layouts, name)) is not None}
     if layouts.map is not None and layouts.map.batch is None:
         values["map"] = _map_digests(layouts.map)
     return values
@@ -195,7 +195,7 @@ def _of_layout(layouts: Layouts, spheres: Sequence[str], i: int) -> dict[str, An
     if "box_radii" in boxes and not boxes["box_radii"].any():
         del boxes["box_radii"]
     values: dict[str, Any] = {**_present(layouts, spheres, i)}
-    values |= {name: part for name, part in boxes.items() if len(part)}
+    values |= {name: rows for name, rows in boxes.items() if len(rows)}
     values |= _present(layouts, GATES, i)
     values |= {name: states[i] for name in ("start", "goal") if (states := getattr(layouts, name)) is not None}
     if isinstance(layouts.stages, np.ndarray):
@@ -207,11 +207,11 @@ def _of_layout(layouts: Layouts, spheres: Sequence[str], i: int) -> dict[str, An
 
 def _present(layouts: Layouts, names: Sequence[str], i: int) -> dict[str, np.ndarray]:
     """The rows of a layout's arrays, without those of NaN, by which spheres, boxes or gates are absent."""
-    held = {name: value[i] for name in names if (value := getattr(layouts, name)) is not None}
-    if not held:
+    arrays = {name: value[i] for name in names if (value := getattr(layouts, name)) is not None}
+    if not arrays:
         return {}
-    places = held[names[0]]
-    return {name: value[~np.isnan(places).all(axis=-1)] for name, value in held.items()}
+    places = arrays[names[0]]
+    return {name: value[~np.isnan(places).all(axis=-1)] for name, value in arrays.items()}
 
 
 def _map_digests(field: DistanceField) -> dict[str, str]:

@@ -109,7 +109,7 @@ class Form:
         return self.dynamics.key, p and (p.start, p.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
 
     def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
-        model, at = self.dynamics, self.position
+        model, position = self.dynamics, self.position
         sizes = {
             "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]), "QUADRATIC_FULL": int(self.dense),
@@ -119,7 +119,7 @@ class Form:
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
             units.append(Unit(_text(vectors | sizes, generated, *library.curvature), own=True))
-        return (*units, _shared_unit(vectors, at, library))
+        return (*units, _shared_unit(vectors, position, library))
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
@@ -152,8 +152,8 @@ class CalledForm:
 
 def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
     """The C file of a unit."""
-    given = {"constants.h": constants(), "code.h": "\n".join(generated)}
-    return joined(defines(sizes) + included(*files), given=given) + HEADER.layout
+    headers = {"constants.h": constants(), "code.h": "\n".join(generated)}
+    return joined(defines(sizes) + included(*files), given=headers) + HEADER.layout
 
 
 def _shared_unit(vectors: dict[str, Any], at: slice | None, library: Library) -> Unit:
