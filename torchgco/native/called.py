@@ -99,11 +99,11 @@ class CalledInterior(InteriorKernels):
         return [self._row(problem, i) for i in range(len(problem.constraints))]
 
     def _row(self, problem: Problem, i: int) -> structures.Constraint:
-        (K, p), S, part = problem.row_shapes[i], problem.n + problem.m, problem.constraints[i]
+        (K, p), S, part = problem.row_shapes[i], problem.n + problem.m, moved(problem.constraints[i], CPU)
         if kind_of(part) in IN_C:
-            return constraint_of(problem, i, numbers_of(moved(part, CPU), None, problem))
+            return constraint_of(part, (K, p), problem.N, kind_of(part), numbers_of(part, None, problem))
         own = {"bound": _numbers(K, p + p * S + S * S), "shared": torch.tensor([float(p)], dtype=DOUBLE)}
-        return constraint_of(problem, i, own, Kind.FUNCTION)
+        return constraint_of(part, (K, p), problem.N, Kind.FUNCTION, own)
 
     def _with(self, problem: Problem, **values: Any) -> structures.Problem:
         n, S, N = problem.n, problem.n + problem.m, problem.N
