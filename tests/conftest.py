@@ -60,11 +60,12 @@ def _composed(overrides: Sequence[str], searchpath: Sequence[str] = (), slow: An
 
 build.compose_config = _composed
 checks._read = cache(checks._read)
-# Without a C compiler PyTorch's kernels solve, many times slower: these folders and files, whose tests are of native
-# kernels or of many solves, are skipped then.
+# Without a C compiler PyTorch's kernels solve, many times slower, and no interior point does: these folders and files,
+# whose tests are of native kernels, of the interior point or of many solves, are skipped then.
 COMPILED = (
     "native", "compiled", "search", "missions", "exploration", "benchmarks", "experiments", "notebooks", "golden",
     "fuzz", "solvers", "view", "cluster", "test_horizons.py", "test_scale.py", "test_presets.py", "roadmap",
+    "sensitivity", "test_required_goal.py",
 )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from tests.other_device import OTHER, SecondDevice
 from tests.slow import mostly
 from torchgco import (
@@ -140,6 +141,7 @@ def test_the_longest_step_is_found() -> None:
     on_both(work, "states")
 
 
+@compiled
 @pytest.mark.parametrize("kind", ["states", pytest.param("map", marks=pytest.mark.slow), *SLOW])
 def test_the_interior_point_solves(kind: str) -> None:
     """Another device has the same iterates; a part of the start is free, and a bound has no room."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.engines import compiled
 from torchgco import (
     Boxes,
     Constraint,
@@ -206,6 +207,7 @@ def test_an_inherited_method_that_does_not_know_a_class_own_one_is_refused(field
     assert told.value.field == field.strip()
 
 
+@compiled
 def test_a_class_with_all_of_its_own_methods_is_solved() -> None:
     found, due = (
         torchgco.solve(p, solver="interior_point")
@@ -303,6 +305,7 @@ def test_what_a_class_leaves_out_is_named(field: str) -> None:
     assert told.value.field == field
 
 
+@compiled
 @pytest.mark.parametrize("solver", ["al_ilqr", "ilqr", "interior_point", "gco"])
 def test_rows_without_derivatives_of_their_own_are_differentiated(solver: str) -> None:
     rows = FunctionConstraint(lambda x, u: (x[..., :2] * u).sum(-1, keepdim=True) - 0.2, of="xu")
