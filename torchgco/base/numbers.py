@@ -96,8 +96,11 @@ def as_floats(value: Any, name: str) -> Floats:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
-        return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float64)
-    except (TypeError, ValueError):
+        given = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+        if given.dtype.kind not in "biufO":  # NumPy would drop imaginary parts, and read text and dates
+            raise TypeError
+        return given.astype(np.float64)
+    except (TypeError, ValueError, NotImplementedError):
         raise InputError(name, "numbers", type(value).__name__) from None
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Floats, Number
 
 
@@ -43,8 +43,10 @@ class Numbers(Mapping[str, Floats]):
         """Values by full names, from mappings by any names.
 
         Raises:
-            InputError: a name that isn't there, or a number that is given twice, by whichever names.
+            InputError: no mapping, a name that isn't there, or a number that is given twice, by whichever names.
         """
+        if wrong := [part for part in given if not isinstance(part, Mapping | None)]:
+            raise InputError("numbers", "a dict of numbers by name", shown(wrong[0]))
         found, names = dict[str, Any](), dict[str, str]()
         for name, value in ((name, value) for part in given for name, value in (part or {}).items()):
             full = self.find(name).name

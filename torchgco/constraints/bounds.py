@@ -83,11 +83,15 @@ class _Bounds(Constraint):
             return expected, float(free[np.isfinite(free)][0])
         return None
 
-    def of_both_sides(self, sizes: Tensor) -> Tensor:
-        every = torch.arange(self.upper.shape[-1], device=sizes.device)
-        place = torch.cat((every[self.above], every[self.below])).expand_as(sizes)
-        either = sizes.new_zeros(*sizes.shape[:2], len(every)).scatter_reduce(2, place, sizes, "amax")
-        return either.gather(2, place)
+    def sizes(self, at_rest: Tensor, along: Tensor) -> Tensor:
+        """Of both sides the larger one at rest, and along a trajectory their distance: none where they are equal."""
+        every = torch.arange(self.upper.shape[-1], device=along.device)
+        place = torch.cat((every[self.above], every[self.below])).expand_as(along)
+        none = along.new_zeros(*along.shape[:2], len(every))
+        rest = none.scatter_reduce(2, place, at_rest.abs().expand_as(along), "amax")
+        return (
+            torch.maximum(rest, none.scatter_add(2, place, along).abs()).amax(1, keepdim=True).gather(2, place[:, :1])
+        )
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         places = torch.arange(self.lower.shape[-1])

@@ -181,6 +181,20 @@ def add_blocks(
         H[..., :n, n + 1 :] += lux.mT
 
 
+def add_slopes(H: Tensor, knots: Any, n: int, g: Tensor, h: Tensor, cx: Tensor | None, cu: Tensor | None) -> None:
+    """Add g' dc and dc' h dc (g, h (B, K, p)) of rows with slopes cx (B, K, p, n), cu (B, K, p, m), or none, to H."""
+    add = H.new_zeros(*g.shape[:2], *H.shape[2:])
+
+    def gradient(c: Tensor | None) -> Tensor | None:
+        return None if c is None else (g.unsqueeze(-2) @ c).squeeze(-2)
+
+    def product(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+        return None if a is None or b is None else (h.unsqueeze(-1) * a).mT @ b
+
+    add_blocks(add, n, gradient(cx), gradient(cu), product(cx, cx), product(cu, cu), product(cu, cx))
+    H[:, knots] += add
+
+
 @dataclass(frozen=True)
 class FirstStates(WrappedCost):
     """A cost of the first n states."""

@@ -33,9 +33,13 @@ OTHER_START = (
     "rows."
 )
 NO_SLOPE = (
-    "The violated rows have no slope where it ended, as a comparison or a rounding has none: no step lowers them."
+    "The violated rows have no slope where it ended, as a comparison or a rounding has none, and a product whose "
+    "factors are 0: no step lowers them."
 )
-SMOOTH_ROWS = "Rows that change smoothly with states and controls, such as x - 1 in the place of (x > 1) * 1.0."
+SMOOTH_ROWS = (
+    "Another guess U0; or rows that change smoothly with states and controls, such as x - 1 in the place of "
+    "(x > 1) * 1.0."
+)
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
 TOUCHES = "All constraints hold at the knots, and the vehicle touches an obstacle between two of them."

@@ -17,12 +17,12 @@ from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.line_search import Rollouts
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import keep_lifted
-from torchgco.kernels.in_pytorch import InteriorKernels, Kernels, clearance_of
+from torchgco.kernels.in_pytorch import Kernels, clearance_of
 from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.engine import Engine
-from torchgco.native.interior import InteriorEngine
+from torchgco.native.interior import InteriorEngine, InteriorKernels
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
 from torchgco.native.structures import Options

@@ -12,8 +12,9 @@ from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.dynamics import rollout
 from torchgco.kernels.choice import kernels_of
-from torchgco.kernels.in_pytorch import InteriorKernels, clearance_of
+from torchgco.kernels.in_pytorch import clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.native.interior import InteriorKernels
 from torchgco.problem.between import bends, bulge, paths
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
@@ -115,5 +116,6 @@ def interior_of(problem: Problem) -> InteriorKernels:
 
     Raises:
         InputError: rows that join knots.
+        NativeError: no compiler.
     """
     return kernels_of(problem).interior(problem)

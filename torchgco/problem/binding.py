@@ -27,8 +27,8 @@ OF_FIELDS = {"bind", "batched", "per_element"}
 # Methods that say what a part is, and those that a class of ours computes beside them from its own fields alone.
 SAID = "stage", "terminal", "total", "value", "at", "signed_distance", "field", "step"
 COMPUTED = (
-    "expand", "scaled", "value", "accumulate", "violation", "worst", "at", "signed_distance", "segment_clearance",
-    "chord_clearance", "jacobians",
+    "expand", "scaled", "value", "rows", "accumulate", "violation", "worst", "at", "signed_distance",
+    "segment_clearance", "chord_clearance", "jacobians",
 )  # fmt: skip
 INTERFACES = Cost, Constraint, Obstacles, Dynamics  # what these compute, they compute by a part's own methods
 
@@ -85,7 +85,8 @@ def _origin(part: Any) -> Any:
 
 def _lost(part: Any, result: Any) -> Iterator[str]:
     """Names that a user's class redefines and that are other ones in the class of what its `bind` returned."""
-    if isinstance(result, type(part)) or not _is_ours(type(result)):
+    inner = result.inscribed if isinstance(result, Obstacles) else result  # a body's balls meet obstacles of the class
+    if isinstance(inner, type(part)) or not _is_ours(type(result)):
         return
     values = {field.name for field in fields(part)} if is_dataclass(part) else set[str]()
     for cls in type(part).__mro__:
@@ -104,6 +105,7 @@ def _torn(result: Any) -> Iterator[tuple[str, str, str]]:
     for name in COMPUTED:
         index = next((i for i, cls in enumerate(line) if name in vars(cls)), None)
         unused = name == "at" and isinstance(result, Constraint) and not result.geometric
+        unused |= name == "rows" and getattr(type(result), "value", None) is not Obstacles.value
         if index is None or unused or line[index] in INTERFACES or not _is_ours(line[index]):
             continue
         users = [cls for cls in line[:index] if not _is_ours(cls)]

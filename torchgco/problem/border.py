@@ -179,7 +179,7 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     K = len(torch.arange(N + 1)[constraint.knots])
     if K == 0:
         return
-    wanted = f"rows (2, {K}, p) in {x0.dtype}, the type of x0, of two problems"
+    wanted = f"rows (2, {K}, p) in {x0.dtype}, the type of x0, of two problems (numbers per problem are `batched`)"
     if isinstance(constraint, FunctionConstraint):
         wanted = f"a function of {' and '.join(constraint.of)} that gives {wanted}"
     shape = _check_values(field, value, rows, (X, U), (2, K, None), wanted)
@@ -198,7 +198,10 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
 
     weighted = lambda X, U: (weights * value(rows, X, U)).flatten(1).sum(-1)
     by_pytorch = type(constraint).accumulate in (Constraint.accumulate, FunctionConstraint.accumulate)
-    _check_slope(field, weighted, X, U, None if by_pytorch else own)
+    if by_pytorch:
+        _check_slope(field, weighted, X, U)
+    else:
+        _check_slope(f"{field.rpartition('.')[0]}.accumulate", weighted, X, U, own)
 
 
 def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int, X: Tensor, U: Tensor) -> None:
@@ -240,7 +243,7 @@ def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint
     if is_users(cost):
         called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
     for i, constraint in enumerate(constraints):
-        if is_users(constraint) and type(constraint.bare).accumulate is not Constraint.accumulate:
+        if is_users(constraint):
             single = constraint.take(first)
             zero = torch.zeros_like(called(f"constraints[{i}].value", wanted, single.value, X, U))
             called(f"constraints[{i}].value", wanted, single.accumulate, X, U, zero, zero, _blocks(X, U)[first])

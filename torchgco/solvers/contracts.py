@@ -289,7 +289,7 @@ class Solver(Brief, Checked):
         whole = for_solvers(current_problem(problem), self.joins_knots)
         with computing_on(whole.x0.device):
             self.announce(whole)
-            if whole.B > 0 and kernels_of(whole).compiled and whole.known.expects_interior:
+            if whole.B > 0 and kernels_of(whole) and whole.known.expects_interior:
                 interior_of(whole)
         return self
 

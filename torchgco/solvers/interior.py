@@ -11,15 +11,13 @@ from torchgco.base.options import Count, Positive
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
-from torchgco.eager.fixed import GOLDEN, ROUNDINGS
-from torchgco.eager.kernels import least_violation
 from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
-from torchgco.kernels.in_pytorch import InteriorKernels
-from torchgco.lagrangian.barrier import BarrierOptions
+from torchgco.lagrangian.barrier import GOLDEN, ROUNDINGS, BarrierOptions, least_violation
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
+from torchgco.native.interior import InteriorKernels
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
@@ -42,9 +40,9 @@ class InteriorPoint(Solver, named="solver"):
     """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
 
     States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
-    anything; Hessians are exact. Returned trajectories are rollouts. What kernels in C can't serve (single precision,
-    other devices, code that can't be traced) is solved by the same algorithm in PyTorch: statuses are the same, and
-    costs within 1e-6.
+    anything; Hessians are exact. Returned trajectories are rollouts. It needs a C compiler. In single precision, on
+    other devices, and of code that can't be traced PyTorch computes values and derivatives, and the same code in C all
+    else, in double precision on the CPU.
 
     Args:
         tolerance: of the optimality conditions, scaled as in the paper; in float32 8e-6, or what rounding allows.
