@@ -399,6 +399,8 @@ def show(problem: Problem, solution: Solution) -> HtmlPage:
     """
     from torchgco.view import notebook  # slow to load
 
+    if isinstance(problem, Fleet):
+        raise InputError("problem", "a Problem, such as fleet.members[0] with solution[0]", "Fleet")
     return notebook.show(problem, solution.detach())
 
 
