@@ -34,16 +34,16 @@ class Fleet:
         pairs: which vehicles keep it, (Q, 2) whole numbers; None: all, in the order (0, 1), (0, 2), ..., (1, 2), ...
 
     Raises:
-        InputError: fewer than two vehicles, another N, dt, batch or dimension of space, problems that
-            aren't float64 on the CPU, a free time, a horizon or free starts, pairs of unknown vehicles or given twice, distances that aren't above 0, starts that
-            touch.
+        InputError: fewer than two vehicles, another N, dt, batch or dimension of space, problems that aren't float64 on
+            the CPU, a free time, a horizon or free starts, pairs of unknown vehicles or given twice, distances that
+            aren't above 0, starts that touch.
     """
 
     vehicles: Sequence[Problem] | Problem
     apart: Any
     pairs: Any = None
     members: tuple[Problem, ...] = field(init=False, repr=False)  # a problem per vehicle, (B,) each
-    forms: tuple[tuple[Problem, tuple[int, ...]], ...] = field(init=False, repr=False)  # see `rows_of`
+    forms: tuple[tuple[Problem, tuple[int, ...]], ...] = field(init=False, repr=False)  # batches of those alike, and whose they are
     distances: Tensor = field(init=False, repr=False)  # (V, V), m; 0 of pairs that keep none
 
     def __post_init__(self) -> None:
