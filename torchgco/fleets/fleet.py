@@ -43,7 +43,8 @@ class Fleet:
     apart: Any
     pairs: Any = None
     members: tuple[Problem, ...] = field(init=False, repr=False)  # a problem per vehicle, (B,) each
-    forms: tuple[tuple[Problem, tuple[int, ...]], ...] = field(init=False, repr=False)  # batches of those alike, and whose they are
+    # Problems of those that are alike as one batch, (vehicles, B) after each other, and whose they are.
+    forms: tuple[tuple[Problem, tuple[int, ...]], ...] = field(init=False, repr=False)
     distances: Tensor = field(init=False, repr=False)  # (V, V), m; 0 of pairs that keep none
 
     def __post_init__(self) -> None:
