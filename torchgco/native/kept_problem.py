@@ -36,13 +36,14 @@ class KeptProblem:
         self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
         self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
         self._numbers = [engine.row_numbers(problem, i) for i in range(len(problem.constraints))]
-        rows = [constraint_of(problem, i, numbers) for i, numbers in enumerate(self._numbers)]
+        parts = zip(problem.constraints, problem.row_shapes, self._numbers, strict=True)
+        rows = [constraint_of(part, shape, N, kind_of(part), numbers) for part, shape, numbers in parts]
         for row, lam in zip(rows, self.lam, strict=True):
             row.lam = lam
         self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(engine.shared))
         self._model, self._cost = engine.model_numbers(problem), engine.cost_numbers(problem)
         self.packed.fill({"parameters": self._model, "cost_data": self._cost, "X": self.X, "U": self.U})
-        self._copied = {i: found for i in engine.functions if (found := self._copies(i)) is not None}
+        self._copied = {i: arrays for i in engine.functions if (arrays := self._copies(i)) is not None}
 
     @property
     def is_outdated(self) -> bool:
@@ -89,7 +90,7 @@ class KeptProblem:
         if picks is None or picks.numel() == 0 or kind_of(part) is not Kind.FUNCTION or part.row_radii is not None:
             return None
         first, every = 0, own_tensors(part)
-        for own in (every[place] for place in self.engine.functions[i].span.traced.named):
+        for own in (every[index] for index in self.engine.functions[i].span.traced.named):
             size = math.prod(own.shape[1:])
             if first <= int(picks.min()) and int(picks.max()) < first + size:
                 (there,) = self._numbers[i]["bound"].kept

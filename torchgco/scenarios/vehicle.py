@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf, nan
 from typing import Annotated, Any, Literal, Self
 
@@ -143,7 +144,7 @@ class Vehicle:
         """
         frame = check_value(Airframe() if airframe is None else airframe, Airframe, "airframe")
         rest = [0.0] * 3 + [1.0] + [0.0] * 6 + [frame.gravity]  # after the position: v, q, w, a
-        given: dict[str, Any] = {
+        defaults: dict[str, Any] = {
             "name": "quadrotor", "dynamics": QuadrotorPlanning(airframe=frame),
             "state_weight": [1.0, 1, 100, *[1.0] * 7, 10, 10, 10, 10], "control_weight": [10.0, 10, 10, 1],
             "terminal_weight": [1.0, 1, 10, *[1.0] * 11], "control_reference": [0.0, 0, 0, frame.gravity],
@@ -151,7 +152,7 @@ class Vehicle:
             "start": [-1.0, 1, 0, *rest], "goal": [20.0, 1, 0.2, *rest],
             "radius": frame.radius, "goal_radius": 2.0, "stages": 100,
         }  # fmt: skip
-        return cls(**(given | changes))
+        return cls(**(defaults | changes))
 
     def among(self, scenario: Scenario, ids: Iterable[int], seed: int = 0, **where: Any) -> Task:
         """The problems of this vehicle, with its own radius, on layouts of a scenario; `where` as of `task`.
@@ -189,14 +190,14 @@ class Vehicle:
         Raises:
             InputError: none in a place where the dynamics have no limit either.
         """
-        own = getattr(self.dynamics, "control_limits", ([None] * self.dynamics.m,) * 2)[CONTROL_LIMITS.index(name)]
-        found = list[float]()
-        for i, (given, limit) in enumerate(zip(getattr(self, name), own, strict=True)):
-            bound = limit if given is None else given
+        usual = getattr(self.dynamics, "control_limits", ([None] * self.dynamics.m,) * 2)[CONTROL_LIMITS.index(name)]
+        bounds = list[float]()
+        for i, (value, limit) in enumerate(zip(getattr(self, name), usual, strict=True)):
+            bound = limit if value is None else value
             if bound is None:
                 raise InputError(f"vehicle.{name}[{i}]", "a number: the dynamics have no limit here", None)
-            found.append(bound)
-        return found
+            bounds.append(bound)
+        return bounds
 
     def task(self, layouts: Layouts, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64) -> Task:
         """The planning problems of these layouts: quadratic cost to the goal, obstacles, control bounds (section 5).
@@ -211,66 +212,57 @@ class Vehicle:
             raise InputError("dtype", "torch.float64 or torch.float32", repr(dtype))
         device = check_device(device)
         if layouts.dimension != self.dimension:
-            given = layouts.start if layouts.start is not None else layouts.goal
-            wanted = fitting(layouts.dimension, None if given is None else given.shape[1])
+            states = layouts.start if layouts.start is not None else layouts.goal
+            wanted = fitting(layouts.dimension, None if states is None else states.shape[1])
             raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
         whole = self.completed(layouts)
-        assert whole.vehicle_radius is not None and whole.goal_radius is not None and whole.stages is not None
-
-        def tensor(value: object) -> Tensor:
-            return torch.as_tensor(value, dtype=dtype, device=device)
-
+        assert whole.goal_radius is not None and whole.stages is not None
+        tensor = partial(torch.as_tensor, dtype=dtype, device=device)
         dynamics = self.dynamics if layouts.dt is None else replace(self.dynamics, dt=layouts.dt)  # type: ignore
         longest = int(np.max(whole.stages))
         horizon = torch.as_tensor(whole.stages, device=device) if np.ndim(whole.stages) else None
-        radius = self.body or whole.vehicle_radius
-        constraints: list[Constraint] = [
-            Spheres(
-                tensor(layouts.centers),
-                tensor(layouts.radii),
-                radius,
-                None if layouts.velocities is None else tensor(layouts.velocities),
-            ),
-            ControlBounds(
-                tensor(_given(layouts.control_lower, self.limits("control_lower"))),
-                tensor(_given(layouts.control_upper, self.limits("control_upper"))),
-            ),
-        ]
+        gates, legs = gates_of(layouts, longest)
+        constraints = self._constraints(whole, tensor)
+        constraints += [] if gates is None else [replace(gates, centers=tensor(gates.centers))]
+        time, start, goal = free_time(layouts, legs), tensor(whole.start), tensor(whole.goal)
+        rest, moving = (1.0, 1.0) if time is None else (0.0, BESIDE_TIME * dynamics.dt)
+        at_rest = tensor(list(self.control_reference))
+        cost = QuadraticCost(
+            Q=rest * tensor(list(self.state_weight)), R=moving * tensor(list(self.control_weight)),
+            Qf=rest * tensor(list(self.terminal_weight)), x_ref=goal.unsqueeze(1), u_ref=at_rest,
+        )  # fmt: skip
+        center = goal[:, dynamics.position]
+        binds = time is not None or layouts.goal_required is True
+        end = self._required(goal, center, whole.goal_radius) if binds else Goal(center, whole.goal_radius)
+        problem = Problem(dynamics, cost, constraints, start, longest, end, horizon, time=time)
+        return Task(
+            problem, at_rest.expand(layouts.count, longest, -1).contiguous(), center, whole.goal_radius, whole
+        )  # fmt: skip
+
+    def _constraints(self, layouts: Layouts, tensor: Callable[[Any], Tensor]) -> list[Constraint]:
+        """Obstacles and bounds of completed layouts, but for gates; `tensor` makes what they are made of."""
+        assert layouts.vehicle_radius is not None
+        radius, optional = self.body or layouts.vehicle_radius, lambda value: None if value is None else tensor(value)
+        spheres = tensor(layouts.centers), tensor(layouts.radii), radius, optional(layouts.velocities)
+        bounds = (tensor(_given(getattr(layouts, name), self.limits(name))) for name in CONTROL_LIMITS)
+        constraints: list[Constraint] = [Spheres(*spheres), ControlBounds(*bounds)]
         if layouts.box_centers is not None:
-            turns, radii = (
-                None if value is None else tensor(value) for value in (layouts.box_rotations, layouts.box_radii)
-            )
-            boxes = Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, radii)
+            turns, rounding = optional(layouts.box_rotations), optional(layouts.box_radii)
+            boxes = Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, rounding)
             sines = [getattr(layouts, name) for name in SINES]
             constraints.append(boxes if sines[0] is None else OscillatingBoxes(boxes, *map(tensor, sines)))
         if layouts.map is not None:
             constraints.append(Field(layouts.map, radius))
-        constraints += self._state_bounds
-        gates, legs = gates_of(layouts, longest)
-        constraints += [] if gates is None else [replace(gates, centers=tensor(gates.centers))]
-        time = free_time(layouts, legs)
-        rest, moving = (1.0, 1.0) if time is None else (0.0, BESIDE_TIME * dynamics.dt)
-        cost = QuadraticCost(
-            Q=rest * tensor(list(self.state_weight)), R=moving * tensor(list(self.control_weight)),
-            Qf=rest * tensor(list(self.terminal_weight)), x_ref=tensor(whole.goal).unsqueeze(1),
-            u_ref=tensor(list(self.control_reference)),
-        )  # fmt: skip
-        goal, goal_radius = tensor(whole.goal), whole.goal_radius
-        center = goal[:, dynamics.position]
-        binds = time is not None or layouts.goal_required is True
-        end = self._required(goal, center, goal_radius) if binds else Goal(center, goal_radius)
-        problem = Problem(dynamics, cost, constraints, tensor(whole.start), longest, end, horizon, time=time)
-        U0 = tensor(list(self.control_reference)).expand(layouts.count, longest, -1).contiguous()
-        return Task(problem, U0, center, goal_radius, whole)
+        return constraints + self._state_bounds
 
     @property
     def _state_bounds(self) -> list[StateBounds]:
         """Bounds on the states, where there are any."""
         if self.state_lower is None and self.state_upper is None and self.speed is None:
             return []
-        given = (self.state_lower, -inf), (self.state_upper, inf)
+        sides = (self.state_lower, -inf), (self.state_upper, inf)
         lower, upper = (
-            [none if bound is None else bound for bound in side or [None] * self.dynamics.n] for side, none in given
+            [none if bound is None else bound for bound in side or [None] * self.dynamics.n] for side, none in sides
         )
         if self.speed is not None:
             i = self.dynamics.state_names.index("speed")
@@ -294,20 +286,20 @@ class Vehicle:
             InputError: states of another length than the vehicle's.
         """
         layouts = self.at_rest(layouts)
-        own: dict[str, Any] = {"vehicle_radius": self.radius, "goal_radius": self.goal_radius, "stages": self.stages}
-        own = {name: _given(getattr(layouts, name), default) for name, default in own.items()}
-        own |= {name: self._states(layouts, name) for name in ("start", "goal")}
+        values: dict[str, Any] = {"vehicle_radius": self.radius, "goal_radius": self.goal_radius, "stages": self.stages}
+        values = {name: _given(getattr(layouts, name), default) for name, default in values.items()}
+        values |= {name: self._states(layouts, name) for name in ("start", "goal")}
         dt = self.dynamics.dt if layouts.dt is None else layouts.dt
-        return replace(layouts, dt=dt if isinstance(dt, float | int) else None, **own)
+        return replace(layouts, dt=dt if isinstance(dt, float | int) else None, **values)
 
     def at_rest(self, layouts: Layouts) -> Layouts:
         """The layouts with states where they give positions alone: the vehicle's own start or goal, moved there."""
         moved = {}
         for name in ("start", "goal"):
-            given = getattr(layouts, name)
-            if given is not None and given.shape[1] == layouts.dimension == self.dimension:
+            points = getattr(layouts, name)
+            if points is not None and points.shape[1] == layouts.dimension == self.dimension:
                 moved[name] = np.tile(np.array(getattr(self, name), np.float64), (layouts.count, 1))
-                moved[name][:, self.dynamics.position] = given
+                moved[name][:, self.dynamics.position] = points
         return replace(layouts, **moved) if moved else layouts
 
     def _states(self, layouts: Layouts, name: str):
