@@ -20,7 +20,7 @@ LAYERS = [
     ["explaining"],
     ["solution", "native"],
     ["kernels"],
-    ["solvers", "roadmap"],
+    ["solvers", "roadmap", "receding"],
     ["sensitivity"],
     ["guidance", "missions", "scenarios"],
     ["search", "plotting", "exploration"],

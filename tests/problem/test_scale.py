@@ -346,3 +346,24 @@ def test_a_periodic_row_that_is_met_to_rounding_has_no_size(seed: int) -> None:
         X[:, :, 1] += off * (1.0 + torch.rand(8, 1, generator=draws, dtype=D))
         X[:, -1, 1] += off
         assert bool((dwarfed(problem, X, found.U) != NO_PLACE).any()) == warned
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_equal_bounds_along_a_trajectory_say_nothing_of_their_size(seed: int) -> None:
+    """At 0 they have that of their constraint's other rows, or none: what a solve leaves there isn't large."""
+    draws = torch.Generator().manual_seed(seed)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4")
+    reference, speed = torch.randn(4, generator=draws, dtype=D), 0.1 + float(torch.rand(1, generator=draws))
+    cost = QuadraticCost([1.0, 1.0, 0.1, 0.1], [0.1] * 2, [20.0, 20.0, 1.0, 1.0], reference)
+    zero = torch.zeros(1, 4, dtype=D)
+    stands = StateBounds([None, None, 0.0, None], [None, None, 0.0, None])
+    sized = [(ControlBounds([0, -2], [0, 2]), 4.0), (ControlBounds([speed, -9], [speed, 9]), speed), (stands, 0.0)]
+    for part, size in sized:
+        problem = Problem(model, cost, [part], zero, 20)
+        for solver in ("gco", "interior_point"):
+            found = torchgco.solve(problem, solver=solver)  # a ScaleWarning is an error here
+            assert found.statuses == [Status.CONVERGED] and float(found.violation) <= 1e-6
+        for off in (1e-26, 1e-20, 1e-9, 1e-4, 0.1, 0.5):
+            X, U = found.X.clone(), found.U.clone()
+            (X[:, 1:, 2] if part is stands else U[..., 0]).add_(off)
+            assert bool((dwarfed(problem, X, U) != NO_PLACE).any()) == (off > max(1e-6, 0.05 * size))

@@ -45,6 +45,18 @@ def test_the_number_of_stages_that_would_do_is_named() -> None:
         assert said is None or (said.startswith("1 of 2 horizons") and "N = 57 would do" in said and "6 m long" in said)
 
 
+@pytest.mark.parametrize("bounds", [(0.0, 0.0), (1e-12, 0.0)])
+@pytest.mark.parametrize("far", [0.0, 1e160, 1e308])
+def test_a_vehicle_that_cannot_move_and_one_too_far_away_lose_no_other(bounds: tuple[float, float], far: float) -> None:
+    """No number of stages serves the first, and the way of the second overflows."""
+    problem = task(POINT, [ControlBounds([0.0, 0.0], bounds)], 20, [[far, 0.0], [0.0, 0.0]], Goal([8.0, 1.0], 0.3))
+    still = bounds == (0.0, 0.0)
+    with pytest.warns(HorizonWarning, match="no horizon would do" if still else "N = .* would do"):
+        found = torchgco.solve(problem)
+    assert found.statuses[1] in (Status.CONVERGED, Status.FEASIBLE) and float(found.cost[1]) < 1e4
+    assert (found.statuses[0] is Status.NON_FINITE) == (far > 0.0)
+
+
 class Stepped(Dynamics):
     """A model that has a whole step alone."""
 

@@ -93,6 +93,14 @@ def test_quaternions_of_any_turn() -> None:
     assert turns(np.tile(np.eye(3), (4, 1, 1))) is None
 
 
+def test_sides_in_any_order_are_turned_to_be_drawn() -> None:
+    sides = Rotation.random(5, random_state=4).as_matrix()[:, [1, 0, 2]]  # left-handed
+    found = turns(sides)
+    assert found is not None
+    drawn = Rotation.from_quat(found[:, [1, 2, 3, 0]]).as_matrix().transpose(0, 2, 1)
+    np.testing.assert_allclose(np.abs((drawn * sides).sum(-1)), 1.0, atol=1e-12)  # the same sides, whichever way
+
+
 def test_equal_rows_are_kept_once() -> None:
     assert once(np.ones((5, 2))).shape == (1, 2) and once(np.eye(2)).shape == (2, 2)
 

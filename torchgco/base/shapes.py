@@ -52,7 +52,7 @@ def bound_of(value: Any, none: float) -> Any:
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
     if isinstance(value, list | tuple):
-        return [bound_of(one, none) for one in value]
+        return [bound_of(entry, none) for entry in value]
     return none if value is None else value
 
 
@@ -83,8 +83,8 @@ def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
         raise InputError(field, "a tensor", type(value).__name__)
     if value.dtype not in (torch.float64, torch.float32):
         raise InputError(field, f"a {'float64 or float32' if like is None else like.dtype} tensor", describe(value))
-    if value.layout != torch.strided:
-        raise InputError(field, "a dense tensor", value.layout)
+    if value.layout != torch.strided or value.is_meta:
+        raise InputError(field, "a dense tensor that holds numbers", value.device if value.is_meta else value.layout)
     if not is_recording() and asks(value):
         expected = "a tensor without gradients, `.detach()`: no solution is differentiated with respect to it"
         raise InputError(field, expected, describe(value))
@@ -184,10 +184,10 @@ def per_row(value: Any, field: str, dims: Dimensions, *size: int | str) -> Tenso
     Raises:
         InputError: not numbers, or of another shape.
     """
-    found = tensor(value, field, dims.like)
-    found = found.expand(dims.B, *found.shape) if found.dim() == len(size) else found
-    check_shape(found, (dims.B, *size), field)
-    return found
+    values = tensor(value, field, dims.like)
+    values = values.expand(dims.B, *values.shape) if values.dim() == len(size) else values
+    check_shape(values, (dims.B, *size), field)
+    return values
 
 
 def check_finite(value: Tensor, field: str, expected: str = "finite numbers") -> None:

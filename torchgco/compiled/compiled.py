@@ -208,8 +208,8 @@ class Compiled:
             until = math.inf
             if max_seconds is not None:
                 until = began + check_value(max_seconds, Positive, "max_seconds")
+            able = self._warm if check_value(warm, bool, "warm") else np.zeros_like(self._warm)
             self.numbers.write(values)
-            able = self._warm if warm else np.zeros_like(self._warm)
             self._warm = np.zeros_like(self._warm)  # an error or an interrupt leaves nothing to begin with
             return self._solved(able, moved, began, until, begin)
         finally:

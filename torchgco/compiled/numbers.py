@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from torchgco.base.errors import InputError
-from torchgco.base.numbers import Floats, Number, as_floats
+from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Floats, Number
 
 
 class Numbers(Mapping[str, Floats]):
@@ -44,8 +43,10 @@ class Numbers(Mapping[str, Floats]):
         """Values by full names, from mappings by any names.
 
         Raises:
-            InputError: a name that isn't there, or a number that is given twice, by whichever names.
+            InputError: no mapping, a name that isn't there, or a number that is given twice, by whichever names.
         """
+        if wrong := [part for part in given if not isinstance(part, Mapping | None)]:
+            raise InputError("numbers", "a dict of numbers by name", shown(wrong[0]))
         found, names = dict[str, Any](), dict[str, str]()
         for name, value in ((name, value) for part in given for name, value in (part or {}).items()):
             full = self.find(name).name
@@ -86,20 +87,6 @@ class Numbers(Mapping[str, Floats]):
     def _named(self, name: str) -> str:
         short = _short(name)
         return short if self._by_name.get(short) is self._all[name] else name
-
-
-def measured(x: Any, B: int, n: int) -> Floats:
-    """States (B, n), or (n,) of all vehicles.
-
-    Raises:
-        InputError: another shape, no numbers, NaN or infinity.
-    """
-    state = as_floats(x, "x")
-    if state.shape not in ((B, n), (n,)):
-        raise InputError("x", f"shape ({B}, {n}), or ({n},) for all vehicles", state.shape)
-    if not math.isfinite(state.sum()) and not np.isfinite(state).all():  # a sum takes a third of the time
-        raise InputError("x", "finite states", "NaN or infinity")
-    return state
 
 
 def _short(name: str) -> str:

@@ -26,13 +26,14 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """The place (B,) of a constraint with a violation that is large beside a row's values; `NO_PLACE` without one.
 
     The size of a row is its largest value at rest, and of inequalities along the trajectory, too, where equalities are
-    met; the two sides of a bound have one size. Rows that have the value at rest still, such as those of a given start,
-    say nothing, nor do rows of two knots that are 0 there, as differences are; obstacles have sizes of their own.
+    met; the two sides of a bound have one size, and where they are equal that at rest alone. Rows that have the value
+    at rest still, such as those of a given start, say nothing, nor do rows of two knots that are 0 there, as
+    differences are; obstacles have sizes of their own.
 
     Args:
         X, U: trajectories, (B, N+1, n) and (B, N, m).
     """
-    place = torch.full((problem.B,), NO_PLACE, device=problem.x0.device)
+    where = torch.full((problem.B,), NO_PLACE, device=problem.x0.device)
     free = torch.zeros_like(X[:, :1, :1]) if problem.free_start is None else _of_start(problem, X, U)
     problem = within_horizons(problem.held_at(X[:, 0]))
     moved = tuple(_moved(z, problem.N) for z in (X, U))
@@ -43,15 +44,14 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         if before.numel() == 0:
             continue
         least = (constraint.value(*moved) - now).abs().amax(1, keepdim=True)
-        sizes = before.abs() if constraint.sense == "equality" else torch.maximum(before.abs(), now.abs())
-        rows = constraint.of_both_sides(sizes.amax(1, keepdim=True))
+        rows = constraint.sizes(before, now)
         size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))
         known = size > torch.maximum(least, free)
         unknown = torch.inf if constraint.joins_knots else LARGE_VIOLATION
         admitted = torch.where(known, torch.maximum(SHARE * size, least), unknown)
         large = (constraint.violation(X, U) > admitted) & (now != before)
-        place[large.flatten(1).any(-1)] = number
-    return place
+        where[large.flatten(1).any(-1)] = number
+    return where
 
 
 def _moved(z: Tensor, N: int) -> Tensor:

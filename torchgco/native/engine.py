@@ -226,8 +226,11 @@ class Engine:
 
     def _row(self, problem: Problem, i: int) -> c.Constraint:
         """Constraint i without multipliers."""
-        make = lambda: constraint_of(problem, i, self.row_numbers(problem, i))
-        return _of_last(problem, i, problem.constraints[i], i in self.functions, make)
+        part = problem.constraints[i]
+        place = part, problem.row_shapes[i], problem.N, kind_of(part)
+        return _of_last(
+            problem, i, part, i in self.functions, lambda: constraint_of(*place, self.row_numbers(problem, i))
+        )
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
         """The fields of a `Constraint` in C that hold the numbers of constraint i."""

@@ -86,6 +86,7 @@ class Box:
 
     center, half (d,): half the sides' lengths; sides (d, d): their directions, as rows
     swing: amplitudes, rates and phases (3, S, d) of the sines along which the centre moves; None: it has none
+    velocity: (d,), m/s, with which it moves beside; None: 0
     track: along which it moves instead
     """
 
@@ -94,11 +95,13 @@ class Box:
     sides: np.ndarray
     radius: float = 0.0
     swing: np.ndarray | None = None
+    velocity: np.ndarray | None = None
     track: Track | None = None
 
     @property
     def moving(self) -> bool:
-        return self.track is not None or (self.swing is not None and bool(self.swing[0].any()))
+        parts = self.velocity, None if self.swing is None else self.swing[0]
+        return self.track is not None or any(part is not None and bool(part.any()) for part in parts)
 
     @property
     def corners(self) -> np.ndarray:
@@ -113,10 +116,13 @@ class Box:
         """Centres (..., d) at times t (...), s."""
         if self.track is not None:
             return self.track.at(t)
+        t, center = np.asarray(t), np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+        if self.velocity is not None:
+            center = center + t[..., None] * self.velocity
         if self.swing is None:
-            return np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+            return center
         amplitudes, rates, phases = self.swing
-        return self.center + (amplitudes * np.sin(np.asarray(t)[..., None, None] * rates + phases)).sum(axis=-2)
+        return center + (amplitudes * np.sin(t[..., None, None] * rates + phases)).sum(axis=-2)
 
     def distance(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Signed distances (K,) of points (K, d) from the box before rounding."""

@@ -94,9 +94,9 @@ class Problem:
         rows = list(zip(stated, self.constraints, strict=False))  # the goal's row is last
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
         remember([(dynamics, self.dynamics), (cost, self.cost), *rows])
-        for i, part in enumerate(self.constraints):
-            if isinstance(part, Obstacles):
-                warn_of_small(part, f"constraints[{i}]")
+        for i, constraint in enumerate(self.constraints):
+            if isinstance(constraint, Obstacles):
+                warn_of_small(constraint, f"constraints[{i}]")
         self._set(goal=goal)
         if self.time is not None:
             self._set(time=self.time.bind(dims))
@@ -218,15 +218,15 @@ class Problem:
         """Knots and rows of every constraint; the same for all problems of a form."""
         shapes = self.known.row_shapes
         if shapes is None:
-            stated = [None if is_users(part) else part.row_shape(self.N) for part in self.constraints]
-            found: list[Any] = stated
+            stated = [None if is_users(constraint) else constraint.row_shape(self.N) for constraint in self.constraints]
+            complete: list[Any] = stated
             if None in stated:
                 # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
-                one = self.take(slice(0, 1))
-                X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-                parts = zip(stated, one.constraints, strict=True)
-                found = [shape or part.value(X, U).shape[1:] for shape, part in parts]
-            shapes = self.known.row_shapes = tuple((knots, rows) for knots, rows in found)
+                first = self.take(slice(0, 1))
+                X, U = first.x0.new_zeros(first.B, self.N + 1, self.n), first.x0.new_zeros(first.B, self.N, self.m)
+                parts = zip(stated, first.constraints, strict=True)
+                complete = [shape or constraint.value(X, U).shape[1:] for shape, constraint in parts]
+            shapes = self.known.row_shapes = tuple((knots, rows) for knots, rows in complete)
         return shapes
 
     @property
@@ -265,12 +265,12 @@ class Problem:
         if is_whole(index, self.B):
             return self
         names = "dynamics", "cost", "constraints", "x0", "goal", "horizon", "free_start", "time"
-        part = self._with({name: take(getattr(self, name), index) for name in names}, known=self.known)
+        subset = self._with({name: take(getattr(self, name), index) for name in names}, known=self.known)
         if self.B == 1 or self.one is not None:
-            part._set(one=self.one or self)
+            subset._set(one=self.one or self)
         if self.given is not None:
-            part._set(given=self.given.followed(self, lambda whole: whole.take(index)))
-        return part
+            subset._set(given=self.given.followed(self, lambda whole: whole.take(index)))
+        return subset
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
@@ -349,9 +349,9 @@ class Problem:
                 if other is not None and other != (dims.position, dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
                     raise InputError(f"constraints[{i}]", expected, f"bound ones for {other[1]} s and {other[0]}")
-            if [type(part) for part in rows] != [type(part) for part in self.constraints]:
-                kinds = ", ".join(type(part).__name__ for part in self.constraints)
-                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in rows))
+            if [type(row) for row in rows] != [type(row) for row in self.constraints]:
+                kinds = ", ".join(type(row).__name__ for row in self.constraints)
+                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(row).__name__ for row in rows))
             parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, rows), "constraints": rows}
             parts["dynamics"] = model
             if cost is not None:
@@ -371,7 +371,7 @@ class Problem:
         if dynamics is not None:
             parts["dynamics"] = dynamics.bind(dims)
         if constraints is not None:
-            rows = [part.bind(dims) for part in without_goal(self.goal, dims, constraints)]
+            rows = [constraint.bind(dims) for constraint in without_goal(self.goal, dims, constraints)]
             parts["constraints"] = with_goal(self.goal, rows, dims)
         parts["x0"] = moved_inside(x0, self.free_start, parts.get("constraints", self.constraints))
         return self._with(parts, known=self.known)
@@ -439,4 +439,4 @@ def current_problem(problem: Any) -> Problem:
 
 def _all_bound(constraints: Sequence[Constraint], dims: Dimensions, goal: Goal | None) -> tuple[Constraint, ...]:
     stated = enumerate(without_goal(goal, dims, constraints))
-    return with_goal(goal, [bound(part, dims, f"constraints[{i}]", Constraint) for i, part in stated], dims)
+    return with_goal(goal, [bound(row, dims, f"constraints[{i}]", Constraint) for i, row in stated], dims)

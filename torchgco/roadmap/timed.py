@@ -15,13 +15,14 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchgco.base.tree import cast, moved
+from torchgco.base.tree import cast, is_users, moved
 from torchgco.kernels import EagerWarning, native
 from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
 from torchgco.native.declarations import Header, Structure, defines
@@ -33,7 +34,6 @@ PARTS = 3  # of a move, at whose ends it is looked at
 LOOKS = 16  # layers, about, in which ways of their own are sought
 TRIES = 400  # ways that are looked at for them
 FAR = 1e30  # costs that stand for none
-POINTS_AT_ONCE = 2**14  # points whose clearances are computed together
 C = Path(__file__).parent / "c"
 
 
@@ -155,19 +155,21 @@ class TimedWays:
     tau: float
 
 
-def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[TimedWays] | None:
-    """Up to `most` ways of each scene that cost at most a share `dearer` more than its cheapest; None without a library.
+def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[TimedWays]:
+    """Up to `most` ways of each scene that cost at most a share `dearer` more than its cheapest.
 
-    Scenes are searched by as many threads as PyTorch uses; what is found in one doesn't depend on the others.
+    There must be a library (`library_for`). Scenes are searched by as many threads as PyTorch uses; what is found in one
+    doesn't depend on the others.
 
     Raises:
         MemoryError: C could not allocate 8 bytes for each state.
     """
-    library = library_for(scenes[0].lattice.d) if scenes else None
-    if library is None:
-        return None
+    if not scenes:
+        return []
+    library = library_for(scenes[0].lattice.d)
+    assert library is not None
     own = [scene.arguments(most, dearer) for scene in scenes]
-    every = (Timed * len(own))(*own)
+    every: Any = (Timed * len(own))(*own)
     run(library.tgco_timed, len(own), 1, every)
     found = []
     for scene, one, end in zip(scenes, own, every, strict=True):
@@ -177,7 +179,7 @@ def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[T
     return found
 
 
-def clearances(parts: Sequence, lattice: TimedLattice) -> Tensor:
+def clearances(parts: Sequence[Any], lattice: TimedLattice) -> Tensor:
     """Distances (layers PARTS + 1, cells), float32, m, of a lattice's cells at its times from the obstacles of one
     problem: infinite where there is none.
 
@@ -186,25 +188,16 @@ def clearances(parts: Sequence, lattice: TimedLattice) -> Tensor:
     """
     count = lattice.layers * PARTS + 1
     parts = moved(cast(list(parts), torch.float32), torch.device("cpu"))
-    found = torch.full((count, lattice.cells), torch.inf)
-    points = torch.from_numpy(lattice.points).float()
+    points = torch.from_numpy(lattice.points).float().unsqueeze(0)
     times = torch.arange(count, dtype=torch.float32) * (lattice.tau / PARTS)
+    found = torch.full((count, lattice.cells), torch.inf)
     for part in parts:
-        if part.moving:
-            each = max(1, POINTS_AT_ONCE // lattice.cells)
-            for rows in torch.arange(count).split(each):
-                p, t = points.repeat(len(rows), 1), times[rows].repeat_interleave(lattice.cells)
-                found[rows] = torch.minimum(found[rows], _nearest(part, p, t).view(len(rows), -1))
-        else:
-            found = torch.minimum(found, _nearest(part, points, torch.zeros(len(points))))
+        if part.absent.numel() > 0:
+            for row, t in zip(found, times[: None if part.moving else 1].split(1), strict=False):
+                # A user's kind may need as many times as there are points.
+                away = part.signed_distance(points, t.expand(points.shape[1]) if is_users(part) else t)[0].amin(-1)
+                torch.minimum(row if part.moving else found, away, out=row if part.moving else found)
     return found
-
-
-def _nearest(part, p: Tensor, t: Tensor) -> Tensor:
-    """Distances (K,) of points p (K, d) at times t (K,) from the nearest obstacle."""
-    some = [part.signed_distance(a.unsqueeze(0), b)[0] for a, b in zip(p.split(POINTS_AT_ONCE), t.split(POINTS_AT_ONCE), strict=True)]
-    away = torch.cat(some)
-    return away.amin(-1) if away.shape[-1] > 0 else away.new_full(away.shape[:1], torch.inf)
 
 
 def library_for(d: int) -> ctypes.CDLL | None:

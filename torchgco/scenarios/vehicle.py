@@ -51,6 +51,13 @@ class Task:
     goal_radius: float  # m
     layouts: Layouts  # with the vehicle's own numbers where they gave none
 
+    def take(self, places: Sequence[int] | np.ndarray) -> Task:
+        """The problems at some places, ascending."""
+        rows = torch.as_tensor(places, device=self.U0.device)
+        return Task(
+            self.problem.take(rows), self.U0[rows], self.goal[rows], self.goal_radius, self.layouts.take(places)
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Vehicle:

@@ -43,11 +43,12 @@ def short_horizons(problem: Problem) -> str | None:
     if found is None or problem.goal is None:
         return None
     limit, far = found
-    goal, short = problem.goal, (far > limit.reach(problem) + problem.goal.radius).nonzero().flatten().tolist()
+    goal, misses = problem.goal, (far > limit.reach(problem) + problem.goal.radius) & torch.isfinite(far)
+    short = misses.nonzero().flatten().tolist()
     if not short:
         return None
     first, named = short[0], ", ".join(map(str, short[:NAMED])) + (", ..." if len(short) > NAMED else "")
-    needed = max(math.ceil(float(limit.stages(problem, far - goal.radius)[b])) for b in short)
+    needed = float(limit.stages(problem, far - goal.radius)[misses].amax())
     return (
         f"{len(short)} of {problem.B} horizons are too short for the way to the goal (problem {named}): the first is "
         f"{float(far[first]):.3g} m long, of which {int(problem.stages[first])} stages cover at most "
@@ -118,7 +119,7 @@ def horizon_of(problem: Problem) -> Horizon | None:
         if not math.isfinite(needed):
             return None
         stages, reach = int(problem.stages[0]), float(limit.reach(problem)[0])
-        return Horizon(float(far[0]), reach, stages, math.ceil(needed), limit.advice(0, math.ceil(needed)))
+        return Horizon(float(far[0]), reach, stages, math.ceil(needed), limit.advice(0, needed))
 
 
 def within_reach(problem: Problem) -> Tensor:
@@ -134,8 +135,11 @@ class Limit(NamedTuple):
     step: Tensor  # the longest way of a stage, (B,), m
     push: Tensor  # the largest increase of the speed, (B,), m/s^2; of problems without a longest step alone
 
-    def advice(self, b: int, N: int) -> str:
-        """Which horizon problem b should take."""
+    def advice(self, b: int, stages: float) -> str:
+        """Which horizon problem b should take, if it takes so many stages."""
+        if not math.isfinite(stages):
+            return "no horizon would do: the bounds keep the vehicle where it is"
+        N = math.ceil(stages)
         if math.isfinite(float(self.step[b])):
             return f"N = {N} would do at full speed"
         return f"from rest to rest it takes N = {N} at full acceleration"
@@ -176,7 +180,7 @@ def limit_of(problem: Problem, climbs: int = 0) -> Limit | None:
 
 
 def push_of(problem: Problem) -> Tensor:
-    """The largest increase of the speed, (B,), m/s^2, also where a speed is bounded; infinite where nothing limits it."""
+    """The largest increase of the speed, (B,), m/s^2, also where speeds are bounded; infinite where it isn't limited."""
     box = _Box.of(problem)
     if box is None or not problem.dynamics.is_integrated:
         return torch.full_like(problem.x0[:, 0], torch.inf)

@@ -31,6 +31,7 @@ from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.suitability import suited_paths
 from torchgco.search.table import Passes, Row, passes_of
 from torchgco.search.through_gates import solved_through_gates
+from torchgco.search.timed import Timed
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
@@ -155,7 +156,8 @@ class Restarts(Solver):
         solver = self.local
         session = Session(call, solver.inner.as_printed, record=solver.record)
         passes, guidance = self._suited(session.call.problem)
-        again = partial(self._ended, passes, guidance)
+        # Among what moves a goal is sought, required or not: where there is no way, there is none again.
+        again = partial(self._ended, [None if isinstance(one, Timed) else one for one in passes], guidance)
         search = Search(session.call, solver, passes, guidance, self.interior, session.recorder, again)
         self._run(search, passes)
         end = search.best.end

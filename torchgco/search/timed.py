@@ -23,6 +23,7 @@ from torchgco.lagrangian.state import SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.timed import TimedWays, library_for, timed_ways
+from torchgco.search.chords import EXTRA
 from torchgco.search.converge import solved_nearby
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.search import Search
@@ -30,10 +31,12 @@ from torchgco.search.solved_candidates import SOLVER
 from torchgco.search.table import Row
 from torchgco.search.timed_scenes import can_search, scene_in_time
 from torchgco.search.velocity import Velocity
+from torchgco.solvers.contracts import Call
 
 PROBLEMS_AT_ONCE = 16  # searched together: bounds the memory
 FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the lattice is made finer once
-GROWTHS = 0.0, 0.01, 0.03  # m by which obstacles grow for the solves: what is clear at knots may touch between them
+SMALL = 1e-4  # change of a control by which its effect is looked at
+ROUNDS = 4  # of solves, at most, each among larger obstacles: what is clear at knots may touch between them
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,12 @@ class Timed(Row):
 
     A lattice's cells are as wide as the vehicle's radius, and its layers as far apart as the acceleration of the model
     lets moves differ by a cell. Its costs are the problem's own, as far as they can be read from its states. The
-    cheapest way of each class is solved among obstacles as they are, and among larger ones; the cheapest result that is
-    clear between the knots, too, competes with the best so far.
+    cheapest way of each class is solved, among larger obstacles where it touches one between the knots; the cheapest
+    result that is clear there, too, competes with the best so far.
 
     Args:
         ways: classes of ways that are solved, at most.
-        gap: trajectories that have arrived and cost at most this share more than without obstacles are left as they are.
+        gap: share by which what has arrived may cost more than without obstacles, and is left as it is.
         dearer: share by which ways may cost more than the cheapest.
 
     Raises:
@@ -68,8 +71,8 @@ class Timed(Row):
     @property
     def does(self) -> str:
         return (
-            f"up to {self.ways} ways through space and time, each of a class of its own; interior point from each, among "
-            f"obstacles grown by {', '.join(f'{by:g}' for by in GROWTHS)} m"
+            f"up to {self.ways} ways through space and time, each of a class of its own; interior point from each, "
+            "also among larger obstacles where the cheapest touch between knots"
         )
 
     def run(self, search: Search) -> None:
@@ -103,11 +106,11 @@ class Timed(Row):
             if rows.numel() == 0 or search.call.late:
                 return
 
-    def _ways(self, problem: Problem, X: Tensor, finer: float) -> list[TimedWays | None]:
+    def _ways(self, problem: Problem, X: Tensor, finer: float) -> list[TimedWays]:
         """The ways of every problem."""
         each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
         scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
-        return timed_ways(scenes, self.ways, self.dearer) or [None] * len(scenes)
+        return timed_ways(scenes, self.ways, self.dearer)
 
 
 def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,75 +127,101 @@ def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
     return X, torch.where(good, end.best.cost, none)
 
 
-def _solve_along(search: Search, rows: Tensor, found: list[TimedWays | None]) -> Tensor:
-    """Solve along the ways of the problems in `rows`; whether each has a trajectory that arrives now, (b,)."""
-    problem = search.call.problem.take(rows)
-    places, X, U = [], [], []
-    for b, ways in enumerate(found):
-        one = problem.take(torch.tensor([b], device=rows.device))
-        velocity = Velocity.of(one)
-        for points in () if ways is None else ways.points:
-            x, u = _guess(velocity, points, ways.tau)
-            places.append(b)
-            X.append(x)
-            U.append(u)
-    done = torch.zeros_like(rows, dtype=torch.bool)
-    if not places:
-        return done
-    each = torch.tensor(places, device=rows.device).repeat(len(GROWTHS))
-    grown = X[0].new_tensor(GROWTHS).repeat_interleave(len(places))
-    call = replace(search.call.take(rows[each]), U0=torch.stack(U).repeat(len(GROWTHS), 1, 1), warm=None, callback=None)
-    larger = replace(call, problem=call.problem.grown(grown))
-    end = solved_nearby(SOLVER, larger, torch.stack(X).repeat(len(GROWTHS), 1, 1))
-    end = replace(end, best=replace(end.best, violation=measured(call.problem, end.best.X, end.best.U)))
-    return _keep(search, rows, each, call.problem, end)
+def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor:
+    """Solve along the ways of the problems in `rows`; whether each has a trajectory that arrives now, (b,).
 
-
-def _keep(search: Search, rows: Tensor, each: Tensor, problem: Problem, end: SolveEnd) -> Tensor:
-    """Keep the cheapest of the solved candidates of each problem that is clear, between knots too; where there is any.
-
-    Args:
-        each: the place among `rows` that each candidate belongs to.
+    Where the cheapest of a problem touch an obstacle between two knots, they are solved again among larger ones.
     """
-    best, limit = end.best, search.solver.violation_tolerance
-    good = (best.violation <= limit) & torch.isfinite(best.cost)
+    each = torch.tensor([b for b, ways in enumerate(found) for _ in ways.points])
+    done = torch.zeros_like(rows, dtype=torch.bool)
+    if each.numel() == 0:
+        return done
+    each = each.to(rows.device)
+    X, U = _guesses(search.call.problem.take(rows), each, found)
+    call = replace(search.call.take(rows[each]), U0=U, warm=None, callback=None)
+    grown, made, left = (
+        torch.zeros_like(X[:, 0, 0]),
+        torch.zeros_like(each),
+        torch.arange(len(each), device=each.device),
+    )
+    least = torch.full_like(search.best.end.best.cost[rows], torch.inf)
+    for _ in range(ROUNDS):
+        part = call.take(left)
+        end = _solved(part, X[left], grown[left])
+        made[left] = end.iterations
+        good, clearance = _rated(search, part.problem, end)
+        clear = good & (clearance >= 0.0)
+        found_now = _keep(search, rows, each[left], torch.where(clear, end.best.cost, torch.inf), end)
+        done |= found_now
+        least = least.scatter_reduce(0, each[left], torch.where(clear, end.best.cost, torch.inf), "amin")
+        again = good & ~clear & (end.best.cost < least[each[left]])
+        grown[left] += torch.where(again, -EXTRA * clearance, 0.0).nan_to_num(0.0)
+        left = left[again]
+        if left.numel() == 0 or search.call.late:
+            break
+    return done
+
+
+def _solved(call: Call, X: Tensor, grown: Tensor) -> SolveEnd:
+    """Solves of a call from X (C, N+1, n) among obstacles that have grown (C,), m, rated among those as they are."""
+    if not bool(grown.any()):
+        return solved_nearby(SOLVER, call, X)
+    end = solved_nearby(SOLVER, replace(call, problem=call.problem.grown(grown)), X)
+    return replace(end, best=replace(end.best, violation=measured(call.problem, end.best.X, end.best.U)))
+
+
+def _rated(search: Search, problem: Problem, end: SolveEnd) -> tuple[Tensor, Tensor]:
+    """Whether solved candidates are feasible and arrive where that is wanted, (C,), and their clearances (C,), m."""
+    best = end.best
+    good = (best.violation <= search.solver.violation_tolerance) & torch.isfinite(best.cost)
     if ranks_arrival(problem):
         good &= has_arrived(problem, best.X)
-    some = good.nonzero().flatten()
-    if some.numel() > 0:
-        good[some] = path_clearance(problem.take(some), best.X[some], best.U[some]) >= 0.0
+    clearance, some = torch.full_like(best.cost, -torch.inf), good.nonzero().flatten()
+    if some.numel() > 0:  # others may end anywhere
+        clearance[some] = path_clearance(problem.take(some), best.X[some], best.U[some])
+    return good, clearance
+
+
+def _keep(search: Search, rows: Tensor, each: Tensor, merit: Tensor, end: SolveEnd) -> Tensor:
+    """Keep the candidate of least merit (C,) of each problem in `rows` where it is finite; whether it is, (b,) bool.
+
+    Args:
+        each: the place (C,) among `rows` that each candidate belongs to.
+    """
     made = torch.zeros_like(rows).index_add(0, each, end.iterations)
-    merit = torch.where(good, best.cost, torch.inf)
-    done, chosen = torch.zeros_like(rows, dtype=torch.bool), []
-    for b in range(rows.numel()):
-        own = (each == b).nonzero().flatten()
-        least = own[merit[own].argmin()] if own.numel() > 0 else None
-        done[b] = least is not None and bool(torch.isfinite(merit[least]))
-        chosen += [int(least)] if done[b] else []
-    kept = take(end, torch.tensor(chosen, dtype=torch.int64, device=rows.device))
+    least = torch.full_like(search.best.end.best.cost[rows], torch.inf).scatter_reduce(0, each, merit, "amin")
+    done = torch.isfinite(least)
+    order = torch.where(merit == least[each], torch.arange(len(each), device=each.device), len(each))
+    first = torch.full_like(rows, len(each)).scatter_reduce(0, each, order, "amin")
+    kept = take(end, first[done])
     kept.status[:] = int(Status.MAX_ITERATIONS)  # the last row brings it to its own tolerance
     kept.iterations[:] = made[done]
     search.best.end.iterations[rows[~done]] += made[~done]
-    if chosen:
+    if bool(done.any()):
         search.best.keep(rows[done], kept)
     return done
 
 
-def _guess(velocity: Velocity, points: Array, tau: float) -> tuple[Tensor, Tensor]:
-    """States (N+1, n) and controls (N, m) of a batch of one along places (layers + 1, d) at times tau apart."""
-    problem = velocity.problem
-    p, v = _smooth(points, tau, float(problem.dynamics.dt) * np.arange(problem.N + 1), velocity.start)
-    x = velocity.states(v, problem.x0.new_tensor(p))
-    x[0] = problem.x0[0]
-    u = problem.at_rest[1]
-    here, then = x[:-1].unsqueeze(0), x[1:].unsqueeze(0)
-    error = then - problem.along.step(here, u)
-    _, fu = problem.along.jacobians(here, u)
-    u = u + (torch.linalg.pinv(fu) @ error.unsqueeze(-1)).squeeze(-1)
-    if problem.control_bounds is not None:
-        lower, upper = problem.control_bounds.over(problem.N)
-        u = torch.minimum(torch.maximum(u, lower), upper)
-    return x, u[0].nan_to_num(0.0, 0.0, 0.0)
+def _guesses(problem: Problem, each: Tensor, found: list[TimedWays]) -> tuple[Tensor, Tensor]:
+    """States (C, N+1, n) and controls (C, N, m) along the ways of all problems in turn; `each` says whose way it is."""
+    states, t = [], float(problem.dynamics.dt) * np.arange(problem.N + 1.0)
+    for b, ways in enumerate(found):
+        if len(ways.points) == 0:
+            continue
+        velocity = Velocity.of(problem.take(torch.tensor([b], device=each.device)))
+        for points in ways.points:
+            p, v = _smooth(points, ways.tau, t, velocity.start)
+            states.append(velocity.states(v, problem.x0.new_tensor(p)))
+            states[-1][0] = problem.x0[b]
+    X, many = torch.stack(states), problem.take(each)
+    x, U, model = X[:, :-1], many.at_rest[1], many.along
+    then = model.step(x, U)
+    fu = torch.stack([model.step(x, U + SMALL * row) - then for row in torch.eye(many.m).to(U)], dim=-1) / SMALL
+    U = (U + (torch.linalg.pinv(fu) @ (X[:, 1:] - then).unsqueeze(-1)).squeeze(-1)).nan_to_num(0.0, 0.0, 0.0)
+    if many.control_bounds is not None:
+        lower, upper = many.control_bounds.over(problem.N)
+        U = torch.minimum(torch.maximum(U, lower), upper)
+    return X, U
 
 
 def _smooth(points: Array, tau: float, t: Array, first: Array) -> tuple[Array, Array]:

@@ -27,6 +27,7 @@ ROOM = 0.1  # share of a cell's side that ways keep clear, as distances are inte
 AROUND = 3.0  # sizes of the largest obstacle that the lattice extends beyond start, goal and the way without obstacles;
 # at most half of the distance, within which ways up to sqrt(2) times as long stay
 FASTER = 1.25  # times as fast as without obstacles, at most
+SIDEWAYS = 0.5  # share of that speed by which in space the velocity along an axis may leave its range there
 THIN = 0.25  # share of the smallest obstacle's size that a cell of a vehicle without a radius measures
 
 
@@ -55,16 +56,15 @@ def can_search(problem: Problem) -> bool:
     )
 
 
-def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedScene | None:
-    """The scene of a batch of one; None where nothing says how far it goes.
+def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedScene:
+    """The scene of a batch of one.
 
     Args:
         free: states (N+1, n) of the trajectory without obstacles.
         finer: share of the usual spacing.
     """
-    velocity = Velocity.of(problem)
-    sizes = _sizes(problem, free, finer)
-    lattice = _lattice(sizes, problem.x0[0, problem.position].double().cpu().numpy(), velocity)
+    velocity, start = Velocity.of(problem), problem.x0[0, problem.position].double().cpu().numpy()
+    lattice = _lattice(_sizes(problem, free, finer), start, velocity)
     stages = lattice.tau / float(problem.dynamics.dt)
     parts = [part.inscribed if isinstance(part, Obstacles) else part for part in problem.geometric]
     parts = [part for part in parts if isinstance(part, Obstacles | BoundField)]
@@ -78,7 +78,6 @@ def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedSc
     change[: lattice.d] = np.where(np.isfinite(own), own, bend)
     if not change.any() and not move.any():  # the way alone counts
         move = (lattice.velocities**2).sum(1) * lattice.tau
-    start = problem.x0[0, problem.position].double().cpu().numpy()
     return TimedScene(
         lattice, clearances(parts, lattice), cell_cost,
         _costs(np.where(fast, FAR, move)), _costs(last), _costs(change), lattice.cell(start),
@@ -113,11 +112,11 @@ def _sizes(problem: Problem, free: Tensor, finer: float) -> Sizes:
     beyond = min(AROUND * (_largest(problem) + radius), 0.5 * float(np.linalg.norm(np.ptp(points, axis=0))))
     low, high = (part[0, at].double().cpu().numpy() for part in bounds_at_inner_knots(problem))
     speed = FASTER * np.linalg.norm(v, axis=1).max(initial=0.0)
-    most = np.full(d, speed)
-    return Sizes(
-        spacing, push, stages * dt, np.maximum(low, points.min(0) - beyond), np.minimum(high, points.max(0) + beyond),
-        -most, most,
-    )  # fmt: skip
+    slowest, fastest = np.full(d, -speed), np.full(d, speed)
+    if d == 3 and len(v) > 0:
+        slowest, fastest = v.min(0) - SIDEWAYS * speed, v.max(0) + SIDEWAYS * speed
+    low, high = np.maximum(low, points.min(0) - beyond), np.minimum(high, points.max(0) + beyond)
+    return Sizes(spacing, push, stages * dt, low, high, slowest, fastest)
 
 
 def _largest(problem: Problem) -> float:
@@ -139,7 +138,10 @@ def _lattice(sizes: Sizes, start: Array, velocity: Velocity) -> TimedLattice:
         tau = np.sqrt(spacing / (PUSH_SHARE * sizes.push))
         layers = max(2, round(sizes.duration / tau))
         tau = sizes.duration / layers
-        before, behind = (np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64) for part in (start - sizes.low, sizes.high - start))
+        before, behind = (
+            np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64)
+            for part in (start - sizes.low, sizes.high - start)
+        )
         unit = spacing / tau
         least, most = np.floor(sizes.slowest / unit + 0.5), np.ceil(sizes.fastest / unit - 0.5)
         least, most = (part.astype(np.int64) for part in (np.minimum(least, -1), np.maximum(most, 1)))

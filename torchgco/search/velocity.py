@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients_at_once
@@ -86,8 +87,10 @@ class Velocity:
         heading, speed = (float(x[0, i]) for i in self.places)
         return speed * np.array([np.cos(heading), np.sin(heading)])
 
-    def admitted(self, v: Array) -> Array:
+    def admitted(self, v: Array) -> NDArray[np.bool_]:
         """Which velocities v (M, d) the constraints on states admit at some knot, (M,) bool."""
+        if not any(map(_limits_speed, self.problem.constraints)):
+            return np.ones(len(v), dtype=bool)
         rest = self.problem.take(torch.zeros(len(v) + 1, dtype=torch.int64, device=self.problem.x0.device))
         X = repeated(self.states(np.vstack((v, np.zeros_like(v[:1])))), rest.N + 1)
         U = rest.cost.rest_controls(X.new_zeros(rest.B, rest.N, rest.m))
@@ -104,10 +107,14 @@ class Velocity:
         both = self.states(np.vstack((v, np.zeros_like(v[:1])))).unsqueeze(0)
         cost, u = self.problem.cost, self._rest(both.shape[1])
         along, last = cost.stage(both, u, 0)[0], cost.terminal(both)[0]
-        return tuple((part[:-1] - part[-1]).double().cpu().numpy() * by for part, by in ((along, stages), (last, 1.0)))
+        moving, ending = ((part[:-1] - part[-1]).double().cpu().numpy() for part in (along, last))
+        return stages * moving, ending
 
     def cost_of_change(self, a: float, stages: float) -> Array:
-        """What an acceleration a, m/s^2, along each axis costs over so many stages, (d,); NaN where no control does it."""
+        """What an acceleration a, m/s^2, along each axis costs over so many stages, (d,).
+
+        NaN where no control accelerates at once.
+        """
         at, model = self.problem.position, self.problem.dynamics
         unknown = np.full(at.stop - at.start, np.nan)
         if not self.places:
@@ -118,7 +125,9 @@ class Velocity:
         more = torch.linalg.pinv(B).T * a  # controls of each, (c, m)
         does = (more @ B.T - a * torch.eye(len(states)).to(B)).abs().amax(-1) <= 1e-6 * a
         here = repeated(x[:, 0], len(states))
-        cost = self.problem.cost.stage(here, u + more, 0) - self.problem.cost.stage(here, u.expand(-1, len(states), -1), 0)
+        cost = self.problem.cost.stage(here, u + more, 0) - self.problem.cost.stage(
+            here, u.expand(-1, len(states), -1), 0
+        )
         found = torch.where(does, stages * cost[0], torch.nan).double().cpu().numpy()
         return np.broadcast_to(found, unknown.shape).copy()
 
@@ -134,8 +143,12 @@ def _slopes(model, x: Tensor, u: Tensor, i: int) -> tuple[Tensor, Tensor]:
 
 def _limits_speed(part: Constraint) -> bool:
     """Whether a constraint's rows are of states, and say more than where to be."""
-    return not part.geometric and not part.joins_knots and not part.is_goal and getattr(part, "of", "x") == "x" and (
-        part.sense == "inequality"
+    return (
+        not part.geometric
+        and not part.joins_knots
+        and not part.is_goal
+        and getattr(part, "of", "x") == "x"
+        and (part.sense == "inequality")
     )
 
 

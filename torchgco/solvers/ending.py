@@ -82,10 +82,10 @@ def _rounds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
 
 def _binds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
     """Whether a row binds, (B,): others have no stiffness."""
-    found = torch.zeros_like(lagrangian.multipliers.mu, dtype=torch.bool)
-    for part, lam in zip(lagrangian.problem.constraints, lagrangian.multipliers.lam, strict=True):
-        found |= (binding(part.sense, part.value(X, U), lam) != 0).flatten(1).any(-1)
-    return found
+    binds = torch.zeros_like(lagrangian.multipliers.mu, dtype=torch.bool)
+    for constraint, lam in zip(lagrangian.problem.constraints, lagrangian.multipliers.lam, strict=True):
+        binds |= (binding(constraint.sense, constraint.value(X, U), lam) != 0).flatten(1).any(-1)
+    return binds
 
 
 def _sizes(problem: Problem, U: Tensor) -> Tensor:
@@ -141,13 +141,13 @@ def fails_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     return bad
 
 
-def touches(problem: Problem, found: Solution) -> Tensor:
+def touches(problem: Problem, solution: Solution) -> Tensor:
     """Which trajectories (B,) are INFEASIBLE only because they touch an obstacle between two knots."""
-    touching = (found.status == Status.INFEASIBLE) & (found.violation <= ADMITTED)
+    touching = (solution.status == Status.INFEASIBLE) & (solution.violation <= ADMITTED)
     rows = touching.nonzero().flatten()
     if rows.numel() > 0:
-        times = None if found.times is None else found.times[rows]
-        touching[rows] = path_clearance(*at_times(problem.take(rows), found.X[rows], found.U[rows], times)) < 0
+        times = None if solution.times is None else solution.times[rows]
+        touching[rows] = path_clearance(*at_times(problem.take(rows), solution.X[rows], solution.U[rows], times)) < 0
     return touching
 
 

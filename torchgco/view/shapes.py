@@ -110,6 +110,7 @@ def turns(axes: np.ndarray) -> np.ndarray | None:
         return None
     if axes.shape[-1] == 2:
         return np.arctan2(axes[:, 0, 1], axes[:, 0, 0])
+    axes = axes * np.sign(np.linalg.det(axes))[:, None, None]  # a box is the same with all its sides turned about
     return Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat(scalar_first=True)
 
 

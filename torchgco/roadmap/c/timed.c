@@ -13,6 +13,7 @@ typedef struct {
     int64_t cells, moves, step[3], turn[3]; /* strides of cells and of moves */
     const int32_t *move; /* (moves, 3) */
     const float *length; /* (moves): m */
+    float *node; /* (layers + 1, cells): cell_cost, FAR where an obstacle is too near */
     float *ahead; /* (layers + 1, cells): no more than what any way costs from there on, without the changes of moves */
     float *there, *onward; /* (layers + 1, cells, moves): the cheapest way to each state, and from it to the end */
     uint8_t *seen; /* (layers + 1, cells): whether any way leads there */
@@ -83,12 +84,6 @@ static float room_at(const Sweep *w, int64_t layer, int64_t cell) {
     return room;
 }
 
-static inline float node_cost(const Sweep *w, int64_t layer, int64_t cell) {
-    const Timed *t = w->t;
-    int bars = layer > 0 && t->clearance[layer * t->parts * w->cells + cell] < (float)t->margin;
-    return bars ? FAR : t->cell_cost[layer * w->cells + cell];
-}
-
 /* The least of what is at most one unit away along each axis, with the cost of the change. */
 static const float *changed(const Sweep *w, const float *row) {
     const Timed *t = w->t;
@@ -116,7 +111,12 @@ static const float *changed(const Sweep *w, const float *row) {
 /* What any way costs at least from each layer and cell on, by cells and moves alone. */
 static void look_ahead(const Sweep *w, float *scratch) {
     const Timed *t = w->t;
-    float least = FAR, last = FAR;
+    float least = FAR, last = FAR, margin = (float)t->margin;
+    for (int64_t l = 0; l <= t->layers; l++) {
+        const float *gap = t->clearance + l * t->parts * w->cells, *cost = t->cell_cost + l * w->cells;
+        for (int64_t c = 0; c < w->cells; c++)
+            w->node[l * w->cells + c] = gap[c] < margin || cost[c] >= FAR ? FAR : cost[c];
+    }
     for (int64_t m = 0; m < w->moves; m++) {
         least = t->move_cost[m] < least ? t->move_cost[m] : least;
         last = t->last_cost[m] < last ? t->last_cost[m] : last;
@@ -125,7 +125,7 @@ static void look_ahead(const Sweep *w, float *scratch) {
     for (int64_t l = t->layers - 1; l >= 0; l--) {
         float *own = w->ahead + l * w->cells, *from = scratch, *to = own;
         for (int64_t c = 0; c < w->cells; c++) {
-            float cost = node_cost(w, l + 1, c) + own[w->cells + c];
+            float cost = w->node[(l + 1) * w->cells + c] + own[w->cells + c];
             from[c] = cost < FAR ? cost : FAR;
         }
         for (int a = 0; a < DIM; a++) {
@@ -164,8 +164,8 @@ static float sweep_there(Sweep *w) {
                 float so_far = cost[m] + t->move_cost[m];
                 int64_t to = so_far < FAR ? moved(w, at, c, w->move + 3 * m) : -1;
                 if (to < 0) continue;
-                float node = node_cost(w, l + 1, to);
                 int64_t next = (l + 1) * w->cells + to;
+                float node = w->node[next];
                 if (node >= FAR || w->ahead[next] >= FAR || !is_clear(w, l, at, m, room)) continue;
                 if (!w->seen[next]) {
                     w->seen[next] = 1;
@@ -207,7 +207,7 @@ static void sweep_onward(Sweep *w, float *through) {
                     int64_t to = moved(w, at, c, w->move + 3 * m), next = (l + 1) * w->cells + to;
                     own[m] = FAR;
                     if (to < 0 || !w->seen[next] || w->there[next * M + m] >= FAR) continue;
-                    float cost = t->move_cost[m] + t->cell_cost[next] + ahead[next * M + m];
+                    float cost = t->move_cost[m] + w->node[next] + ahead[next * M + m];
                     own[m] = cost < FAR ? cost : FAR;
                 }
                 memcpy(own, changed(w, own), sizeof(float) * (size_t)M);
@@ -258,7 +258,7 @@ static int trace(Sweep *w, int64_t layer, int64_t cell, int32_t *way) {
             int64_t to = moved(w, at, cell, w->move + 3 * k), next = (l + 1) * w->cells + to;
             w->row[k] = FAR;
             if (to < 0 || !w->seen[next] || w->there[next * M + k] >= FAR) continue;
-            w->row[k] = t->move_cost[k] + t->cell_cost[next] + w->onward[next * M + k];
+            w->row[k] = t->move_cost[k] + w->node[next] + w->onward[next * M + k];
         }
         m = beside(w, m, w->row);
         if (m < 0) return 0;
@@ -352,14 +352,14 @@ static int solve(Timed *t) {
     }
     size_t places = (size_t)((t->layers + 1) * w.cells), states = places * (size_t)w.moves;
     int32_t *move = malloc(sizeof(int32_t) * 3 * (size_t)w.moves);
-    float *numbers = malloc(sizeof(float) * (2 * places + 3 * (size_t)w.moves + (size_t)w.cells));
+    float *numbers = malloc(sizeof(float) * (3 * places + 3 * (size_t)w.moves + (size_t)w.cells));
     w.there = malloc(sizeof(float) * states), w.onward = malloc(sizeof(float) * states);
     w.seen = malloc(places);
     Least *found = malloc(sizeof(Least) * places);
     int done = move && numbers && w.there && w.onward && w.seen && found;
     if (done) {
-        float *length = numbers + 2 * places + w.cells;
-        w.ahead = numbers, w.move = move, w.length = length, w.row = length + w.moves, w.wide = w.row + w.moves;
+        float *length = numbers + 3 * places + w.cells;
+        w.ahead = numbers, w.node = numbers + 2 * places + w.cells, w.move = move, w.length = length, w.row = length + w.moves, w.wide = w.row + w.moves;
         for (int64_t m = 0; m < w.moves; m++) {
             double far = 0.0;
             for (int a = 0; a < 3; a++) {
