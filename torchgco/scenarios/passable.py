@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from torchgco.scenarios.layouts import Layouts
 
@@ -98,6 +97,8 @@ def _backwards(steps: Sequence[tuple[np.ndarray, np.ndarray]], last: tuple[int, 
 
 def distances(layout: Layouts, points: np.ndarray, t: float) -> np.ndarray:
     """The distances (P,) of points (P, d) from the obstacles of one layout, none of them turned, at a time, m."""
+    from scipy.spatial.distance import cdist  # slow to load
+
     there = ~np.isnan(layout.radii[0])
     moved = layout.centers[0, there] + (0.0 if layout.velocities is None else t * layout.velocities[0, there])
     radii, least = layout.radii[0, there], np.full(len(points), np.inf)
