@@ -30,8 +30,8 @@ from torchgco.exploration.explorer import (
 from torchgco.exploration.movers import Known, Movers, Tracks, Unaware
 from torchgco.exploration.safety import AT_REST, braking, ends_at_rest, former_plans
 from torchgco.exploration.scout import DRIFT, SEARCH_OPTIONS, SPARE, Scout
+from torchgco.exploration.sensing.cells import CellSearch
 from torchgco.exploration.sensing.grid import NOT_FREE, SEEN_OCCUPIED
-from torchgco.exploration.sensing.search import Search
 from torchgco.exploration.sensing.sensors import Sensor
 from torchgco.exploration.sensing.world import World
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
@@ -89,7 +89,7 @@ class Exploration:
         start, goal = self.whole.x0[b, :3].numpy(), self.whole.goal.position[b].numpy()  # type: ignore[union-attr]
         seen, radius = self.explorer.map_of(start, goal), float(self.radius[b])
         size = seen.resolution
-        search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH_OPTIONS)
+        search = CellSearch(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH_OPTIONS)
         log = SeenLog(seen.corner, seen.shape, seen.resolution)
         world = World.of(self.whole, b)
         scout = Scout(

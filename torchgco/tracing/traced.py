@@ -7,7 +7,7 @@ whenever they are asked for, and a problem's own numbers for each problem. Only 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cached_property
@@ -25,15 +25,9 @@ from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.nets import MOST_WEIGHTS, Call, Nets
 from torchgco.tracing.operations import OPERATIONS
+from torchgco.tracing.picks import followers, indices, needed, picks_of
 from torchgco.tracing.recorder import Operation, Recording, Slot, name_of, record, replay_all
 
-INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
-# What moves numbers and computes none.
-PICKING = {f"aten.{name}" for name in (
-    "index", "index_select", "select", "slice", "unsqueeze", "squeeze", "view", "reshape", "expand", "detach", "alias",
-    "clone", "permute", "transpose", "t", "unbind", "split", "cat", "stack",
-)}  # fmt: skip
-PROBED = 3  # problems for which a function is asked which numbers it takes
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
 
@@ -83,7 +77,7 @@ class Traced:
         outer = [slot for slot in recording.outside if slot not in self._named]
         self.looked, self.outside = recording.looked, [self._captured[slot] for slot in outer]
         self._sort(recording, [slot for slot in outer if slot.dtype.is_floating_point], index)
-        self._fix(recording, before, _followers(self._plain, outer))
+        self._fix(recording, before, followers(self._plain, outer))
 
     def _split(self, recording: Recording) -> list[Operation]:
         """CasADi's operations, which depend on the variables, and PyTorch's; returns all that come before the former.
@@ -91,22 +85,22 @@ class Traced:
         Raises:
             InputError: see the class.
         """
-        operations = _needed(recording.operations, self._result)
-        followers = _followers(recording.operations, self._variables)
+        operations = needed(recording.operations, self._result)
+        symbolic = followers(recording.operations, self._variables)
         for operation in recording.operations:
-            if not operation.outputs and not followers.isdisjoint(operation.inputs):
+            if not operation.outputs and not symbolic.isdisjoint(operation.inputs):
                 what = f"one that fails for some values of its arguments: {operation.title}"
                 raise InputError(self.field, "a function that can be traced", what)
-        self._symbolic = [op for op in operations if followers.issuperset(op.outputs)]
-        self._plain = [op for op in operations if not followers.issuperset(op.outputs)]
+        self._symbolic = [op for op in operations if symbolic.issuperset(op.outputs)]
+        self._plain = [op for op in operations if not symbolic.issuperset(op.outputs)]
         for operation in self._symbolic:
             if name_of(operation.function) not in OPERATIONS:
                 raise _unknown(self.field, operation)
         # Where PyTorch's part ends and CasADi's begins.
         border = dict.fromkeys(slot for op in self._symbolic for slot in op.inputs) | {self._result: None}
-        self._border = [slot for slot in border if slot not in followers]
+        self._border = [slot for slot in border if slot not in symbolic]
         self._indexed = {slot for op in self._plain if self._index in op.inputs for slot in op.inputs}
-        return [op for op in recording.operations if op.outputs and not followers.issuperset(op.outputs)]
+        return [op for op in recording.operations if op.outputs and not symbolic.issuperset(op.outputs)]
 
     def _sort(self, recording: Recording, read: list[Slot], index: Tensor) -> None:
         """What is between PyTorch's part and CasADi's: a problem's own numbers, shared ones, weights, and constants.
@@ -115,8 +109,8 @@ class Traced:
             read: floating tensors that the function has read, other than its arguments and `own`.
             index: of a first problem, (1,).
         """
-        varying = _followers(self._plain, [self._index, *self._named])
-        reached = _followers(self._plain, read) - varying
+        varying = followers(self._plain, [self._index, *self._named])
+        reached = followers(self._plain, read) - varying
         shared = [slot for slot in self._border if slot in reached and slot.dtype.is_floating_point]
         self._nets = Nets(self._symbolic, recording.shapes, shared, self._result)
         if self._nets.size > MOST_WEIGHTS:
@@ -129,12 +123,12 @@ class Traced:
         constant = {slot: computed[slot] for slot in self._border if slot not in varying and slot not in shared}
         self._constants = {slot: _array(value) for slot, value in constant.items()}
         self._weights = {slot: _array(computed[slot]) for slot in self._nets.alone}
-        indices = _indices(self._symbolic)
-        self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
+        places = indices(self._symbolic)
+        self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in places]
         numbers = [computed[slot] for slot in self._shared_shapes]
         self._numbers = _flat(numbers)
         self.shared = torch.cat((self._numbers, self._nets.numbers(computed, self._numbers.numel())))
-        learned = _followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
+        learned = followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
         is_learned = np.repeat([slot in learned for slot in self._shared_shapes], [value.numel() for value in numbers])
         self.pattern = _pattern(self._numbers, is_learned)
         if (alike := _earlier(self.field, self.pattern.shape)) is not None:
@@ -149,17 +143,17 @@ class Traced:
             before: all operations that don't depend on the variables.
             outside: what depends on tensors from outside.
         """
-        of_problems = _followers(before, [self._index, *self._named])
+        of_problems = followers(before, [self._index, *self._named])
         self.reads_own = not of_problems.isdisjoint(recording.read)
         self.is_mixed = not outside.isdisjoint(self._own)
         kept = [slot for slot in self._constants if slot in outside]
         self._fixed = self._replayed(before, [*kept, *(slot for slot in recording.read if slot not in of_problems)])
-        self._again = _needed(before, *self._shared_shapes, *self._nets.alone, *self._fixed)
+        self._again = needed(before, *self._shared_shapes, *self._nets.alone, *self._fixed)
 
     def _replayed(self, operations: list[Operation], wanted: Sequence[Slot]) -> dict[Slot, Tensor]:
         """What slots hold that depend on no argument, as tensors that nobody changes."""
         known: dict[Slot, Any] = dict(self._captured)
-        replay_all(_needed(operations, *wanted), known)
+        replay_all(needed(operations, *wanted), known)
         return {slot: known[slot].detach().clone() for slot in wanted}
 
     @property
@@ -230,47 +224,9 @@ class Traced:
 
         These are the ones at the places `named`, in turn. None where a number is computed, or chosen by others.
         """
-        operations = _needed(self._plain, *self._own)
-        if not self._moves_alone(operations):
-            return None
-        # Asked with the places themselves in the place of the numbers: those of problem i, i times their number later.
-        tensors = {slot: self._captured[slot] for slot in self._named}
-        ends = np.cumsum([0, *(math.prod(tensor.shape[1:]) for tensor in tensors.values())]).tolist()
-        total, known, of_problem = ends[-1], dict(self._captured), torch.zeros(ends[-1], dtype=torch.int64)
-        for (slot, tensor), first, end in zip(tensors.items(), ends, ends[1:], strict=False):
-            rows = PROBED if slot in self._indexed else 1
-            numbers = total * torch.arange(rows).unsqueeze(-1) + torch.arange(first, end, dtype=torch.float64)
-            known[slot] = numbers.reshape(rows, *tensor.shape[1:]).to(tensor.device)
-            of_problem[first:end] = int(rows > 1)
-        try:
-            picked = torch.stack([self._picked(operations, known, i) for i in range(PROBED)])
-        except (RuntimeError, IndexError):  # other shapes than these
-            return None
-        if not bool((picked[0] < total).all()):
-            return None
-        expected = picked[0] + total * torch.arange(PROBED).unsqueeze(-1) * of_problem[picked[0]]
-        return picked[0] if torch.equal(picked, expected) else None
-
-    def _moves_alone(self, operations: list[Operation]) -> bool:
-        """Whether operations only move numbers of `own` tensors, in the rows that the index says or in a shared one."""
-        if not self._named or any(name_of(op.function) not in PICKING for op in operations):
-            return False
-        if not _followers(operations, self._named).issuperset(self._own):
-            return False
-        if _indices(operations) & (_followers(operations, [self._index, *self._named]) - {self._index}):
-            return False  # chosen by others
-        for slot in self._named:
-            tensor = self._captured[slot]
-            if tensor.dim() == 0 or (len(tensor) > 1 and slot not in self._indexed):
-                return False
-        others = self._captured.keys() & {slot for op in operations for slot in op.inputs} - self._named.keys()
-        return not any(slot.dtype.is_floating_point for slot in others)
-
-    def _picked(self, operations: list[Operation], known: dict[Slot, Any], i: int) -> Tensor:
-        device = known[next(iter(self._named))].device
-        known = {**known, self._index: torch.full((1,), i, dtype=torch.int64, device=device)}
-        replay_all(operations, known)
-        return torch.cat([known[slot].flatten().long().cpu() for slot in self._own])
+        own = {slot: self._captured[slot] for slot in self._named}
+        operations = needed(self._plain, *self._own)
+        return picks_of(operations, own, self._own, self._index, self._captured, self._indexed)
 
     @property
     def named(self) -> list[int]:
@@ -428,30 +384,6 @@ def _flat(values: Sequence[Tensor]) -> Tensor:
     """All numbers of some tensors (s,) float64."""
     parts = [value.detach().cpu().to_dense().double().flatten() for value in values]
     return torch.cat([torch.zeros(0, dtype=torch.float64, device="cpu"), *parts])
-
-
-def _needed(operations: list[Operation], *results: Slot) -> list[Operation]:
-    """The operations that the results depend on."""
-    wanted, kept = set(results), []
-    for operation in reversed(operations):
-        if not wanted.isdisjoint(operation.outputs):
-            wanted.update(operation.inputs)
-            kept.append(operation)
-    return kept[::-1]
-
-
-def _indices(operations: list[Operation]) -> set[Slot]:
-    """What is used as an index."""
-    return {slot for op in operations if name_of(op.function) in INDEXING for slot in op.inputs[1:]}
-
-
-def _followers(operations: Iterable[Operation], sources: Iterable[Slot]) -> set[Slot]:
-    """`sources`, and all slots that depend on them."""
-    reached = set(sources)
-    for operation in operations:
-        if not reached.isdisjoint(operation.inputs):
-            reached.update(operation.outputs)
-    return reached
 
 
 def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict[Slot, np.ndarray]:

@@ -44,7 +44,7 @@ NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
 
 
 @dataclass(frozen=True)
-class Plan:
+class Schedule:
     """How a study is flown: options of `study` that decide no result.
 
     Args:
@@ -92,13 +92,13 @@ class Plan:
         return [number for number in ids if self.jobs is None or number * self.jobs // count == self.job]
 
 
-def plan_of(setup: Setup) -> Plan:
+def plan_of(setup: Setup) -> Schedule:
     """The plan of a configuration, with its number of processes.
 
     Raises:
-        InputError: as Plan.
+        InputError: as Schedule.
     """
-    plan = Plan(**{field.name: setup.configuration["study"][field.name] for field in fields(Plan)})
+    plan = Schedule(**{field.name: setup.configuration["study"][field.name] for field in fields(Schedule)})
     if plan.workers is not None:
         return plan
     # On a GPU the batches of several processes would share one device.
@@ -142,7 +142,7 @@ class Batch(ABC):
 
 
 @dataclass
-class Flight(Batch):
+class SolveBatch(Batch):
     """Single trajectories."""
 
     stages: int | None = None  # N of the controls returned: the most of the study; None: of these layouts

@@ -28,7 +28,7 @@ SINGLE = (
 
 
 @dataclass
-class MissionFlight(Batch):
+class MissionBatch(Batch):
     """Missions in lockstep, planned by one solver."""
 
     plans: bool = False  # keep the planned positions, for figures

@@ -18,8 +18,8 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
-from torchgco.experiments.flying.flight import Batch, Flight, Plan, fly, plan_of, prepare
-from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionFlight
+from torchgco.experiments.flying.flight import Batch, Schedule, SolveBatch, fly, plan_of, prepare
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionBatch
 from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.flying.workers import Shared, run_all
@@ -137,7 +137,7 @@ def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
 class _Study:
     """A configuration, checked and built."""
 
-    plan: Plan
+    plan: Schedule
     tasks: Tasks
     solvers: dict[str, Any]  # by name, the one under study first
     manifest: Manifest
@@ -266,8 +266,8 @@ def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar, alone: bool 
     tasks, places = (tasks.part(ids), range(len(ids))) if alone else (tasks, ids)
     if study.setup.mission is None:
         most = None if study.layouts.stages is None else int(np.max(study.layouts.stages))
-        return Flight(tasks, places, name, solver, bar, most)
-    return MissionFlight(tasks, places, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
+        return SolveBatch(tasks, places, name, solver, bar, most)
+    return MissionBatch(tasks, places, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
 
 
 def _fly_side_by_side(
