@@ -158,8 +158,8 @@ class TimedWays:
 def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[TimedWays]:
     """Up to `most` ways of each scene that cost at most a share `dearer` more than its cheapest.
 
-    There must be a library (`library_for`). Scenes are searched by as many threads as PyTorch uses; what is found in one
-    doesn't depend on the others.
+    There must be a library (`library_for`). As many threads as PyTorch uses search; what is found in one scene doesn't
+    depend on the others.
 
     Raises:
         MemoryError: C could not allocate 8 bytes for each state.

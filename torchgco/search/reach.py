@@ -180,7 +180,7 @@ def limit_of(problem: Problem, climbs: int = 0) -> Limit | None:
 
 
 def push_of(problem: Problem) -> Tensor:
-    """The largest increase of the speed, (B,), m/s^2, also where speeds are bounded; infinite where it isn't limited."""
+    """The largest increase of the speed, (B,), m/s^2, also where speeds are bounded; infinite where none is."""
     box = _Box.of(problem)
     if box is None or not problem.dynamics.is_integrated:
         return torch.full_like(problem.x0[:, 0], torch.inf)

@@ -14,7 +14,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, NonNegative
+from torchgco.base.options import Count
 from torchgco.base.status import Status
 from torchgco.base.tree import take
 from torchgco.kernels import measured, path_clearance
@@ -35,6 +35,8 @@ from torchgco.solvers.contracts import Call
 
 PROBLEMS_AT_ONCE = 16  # searched together: bounds the memory
 FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the lattice is made finer once
+GAP = 0.02  # share by which what has arrived may cost more than without obstacles, and is left as it is
+DEARER = 0.5  # share by which ways that are solved may cost more than the cheapest, on the lattice
 SMALL = 1e-4  # change of a control by which its effect is looked at
 ROUNDS = 4  # of solves, at most, each among larger obstacles: what is clear at knots may touch between them
 
@@ -50,23 +52,19 @@ class Timed(Row):
 
     Args:
         ways: classes of ways that are solved, at most.
-        gap: share by which what has arrived may cost more than without obstacles, and is left as it is.
-        dearer: share by which ways may cost more than the cheapest.
 
     Raises:
         InputError: a field out of its range.
     """
 
     ways: Count = 8
-    gap: NonNegative = 0.02
-    dearer: NonNegative = 0.5
 
     label: ClassVar[str] = "timed"
     kinds: ClassVar[tuple[str, ...]] = ("moving",)
 
     @property
     def problems(self) -> str:
-        return f"among obstacles that move, not arrived or over {self.gap:.0%} more expensive than without obstacles"
+        return f"among obstacles that move, not arrived or over {GAP:.0%} more expensive than without obstacles"
 
     @property
     def does(self) -> str:
@@ -91,7 +89,7 @@ class Timed(Row):
         X, bound = _free(search, rows)
         best = search.best.of(rows).best
         limit = search.solver.violation_tolerance
-        good = (best.violation <= limit) & (best.cost <= bound + self.gap * bound.abs())
+        good = (best.violation <= limit) & (best.cost <= bound + GAP * bound.abs())
         if ranks_arrival(search.call.problem):
             good &= search.best.arrived()[rows]
         left = (~good).nonzero().flatten()
@@ -110,7 +108,7 @@ class Timed(Row):
         """The ways of every problem."""
         each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
         scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
-        return timed_ways(scenes, self.ways, self.dearer)
+        return timed_ways(scenes, self.ways, DEARER)
 
 
 def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor
 from torchgco.base.shapes import repeated
 from torchgco.constraints.gates import gates_of
 from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
-from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
@@ -48,12 +47,13 @@ def can_search(problem: Problem) -> bool:
     at = problem.dynamics.position
     if at is None or at.stop - at.start not in (2, 3) or not any(part.moving for part in problem.obstacles):
         return False
-    parts = [part.inscribed if isinstance(part, Obstacles) else part for part in problem.geometric]
-    return all(
-        isinstance(part, BoundField) or type(part).signed_distance is not Obstacles.signed_distance
-        for part in parts
-        if isinstance(part, Obstacles | BoundField)
-    )
+    return all(type(part.inscribed).signed_distance is not Obstacles.signed_distance for part in problem.obstacles)
+
+
+def _with_distances(problem: Problem) -> list[Any]:
+    """The obstacles and the maps of a batch of one; of a body those of the ball about the position that it holds."""
+    parts = (part.inscribed if isinstance(part, Obstacles) else part for part in problem.geometric)
+    return [part for part in parts if hasattr(part, "signed_distance")]
 
 
 def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedScene:
@@ -66,8 +66,6 @@ def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedSc
     velocity, start = Velocity.of(problem), problem.x0[0, problem.position].double().cpu().numpy()
     lattice = _lattice(_sizes(problem, free, finer), start, velocity)
     stages = lattice.tau / float(problem.dynamics.dt)
-    parts = [part.inscribed if isinstance(part, Obstacles) else part for part in problem.geometric]
-    parts = [part for part in parts if isinstance(part, Obstacles | BoundField)]
     move, last = velocity.cost_of(lattice.velocities, stages)
     fast = ~velocity.admitted(lattice.velocities)
     cell_cost, bend = _cell_costs(problem, lattice, stages)
@@ -79,7 +77,7 @@ def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedSc
     if not change.any() and not move.any():  # the way alone counts
         move = (lattice.velocities**2).sum(1) * lattice.tau
     return TimedScene(
-        lattice, clearances(parts, lattice), cell_cost,
+        lattice, clearances(_with_distances(problem), lattice), cell_cost,
         _costs(np.where(fast, FAR, move)), _costs(last), _costs(change), lattice.cell(start),
         lattice.move(velocity.start), ROOM * lattice.spacing,
     )  # fmt: skip
@@ -169,7 +167,7 @@ def _cell_costs(problem: Problem, lattice: TimedLattice, stages: float) -> tuple
         k = min(K - 1, round(layer * lattice.tau / dt))
         found[layer] = stages * problem.cost.stage(x, u, k)[0].double().cpu()
         for part in problem.geometric:
-            if not isinstance(part, Obstacles | BoundField) and k > 0 and part.holds_at(k):
+            if not hasattr(part, "signed_distance") and k > 0 and part.holds_at(k):
                 found[layer][(part.at(x, k)[0] > 0).any(-1).cpu()] = FAR
     found[-1] = problem.cost.terminal(x)[0].double().cpu()
     bend = _bend(found[0], lattice)
