@@ -77,7 +77,7 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     at = problem.dynamics.position
     planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if at is None else at.stop - at.start, ())
     shared = [courses] if _is_shared(problem, courses) else [[course] for course in courses]
-    maps = [_Map.of(problem, group, planes) for group in shared] if planes else []
+    maps = [SceneMap.of(problem, group, planes) for group in shared] if planes else []
     rows = ceil((problem.n + problem.m) / PANELS_ACROSS)
     wide = WIDTH / len(maps) if maps else WIDTH
     high = max((one.height(wide) for one in maps), default=0.0)
@@ -159,7 +159,7 @@ def _is_shared(problem: Problem, courses: list[Course]) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Map:
+class SceneMap:
     """A scene with the trajectories in it."""
 
     world: World
@@ -169,7 +169,7 @@ class _Map:
     gates: list[Outline]
 
     @classmethod
-    def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> _Map:
+    def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> SceneMap:
         world = world_of(problem, courses[0].b)
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
         gates, inside = outlines(problem, courses[0].b), [view(scene, [0], kept, others) for scene in world.scenes]
@@ -260,7 +260,7 @@ class _Map:
         return drawn
 
 
-def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
+def _handles(maps: Sequence[SceneMap], drawn: set[str]) -> list[Artist]:
     """Entries of the legend of all maps."""
     shapes: dict[str, Artist] = {
         "own": Patch(facecolor=ROCK, label="obstacle"),
