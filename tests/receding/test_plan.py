@@ -9,7 +9,7 @@ import torch
 
 from tests.missions.missions import DOUBLE, DT, far, mission
 from tests.problems import planar_batch
-from torchgco import InputError, Planar, solve
+from torchgco import InputError, Planar, QuadrotorPlanning, solve
 from torchgco.missions import Flight, MissionPlan
 from torchgco.receding.plan import Plan
 
@@ -51,6 +51,7 @@ def test_a_missions_plan_is_sampled_like_any_other() -> None:
     flown = flight.step().plan
     assert isinstance(flown, MissionPlan) and isinstance(flown, Plan) and flown.start.tolist() == [DT, DT]
     assert torch.equal(flown.at(DT).x, flown.X[:, 0]) and torch.equal(flown.at(2 * DT).u, flown.U[:, 1])
+    assert isinstance(flown.dynamics, QuadrotorPlanning)
     half = replace(flown.dynamics, dt=0.5 * DT).at(0).step(flown.X[:, 0], flown.U[:, 0])
     torch.testing.assert_close(flown.at(1.5 * DT).x, half)
 
