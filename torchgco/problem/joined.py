@@ -63,12 +63,14 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
             break  # else it refuses such states
     else:
         found, each = together(rows, k, *arguments), alone(rows, k, *arguments)
-    exempt = False
-    if (place := _place(each, found)) is not None:
-        if take_same_branches((alone, more, k, *drawn), (together, more, k, *drawn)):
+    exempt, alike, few = False, (together, more, k, *drawn), (together, rows, k, *arguments)
+    for changed, other in (((alone, *alike[1:]), each), (few, _tried(*few))):
+        if other is None or (place := _place(other, found[: len(other)])) is None:
+            continue
+        if take_same_branches(changed, alike):
             return place
         exempt = True
-    one, alike = rows[:1], (together, more, k, *drawn)
+    one = rows[:1]
     # Any two knots differ in a digit of their places, so that one of them is kept where the other is foreign. The last
     # two rows are kept as a whole, and foreign as a whole: another problem.
     K = len(k)
