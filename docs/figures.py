@@ -24,9 +24,9 @@ from torch import Tensor
 from benchmarks.lib.recorded import solve
 from torchgco import Problem, Solution, presets
 from torchgco.plotting.style import INK, PALETTE, save, tidy
+from torchgco.roadmap.cheapest import TorchSearch
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, MARGIN, NEIGHBOURS, NODES, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
-from torchgco.roadmap.search import TorchSearch
 from torchgco.scenarios import Layouts
 from torchgco.solution import Fate
 

@@ -20,7 +20,7 @@ LAYERS = [
     ["explaining"],
     ["solution", "native"],
     ["kernels"],
-    ["solvers", "roadmap"],
+    ["solvers", "roadmap", "receding"],
     ["sensitivity"],
     ["guidance", "missions", "scenarios"],
     ["search", "plotting", "exploration"],
@@ -170,6 +170,23 @@ def test_files_and_functions_are_short() -> None:
 NAMED_IN = 6
 NAMED_MORE = {"BoundBody": 9}
 ROOMS_OF_KINDS = "constraints", "obstacles", "costs", "maps/field.py", "problem/goal.py"
+
+
+def test_frozen_objects_are_set_where_they_are_made() -> None:
+    """`object.__setattr__` fills an object's own fields, or those of one that the same function has just made."""
+    called_by_post_init = {"base/options.py", "exploration/sensing/sensors.py"}
+    foreign = []
+    for path in (path for path in MODULES if path.relative_to(PACKAGE).as_posix() not in called_by_post_init):
+        tree = ast.parse(path.read_text())
+        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+            given = {argument.arg for argument in ast.walk(function.args) if isinstance(argument, ast.arg)} - {"self"}
+            made = {
+                name.id for name in ast.walk(function) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
+            }
+            for call in (node for node in ast.walk(function) if isinstance(node, ast.Call)):
+                if ast.unparse(call.func) == "object.__setattr__" and ast.unparse(call.args[0]) in given - made:
+                    foreign.append(f"{path.relative_to(PACKAGE)}: {ast.unparse(call)}")
+    assert not foreign
 
 
 def test_kinds_are_known_in_few_files() -> None:

@@ -64,7 +64,7 @@ from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.judge import judge
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.missions.constraints import FirstStepRates
-from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, OscillatingBoxes, Spheres
+from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, Moved, OscillatingBoxes, Spheres
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
@@ -84,8 +84,8 @@ __all__ = [  # noqa: RUF022
     "Problem", "Goal", "FreeTime", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "Bicycle",
     "QuadrotorPlanning", "QuadrotorPlant", "QuadrotorThrusts",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
-    "Ellipsoids", "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone", "Gates",
-    "Separation", "Link", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "Ellipsoids", "OscillatingBoxes", "Moved", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone",
+    "Gates", "Separation", "Link", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it

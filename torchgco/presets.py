@@ -32,6 +32,7 @@ from torchgco.search import (
     Samples,
     Starts,
     Tighten,
+    Timed,
     Tube,
 )
 from torchgco.search.rows import closer
@@ -54,6 +55,7 @@ def gco(space: Space) -> Restarts:
         local=replace(_local(space), guidance=_guidance(space)),
         passes=Passes({
             "guess": FirstSolve(single_contact_after=3 if _in_the_plane(space) else 6),
+            "timed": Timed(),
             "maps": Tube(among="maps"),
             "paths": _paths(space),
             "tube": Tube(among="bodies"),

@@ -17,7 +17,7 @@ from torchgco.base.differentiability import Differentiability
 from torchgco.base.errors import InputError, shown
 from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.gradients import without_gradients
-from torchgco.base.options import Count, Positive, check_value
+from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import MISTAKES, check_device, check_shape
 from torchgco.base.status import Status
 from torchgco.base.tree import moved, take
@@ -146,18 +146,18 @@ class Solution:
         parts = {name: without_gradients(part) for name, part in live.items()}
         return self if all(parts[name] is part for name, part in live.items()) else replace(self, **parts)
 
-    def shifted(self, steps: int = 1) -> Solution:
+    def shifted(self, steps: float = 1) -> Solution:
         """The guess for the same problems `steps` stages later, as `solve(problem, warm=solution.shifted())` takes it.
 
         For a receding horizon: the new problem starts where this plan is after these stages, or near there, and counts
         its knots from there. Every knot takes the state, control, feedback and multipliers of the one `steps` later,
-        those at the end the last ones. Rows at chosen knots, such as waypoints, keep theirs. Nothing is solved yet:
-        the status is RUNNING, cost and violation are NaN.
+        those at the end the last ones; part of a stage takes the straight line between. Rows at chosen knots, such as
+        waypoints, keep theirs. Nothing is solved yet: the status is RUNNING, cost and violation are NaN.
 
         Raises:
-            InputError: `steps` isn't a number of stages, 1 or more.
+            InputError: `steps` isn't a number of stages above 0.
         """
-        check_value(steps, Count, "steps")
+        check_value(steps, Positive, "steps")
         if self.times is not None:
             raise InputError("solution", "one of fixed times: later knots of a free time lie elsewhere", "a free time")
         last, problem = self.horizon, None if self.account is None else self.account.problem

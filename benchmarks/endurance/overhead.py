@@ -30,7 +30,7 @@ PHASES = {
     "judge": ["torchgco.experiments.flying.flight.judge", "torchgco.experiments.flying.flight.certify"],
     "draw layouts": ["torchgco.scenarios.base.Scenario.draw"],
     "make problems": ["torchgco.scenarios.vehicle.Vehicle.task"],
-    "progress": ["torchgco.experiments.flying.flight.Flight._progress"],
+    "progress": ["torchgco.experiments.flying.flight.SolveBatch._progress"],
     "digests": ["torchgco.experiments.flying.study.layout_digests"],
     "write shards": [f"{FOLDER}.keep"],
     "read shards": [

@@ -1,4 +1,6 @@
-"""python -m benchmarks.families.general_eager: the interior point in PyTorch's kernels beside that in C, by family.
+"""python -m benchmarks.families.general_eager: the interior point with functions that PyTorch computes, by family.
+
+Beside it, that with compiled ones: the same loop in C.
 
 Both solve the problems of a family as one batch of the size asked for. A cost is the same where it differs by 1e-6 of
 itself at most; times are processor time with one thread, without compilation.

@@ -17,7 +17,7 @@ from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
 from torchgco.missions.mission import Mission
 from torchgco.missions.outcome import Ending
-from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planner import MissionPlan, Planner
 from torchgco.missions.tables import clearances, ending, mission_frame, mission_row, samples
 from torchgco.missions.tracker import Tracker, Tracking
 from torchgco.plotting.bodies import bodies
@@ -59,7 +59,7 @@ def mission_of(name: str, duration: float) -> tuple[Mission, Task]:
 class TimedPlanner(Planner):
     """A planner whose seconds are those of the processor, which other programs hardly change."""
 
-    def plan(self, *arguments: Any, **options: Any) -> tuple[Plan, Problem, float]:
+    def plan(self, *arguments: Any, **options: Any) -> tuple[MissionPlan, Problem, float]:
         began = time.process_time()
         plan, problem, _ = super().plan(*arguments, **options)
         return plan, problem, time.process_time() - began

@@ -10,8 +10,9 @@ from tests.problems import planar_batch, quick_gco
 from torchgco import Status
 from torchgco.base import clock
 from torchgco.experiments.config.build import compose
-from torchgco.experiments.flying.flight import Flight
+from torchgco.experiments.flying.flight import SolveBatch
 from torchgco.experiments.flying.progress import NoBar
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.kernels import choice
 from torchgco.native import compiler
 from torchgco.roadmap import native as roadmap
@@ -61,7 +62,7 @@ def test_compiled_problems(loads: list[float]) -> None:
 
 def test_the_rows_of_a_study(loads: list[float]) -> None:
     setup = compose(["scenario=planar_trap", "study.layouts=3"])
-    flight = Flight(setup, setup.layouts(), "gco", setup.solver, NoBar())
+    flight = SolveBatch(Tasks(setup, setup.layouts()), range(3), "gco", setup.solver, NoBar())
     flight.compile()
     assert len(loads) >= 2  # the interior point's, too: no process compiles it while another one solves
     rows, _ = flight.fly()

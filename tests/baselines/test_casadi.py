@@ -29,7 +29,8 @@ from torchgco.baselines import CasADiSolver, Hold
 from torchgco.constraints import Constraint
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import compose
-from torchgco.experiments.flying.flight import Flight
+from torchgco.experiments.flying.flight import SolveBatch
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.solvers.contracts import Call, Solver
 
 PLUGINS = ["ipopt", "fatrop"]
@@ -285,7 +286,7 @@ def test_a_study_prepares_before_the_clock_starts(monkeypatch) -> None:
             return Hold().run(call)
 
     monkeypatch.setattr("torchgco.experiments.flying.flight._now", lambda device: float(events.append("clock") or 0.0))
-    Flight(setup, layouts, "builder", Builder(), tqdm(disable=True)).fly()
+    SolveBatch(Tasks(setup, layouts), range(layouts.count), "builder", Builder(), tqdm(disable=True)).fly()
     assert events == ["prepare", "clock", "solve", "clock"]
 
 
@@ -293,7 +294,7 @@ def test_a_flight_in_a_study() -> None:
     setup = compose(["scenario=layouts", f"scenario.path={DATA / 'planar_trap.npz'}", "model=planar", "solver=fatrop"])
     layouts = replace(setup.layouts(2), stages=20)
     with tqdm(total=2, disable=True) as bar:
-        rows, U = Flight(setup, layouts, "fatrop", setup.solver, bar).fly()
+        rows, U = SolveBatch(Tasks(setup, layouts), range(layouts.count), "fatrop", setup.solver, bar).fly()
     assert rows["status"].tolist() == ["CONVERGED"] * 2 and U.shape == (2, 20, 2) and bool(rows["feasible"].all())
 
 

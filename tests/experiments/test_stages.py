@@ -13,7 +13,7 @@ from torchgco import judge
 from torchgco.baselines import PathPursuit
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.reports.report import main
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import Layouts, Vehicle
 
 WORDS = [
     "scenario=floors", "scenario.size=[9,7]", "scenario.apart=4", "scenario.tracks=0.5", "seed=2", "study.layouts=4",
@@ -52,3 +52,14 @@ def test_failures_are_explained_layout_by_layout(run, tmp_path: Path) -> None:
     code, out, err = run(*words, "study.workers=1", "hydra.run.dir=out")
     assert code == 0, err
     assert "interior_point failed on" in out and out.count("Layout ") >= 2
+
+
+def test_a_study_makes_its_problems_once(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two solvers, the judge, pictures and advice share those of layouts with as many stages."""
+    made, task = [], Vehicle.task
+    monkeypatch.setattr(Vehicle, "task", lambda *words: made.append(words[1].count) or task(*words))
+    words = [*WORDS, "solver=path_pursuit", "study.baselines=[hold]", "study.workers=1", "hydra.run.dir=out"]
+    code, _, err = run(*words)
+    assert code == 0, err
+    layouts = compose(WORDS).layouts()
+    assert sorted(made) == sorted(len(group) for group in layouts.alike()) and len(made) > 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from torchgco.experiments.results.kinds import TRAJECTORIES
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import summarise
+from torchgco.maps.distance import DistanceField
+from torchgco.maps.grid import OccupancyGrid
 from torchgco.scenarios import Layouts
 
 HIT, MISS = True, False
@@ -271,10 +274,18 @@ def test_a_layout_digest_depends_only_on_what_is_flown() -> None:
     assert layout_digests(scene(vehicle_radius=0.1), PLANE | {"radius": 7}) == codes, "layouts overrule the vehicle"
 
 
+BOXED = {"box_centers": np.zeros((2, 1, 2)), "box_half_sizes": np.ones((2, 1, 2))}
+SWINGING = BOXED | dict.fromkeys(("box_amplitudes", "box_rates", "box_phases"), np.ones((2, 1, 1, 2)))
+GATED = {"gate_centers": np.ones((2, 1, 2)), "gate_radii": np.ones((2, 1))}
 OTHERS = {
     "vehicle_radius": 0.2, "goal_radius": 0.3, "dt": 0.1, "stages": 6, "control_lower": [-1.0], "control_upper": [1.0],
-    "start": np.ones(2), "goal": np.zeros(2), "velocities": np.ones((2, 2, 2)),
+    "start": np.ones(2), "goal": np.zeros(2), "velocities": np.ones((2, 2, 2)), "centers": scene().centers + 1.0,
+    "radii": np.array([[0.3, np.nan], [0.3, 0.3]]), "box_radii": np.ones((2, 1)), "box_rotations": np.ones((2, 1)),
+    "free_time": [0.5, 2.0, 1.0], "goal_required": True,
+    "map": DistanceField.of(OccupancyGrid(np.eye(3, dtype=bool), [0.0, 0.0], 0.1)),
+    **{name: value + 1.0 for name, value in (SWINGING | GATED).items()},
 }  # fmt: skip
+OF_NO_FLIGHT = {"best_cost", "name", "ids"}
 
 
 def test_boxes_make_another_layout_unless_absent() -> None:
@@ -287,9 +298,11 @@ def test_boxes_make_another_layout_unless_absent() -> None:
     assert sharp == some and rounded[0] != some[0] and rounded[1] == some[1]
 
 
-@pytest.mark.parametrize("field", OTHERS)
+@pytest.mark.parametrize("field", sorted({f.name for f in fields(Layouts)} - OF_NO_FLIGHT))
 def test_every_input_of_a_flight_changes_the_digest(field: str) -> None:
-    one, other = layout_digests(scene(), PLANE), layout_digests(scene(**{field: OTHERS[field]}), PLANE)
+    boxes = field in ("box_radii", "box_rotations")
+    plain = scene(**next((group for group in (BOXED, SWINGING, GATED) if field in group or boxes), {}))
+    one, other = layout_digests(plain, PLANE), layout_digests(replace(plain, **{field: OTHERS[field]}), PLANE)
     assert not set(one.values()) & set(other.values())
 
 

@@ -14,7 +14,7 @@ from tests.reference.mppi import MppiSettings, mppi
 from torchgco import GCO, MPPI, InputError
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.dynamics.rollout import open_loop
-from torchgco.eager.sampling import Flight, Noise, draw, fly
+from torchgco.eager.sampling import Noise, Rollouts, draw, fly
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.solvers.caught import active_counts, caught_knots
 
@@ -54,7 +54,7 @@ def test_improve_equals_algorithm_3(batch: str, saturation: str, native: bool, m
         np.testing.assert_allclose(X[b], expected.X, rtol=1e-6, atol=1e-6)
 
 
-def flown(problem, V: torch.Tensor) -> Flight:
+def flown(problem, V: torch.Tensor) -> Rollouts:
     """Rollouts of samples with the controls V (B, S, N, m)."""
     noise = Noise(V.permute(2, 0, 1, 3).contiguous(), torch.ones(1, 1, problem.m, dtype=V.dtype), None, None)
     return fly(problem, torch.zeros_like(noise.z[:, :, :1]), noise, None)

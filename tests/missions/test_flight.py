@@ -14,7 +14,7 @@ from tests.missions.missions import DOUBLE, DT, REST, SOLVER, far, mission, vari
 from torchgco import FunctionCost, InputError, Problem
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.missions import Disturbance, Flight, Outcome, endings, pilot, planner
-from torchgco.missions.planner import Plan
+from torchgco.missions.planner import MissionPlan
 from torchgco.missions.planning_problem import continued, planning_state, settled
 
 
@@ -56,7 +56,7 @@ def test_a_plan_of_somebody_elses(knots: int) -> None:
     torch.testing.assert_close(kept, problem.x0[:, None, :3].expand_as(kept), rtol=0, atol=1e-3)
     after, again = flight.step(), flight.step()
     assert bool(after.plan.cost.isfinite().all()) and not bool(again.plan.shifted.any())
-    later = flight.step(replace(again.plan, X=again.plan.X.roll(-1, 1)))  # a Plan, too
+    later = flight.step(replace(again.plan, X=again.plan.X.roll(-1, 1)))  # a MissionPlan, too
     assert torch.equal(later.plan.X, again.plan.X.roll(-1, 1))
     assert bool((flight.log.steps() == 6).all())
 
@@ -72,10 +72,12 @@ class Waiting:
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
         self.calls.append(f"sense {len(x)}")
 
-    def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
+    def plan(
+        self, step: int, x: Tensor, before: MissionPlan | None, measured: Tensor | None = None
+    ) -> tuple[MissionPlan, float]:
         assert (before is None) == (step == 0) or len(before.X) == len(x)
         self.calls.append(f"plan {len(x)}")
-        return Plan.of_states(resting(x, 3), x, self.model, step), 0.25
+        return MissionPlan.of_states(resting(x, 3), x, self.model, step * DT, DT), 0.25
 
     def take(self, index: Tensor) -> None:
         self.ids = self.ids[index]

@@ -28,7 +28,7 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import followed
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.missions.disturbance import Disturbance
-from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planner import MissionPlan, Planner
 from torchgco.missions.planning_problem import Margin
 from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.obstacles.spheres import BoundSpheres
@@ -41,7 +41,7 @@ FIRM = replace(SOLVER, max_outer_iterations=30, violation_tolerance=1e-3)
 RADIUS = 0.5  # m, of sphere and vehicle together in `scene`
 
 
-def first_plan(planner: Planner, problem: Problem, x: Tensor | None = None) -> tuple[Plan, Problem]:
+def first_plan(planner: Planner, problem: Problem, x: Tensor | None = None) -> tuple[MissionPlan, Problem]:
     """The plan of control step 0 from plants x (B, 17), by default hovering at the start; and its problem."""
     x = hovering(FRAME, problem.x0[:, :3]) if x is None else x
     plan, now, seconds = planner.plan(
@@ -51,9 +51,13 @@ def first_plan(planner: Planner, problem: Problem, x: Tensor | None = None) -> t
     return plan, now
 
 
-def next_plan(planner: Planner, problem: Problem, now: Problem, before: Plan, x: Tensor) -> tuple[Plan, Problem]:
+def next_plan(
+    planner: Planner, problem: Problem, now: Problem, before: MissionPlan, x: Tensor
+) -> tuple[MissionPlan, Problem]:
     """The plan of the control step after `before`."""
-    plan, now, _ = planner.plan(problem, now, x, before.step + 1, before, 1, torch.arange(problem.B))
+    plan, now, _ = planner.plan(
+        problem, now, x, round(float(before.start[0]) / DT) + 1, before, 1, torch.arange(problem.B)
+    )
     return plan, now
 
 
@@ -80,7 +84,7 @@ def test_the_first_plan_is_the_solvers_own_solution() -> None:
     solution = SOLVER.solve(alone, U0)
     for name in ("X", "U", "cost", "violation"):
         torch.testing.assert_close(getattr(plan, name), getattr(solution, name), rtol=1e-7, atol=1e-9)
-    assert plan.step == 0 and not bool(plan.shifted.any()) and torch.equal(plan.measured, x)
+    assert not bool(plan.start.any()) and not bool(plan.shifted.any()) and torch.equal(plan.measured, x)
     biased, _ = first_plan(Planner(SOLVER, margin=0.0), problem)  # an estimate of zero changes nothing
     torch.testing.assert_close(biased.X, plan.X, rtol=1e-7, atol=1e-9)
     assert not bool(biased.bias.any())
@@ -193,7 +197,7 @@ def test_moving_spheres_are_planned_where_they_will_be() -> None:
     torch.testing.assert_close(part.value(plan.X, plan.U), moved.value(plan.X, plan.U)[:, :10], rtol=1e-12, atol=1e-12)
 
 
-def by_feedback(problem: Problem, plan: Plan, x: Tensor) -> Tensor:
+def by_feedback(problem: Problem, plan: MissionPlan, x: Tensor) -> Tensor:
     """The controls of a plan one stage later, from states x (B, 14), step by step."""
     controls, last = [], problem.N - 1
     for k in range(problem.N):
@@ -429,7 +433,12 @@ def test_where_a_plan_has_arrived_one_that_waits_is_not_the_last_word() -> None:
     first, now = first_plan(planner, problem)
     assert bool(first.arrived.all()) and bool(has_arrived(now, first.X).all())
     for step, known, arrives in ((8, True, False), (9, True, True), (9, False, False)):
-        before = replace(first, step=step, arrived=first.arrived & known, violation=first.violation * 0.0)
+        before = replace(
+            first,
+            start=torch.full_like(first.start, step * DT),
+            arrived=first.arrived & known,
+            violation=first.violation * 0.0,
+        )
         before = replace(before, X=now.x0.unsqueeze(1).repeat(1, now.N + 1, 1), U=now.cost.rest_controls(first.U))
         plan, later = next_plan(planner, problem, now, before, hovering(FRAME, problem.x0[:, :3]))
         assert bool(has_arrived(later, plan.X).all()) == arrives and bool((plan.violation <= 1e-2).all())

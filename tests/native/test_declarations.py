@@ -89,7 +89,7 @@ def test_a_structure_of_another_size_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("folder", "name", "header"),
-    [(C, "structures.h", structures.HEADER), (roadmap.C, "search.h", roadmap.SEARCH_HEADER),
+    [(C, "structures.h", structures.HEADER), (roadmap.C, "cheapest.h", roadmap.SEARCH_HEADER),
      (roadmap.C, "lattice.h", native_maps.LATTICE_HEADER)],
 )  # fmt: skip
 def test_each_field_lies_where_python_writes_it(folder: Path, name: str, header: Header) -> None:

@@ -32,6 +32,7 @@ from torchgco.obstacles import Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
 
 D, N = torch.float64, 10
+GUESS = torch.full((2, N, 2), 0.3, dtype=D)
 WEIGHTS = {"Q": [1.0] * 6, "R": [0.1] * 2, "Qf": [10.0] * 6, "x_ref": [1.0, 0, 0, 0, 0, 0]}
 
 
@@ -182,7 +183,7 @@ TORN = {
     "cost.scaled": lambda: of_bound_cost(OwnSlopes),
     "constraints[0].accumulate": lambda: of_bound_spheres(Larger),
     "constraints[0].violation": lambda: of_bound_spheres(made_violation()),
-    "constraints[0].value": lambda: of_bound_spheres(Nearer),
+    "constraints[0].rows": lambda: of_bound_spheres(Nearer),
     "constraints[0].accumulate ": lambda: problem(Narrower(-9.0, 9.0)),
     "constraints[0].accumulate  ": lambda: problem(Later(lambda x: x[..., :1] - 0.5)),
 }
@@ -253,8 +254,10 @@ class NoValue(Constraint):
 
 @dataclass(frozen=True)
 class NoSlopes(NoValue):
+    knots = slice(0, N)
+
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return X[:, 1:, :1] - 0.5
+        return (X[:, :-1, :2] * U).sum(-1, keepdim=True) - 0.2
 
 
 @dataclass(frozen=True)
@@ -301,10 +304,40 @@ def test_what_a_class_leaves_out_is_named(field: str) -> None:
 
 
 @pytest.mark.parametrize("solver", ["al_ilqr", "ilqr", "interior_point", "gco"])
-def test_slopes_that_a_solver_needs_are_asked_for(solver: str) -> None:
+def test_rows_without_derivatives_of_their_own_are_differentiated(solver: str) -> None:
+    rows = FunctionConstraint(lambda x, u: (x[..., :2] * u).sum(-1, keepdim=True) - 0.2, of="xu")
     use_native(False)
     try:
-        with pytest.raises(InputError, match=r"NoSlopes\.accumulate: "):
-            torchgco.solve(problem(NoSlopes()), solver=solver)
+        found, due = (torchgco.solve(problem(part), solver=solver, U0=GUESS) for part in (NoSlopes(), rows))
     finally:
         use_native(True)
+    assert found.statuses == due.statuses and float((found.U - due.U).abs().max()) < 1e-6
+
+
+def test_the_derivatives_by_default_are_those_of_each_row() -> None:
+    generator = torch.Generator().manual_seed(4)
+    X, U = (torch.randn(2, K, width, generator=generator, dtype=D) for K, width in ((N + 1, 6), (N, 2)))
+    part = problem(NoSlopes()).constraints[0]
+    g, h = torch.randn(2, 2, N, 1, generator=generator, dtype=D).unbind(0)
+    found = torch.zeros(2, N + 1, 9, 9, dtype=D)
+    part.accumulate(X, U, g, h, found)
+    due = torch.zeros_like(found)
+    for b in range(2):
+        for k in range(N):
+            slope = torch.zeros(9, dtype=D)  # of x_0 u_0 + x_1 u_1, in the order [x, 1, u]
+            slope[:2], slope[7:] = U[b, k], X[b, k, :2]
+            due[b, k] = h[b, k] * slope.outer(slope)
+            due[b, k, 6] += g[b, k] * slope
+            due[b, k, :, 6] += g[b, k] * slope
+    assert float((found - due).abs().max()) < 1e-12
+
+
+class Doubled(NoSlopes):
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        super().accumulate(X, U, 2.0 * g, h, H)
+
+
+def test_derivatives_that_are_wrong_are_named() -> None:
+    with pytest.raises(InputError, match="where differences give") as told:
+        problem(Doubled())
+    assert told.value.field == "constraints[0].accumulate"

@@ -17,10 +17,10 @@ from torchgco.base.tree import cast, take
 from torchgco.kernels import EagerWarning
 from torchgco.obstacles.base import Solids
 from torchgco.roadmap import native as native
+from torchgco.roadmap.cheapest import HOPS, Graph, TorchSearch
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import Roadmap, halton
-from torchgco.roadmap.search import HOPS, Graph, TorchSearch
 
 B = 3
 
@@ -221,7 +221,7 @@ def test_pytorch_searches_in_single_precision_and_without_a_compiler(
     assert library_for(s.start) is None
     paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
-    (tmp_path / "search.c").write_text("not C code")
+    (tmp_path / "cheapest.c").write_text("not C code")
     monkeypatch.setattr(native, "C", tmp_path)
     native._library.cache_clear()
     with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):

@@ -55,7 +55,7 @@ def test_a_search_that_goes_on_makes_no_graph(scene: Scene, monkeypatch: pytest.
         for course in known.courses((roadmap, group), torch.arange(group, min(group + 3, 5))) or ()
     } == {2 + 64 + 128, 2 + 64 + 160}
     monkeypatch.setattr("torchgco.roadmap.native.NativeSearch.graph", None)
-    monkeypatch.setattr("torchgco.roadmap.search.TorchSearch.graph", None)
+    monkeypatch.setattr("torchgco.roadmap.cheapest.TorchSearch.graph", None)
     assert torch.equal(roadmap.paths(scene, 3, SOME, known)[0][:, :1], made[SOME])
 
 

@@ -12,11 +12,11 @@ from tests.search.scenes import NONE, inflated
 from tests.slow import mostly
 from torchgco import InputError, compose
 from torchgco.obstacles.base import squares_from_segments
+from torchgco.roadmap.cheapest import Graph, TorchSearch
 from torchgco.roadmap.geometry import Scene, points_along
 from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
-from torchgco.roadmap.search import Graph, TorchSearch
 
 
 def flat(points, rows):

@@ -328,7 +328,7 @@ def test_a_problem_has_the_rows_of_its_kind() -> None:
     field = Field(OccupancyGrid(np.zeros((20, 20), bool), [-1.0, -1.0], 0.1), 0.05)
     kinds = {"bodies": bodies.constraints, "moving": [moving, bounds], "free": [bounds], "maps": [field, bounds]}
     rows = {
-        "free": ["guess", "tighten"], "moving": ["guess", "samples", "clear", "tighten"],
+        "free": ["guess", "tighten"], "moving": ["guess", "timed", "samples", "clear", "tighten"],
         "maps": ["guess", "maps", "paths", "samples", "clear", "tighten"],
         "bodies": ["guess", "paths", "tube", "samples", "clear", "tighten"],
     }  # fmt: skip

@@ -13,7 +13,7 @@ from torchgco.exploration.sensing.grid import FREE, OCCUPIED
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.missions.log import SeenLog
 from torchgco.view.document import Document, SearchPart
-from torchgco.view.flights import Flight, flights_of
+from torchgco.view.flights import ShownFlight, flights_of
 from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
@@ -82,7 +82,7 @@ def sensed() -> Sensed:
     return Sensed(SeenLog(np.array([-1.0, -4, -2]), shape, 1.0, changes), sought, np.arange(N + 1) % 2 == 0)
 
 
-def flown_by_a_mission(flight: Flight) -> Flight:
+def flown_by_a_mission(flight: ShownFlight) -> ShownFlight:
     """A flight with plans, each 2 m on from where the vehicle is along y, and what `sensed` says."""
     ahead = np.stack((np.zeros(9), np.linspace(0, 2, 9), np.zeros(9)), axis=-1)
     return replace(flight, plan=flight.path[:, None] + ahead, sensed=sensed())

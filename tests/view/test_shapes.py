@@ -12,14 +12,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.view.scenes import DT, RADIUS, SOLVERS, N, problem, trajectories
-from torchgco import Boxes, Field, FunctionDynamics, Planar, Problem, QuadraticCost, QuadrotorPlanning, Unicycle
+from torchgco import Boxes, Field, FunctionDynamics, Moved, Planar, Problem, QuadraticCost, QuadrotorPlanning, Unicycle
 from torchgco.dynamics import Dynamics
 from torchgco.judging.contact import contacts
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.shapes import RoundedBoxes
+from torchgco.plotting.world import world_of
 from torchgco.view import document
 from torchgco.view.flights import flights_of, violated, whole
+from torchgco.view.packing import Packing
 from torchgco.view.shapes import Shapes, merged, once, shapes_of, turns
 from torchgco.view.vehicles import Look, look_of
 
@@ -28,6 +30,9 @@ def distance(shapes: Shapes, p: np.ndarray, t: float) -> np.ndarray:
     """Distances (M,) of a point from the surfaces of the shapes as the page draws them."""
     M, d = shapes.center.shape
     center = shapes.center + (0 if shapes.velocity is None else t * shapes.velocity)
+    if shapes.track is not None:
+        at, times = shapes.track, shapes.step * np.arange(len(shapes.track))
+        center = np.stack([[np.interp(t, times, at[:, i, j]) for j in range(d)] for i in range(M)])
     if shapes.turn is None:
         axes = np.tile(np.eye(d), (M, 1, 1))
     elif d == 2:
@@ -50,6 +55,23 @@ def test_every_kind_is_drawn_where_it_is() -> None:
             np.testing.assert_allclose(distance(shapes, p, t), there, atol=1e-9)
 
 
+@pytest.mark.parametrize("half", [None, [[0.3, 0.1, 0.0], [0.4, 0.4, 0.4]]])
+def test_what_follows_a_track_is_drawn_where_it_is(half: list[list[float]] | None) -> None:
+    rng, task = np.random.default_rng(4), problem(2)
+    path = rng.uniform(0, 5, (N + 1, 2, 3))
+    task = Problem(task.dynamics, task.cost, [Moved(path, 0.2, RADIUS, half)], task.x0, N)
+    part, bodies = task.obstacles[0], world_of(task, 1).scenes[0].bodies[0]
+    shapes = shapes_of(part, 1)
+    assert shapes is not None and len(bodies) == 2 and all(body.moving for body in bodies)
+    for p, t in zip(rng.uniform(-3, 9, (40, 3)), rng.uniform(0, 5, 40), strict=True):
+        there = part.signed_distance(torch.from_numpy(p).expand(2, 1, 3), torch.tensor([t]).double())[1, 0].numpy()
+        np.testing.assert_allclose(distance(shapes, p, t), there + RADIUS, atol=1e-9)
+        drawn = [body.distance(p[None], np.array([t]))[0] - body.radius for body in bodies]
+        np.testing.assert_allclose(drawn, there + RADIUS, atol=1e-9)
+    held = shapes.packed(Packing(), np.zeros(3))
+    assert held["knots"] == N + 1 and held["step"] == DT and held["track"]["shape"] == [2 * (N + 1), 3]
+
+
 def test_turned_boxes_in_the_plane() -> None:
     cost = QuadraticCost(Q=[0.0] * 6, R=[1.0] * 2, Qf=[1.0] * 6, x_ref=[1.0, 0, 0, 0, 0, 0])
     boxes = Boxes([[0.5, 0.2], [0.1, 0.9]], [[0.3, 0.1], [0.2, 0.2]], 0.05, rotations=[0.7, -2.0], radii=[0.1, 0.0])
@@ -69,6 +91,14 @@ def test_quaternions_of_any_turn() -> None:
         assert found is not None
         np.testing.assert_allclose(Rotation.from_quat(found[:, [1, 2, 3, 0]]).as_matrix(), matrices, atol=1e-12)
     assert turns(np.tile(np.eye(3), (4, 1, 1))) is None
+
+
+def test_sides_in_any_order_are_turned_to_be_drawn() -> None:
+    sides = Rotation.random(5, random_state=4).as_matrix()[:, [1, 0, 2]]  # left-handed
+    found = turns(sides)
+    assert found is not None
+    drawn = Rotation.from_quat(found[:, [1, 2, 3, 0]]).as_matrix().transpose(0, 2, 1)
+    np.testing.assert_allclose(np.abs((drawn * sides).sum(-1)), 1.0, atol=1e-12)  # the same sides, whichever way
 
 
 def test_equal_rows_are_kept_once() -> None:

@@ -57,9 +57,9 @@ class WithoutReading(TorchFunctionMode):
         if tensors:
             self.seen.add(name)
         if any(is_functional(tensor) or is_functorch_wrapped_tensor(tensor) for tensor in tensors):
-            found = ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
-            self.refused = self.refused or found
-            raise found
+            refusal = ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
+            self.refused = self.refused or refusal
+            raise refusal
         self.read += tensors
 
 
@@ -80,7 +80,7 @@ def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ..
     sizes = [arg.shape[-1] for arg in args]
 
     def along(direction: Tensor) -> Tensor:
-        tangents = tuple(part.expand_as(arg) for part, arg in zip(direction.split(sizes), args, strict=True))
+        tangents = tuple(tangent.expand_as(arg) for tangent, arg in zip(direction.split(sizes), args, strict=True))
         return slope_along(function, args, tangents)
 
     basis = torch.eye(sum(sizes), dtype=args[0].dtype, device=args[0].device)
@@ -103,13 +103,13 @@ def gradients_at_once(function: Callable[..., Tensor], *args: Tensor) -> tuple[T
             with torch.enable_grad():
                 z = [arg.detach().clone().requires_grad_() for arg in args]
                 total = function(*z).sum()
-                found = torch.autograd.grad(total, z, allow_unused=True) if total.requires_grad else [None] * len(z)
+                slopes = torch.autograd.grad(total, z, allow_unused=True) if total.requires_grad else [None] * len(z)
         except ReadsMemory:
             raise
         except RuntimeError:  # a tensor of the function was made in inference mode, say
             pass
         else:
-            return tuple(torch.zeros_like(arg) if g is None else g for g, arg in zip(found, args, strict=True))
+            return tuple(torch.zeros_like(arg) if g is None else g for g, arg in zip(slopes, args, strict=True))
     return gradients(function, *args)
 
 

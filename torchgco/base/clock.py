@@ -28,7 +28,7 @@ def setting_up() -> Iterator[None]:
     try:
         yield
     finally:
-        wall, processor = (at - before for at, before in zip(_now(), began, strict=True))
+        wall, processor = (now - before for now, before in zip(_now(), began, strict=True))
         _left.out, _left.since = (_left.out[0] + wall, _left.out[1] + processor), None
 
 

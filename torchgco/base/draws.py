@@ -54,9 +54,9 @@ def standard_normal(
     mixed = words(key, stream)
     high, low = ((mixed >> 32).to(torch.int32).view(1, -1, 1), mixed.to(torch.int32).view(1, -1, 1))
     # Counted by sample first, so that a sample keeps its numbers in a range of any length.
-    place = torch.arange(half, dtype=torch.int32, device=key.ids.device).view(half, 1, 1)
+    index = torch.arange(half, dtype=torch.int32, device=key.ids.device).view(half, 1, 1)
     number = torch.arange(samples.start, samples.stop, dtype=torch.int32, device=key.ids.device)
-    counter = (number * half).view(1, 1, width) + place
+    counter = (number * half).view(1, 1, width) + index
     word = _mix32_((counter * WEYL) ^ low)
     radius = _uniform(word).log_().mul_(-2.0).sqrt_()
     angle = _uniform(_mix32_(word ^ high)).mul_(2.0 * math.pi)
@@ -70,9 +70,9 @@ def smooth_normal(key: DrawKey, knots: int, like: Tensor) -> Tensor:
     """Draws shaped as controls (B, N, m): N(0, 1) at `knots` points evenly spaced in time, linear between them."""
     N, m = like.shape[1:]
     z = standard_normal(key, knots * m, range(1), like.dtype).view(knots, m, -1).permute(2, 0, 1)
-    place = torch.linspace(0, knots - 1, N, dtype=like.dtype, device=like.device)
-    left = place.floor().clamp(max=knots - 2).long()
-    return torch.lerp(z[:, left], z[:, left + 1], (place - left).view(-1, 1))
+    position = torch.linspace(0, knots - 1, N, dtype=like.dtype, device=like.device)
+    left = position.floor().clamp(max=knots - 2).long()
+    return torch.lerp(z[:, left], z[:, left + 1], (position - left).view(-1, 1))
 
 
 def _uniform(word: Tensor) -> Tensor:
@@ -100,8 +100,8 @@ def _mix64(z: Tensor) -> Tensor:
 
 def scattered(like: Tensor) -> Tensor:
     """Numbers between -1 and 1 in the shape of `like`, without an order, the same in every process."""
-    place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
-    return (place * 1.618).cos().reshape(like.shape)
+    index = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
+    return (index * 1.618).cos().reshape(like.shape)
 
 
 def uniform(seed: int, shape: tuple[int, ...], like: Tensor) -> Tensor:

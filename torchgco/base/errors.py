@@ -49,10 +49,10 @@ def theirs(error: BaseException) -> BaseException | None:
     import torch
 
     ours = tuple(str(Path(file).parent) + os.sep for file in (Path(__file__).parent, torch.__file__))
-    part = error.__traceback__
-    while part is not None and part.tb_frame.f_code.co_filename.startswith(ours):
-        part = part.tb_next
-    return None if part is None else error.with_traceback(part)
+    trace = error.__traceback__
+    while trace is not None and trace.tb_frame.f_code.co_filename.startswith(ours):
+        trace = trace.tb_next
+    return None if trace is None else error.with_traceback(trace)
 
 
 class GuidanceWarning(UserWarning):

@@ -34,16 +34,16 @@ def write_whole(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, part = tempfile.mkstemp(PART[1], PART[0], path.parent)
+    handle, temporary = tempfile.mkstemp(PART[1], PART[0], path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
             save(file)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(part, 0o644)
-        (move or os.replace)(part, path)
+        os.chmod(temporary, 0o644)
+        (move or os.replace)(temporary, path)
     finally:
-        Path(part).unlink(missing_ok=True)  # gone already after a move
+        Path(temporary).unlink(missing_ok=True)  # gone already after a move
 
 
 def regular(path: str | os.PathLike[str]) -> Path:
@@ -86,8 +86,8 @@ def read_arrays(
             if size > room:
                 expected = f"arrays that fit into the {room / 1e9:.3g} GB {limit}"
                 raise InputError(field, expected, f"{path}, whose arrays take {size / 1e9:.3g} GB")
-            with np.load(file, allow_pickle=False) as held:
-                arrays = {name: held[name] for name in held.files}
+            with np.load(file, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
             longest = max((max(array.shape, default=0) for array in arrays.values() if not array.size), default=0)
             if INDEX_BYTES * longest > room:  # no numbers, but as many rows
                 expected = f"arrays whose rows fit into the {room / 1e9:.3g} GB {limit}"

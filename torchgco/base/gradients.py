@@ -58,16 +58,16 @@ def is_recording() -> bool:
 
 def leaves(tree: Any) -> list[Any]:
     """All that nested sequences, mappings and dataclasses hold, but for these themselves."""
-    found: list[Any] = []
+    flat: list[Any] = []
     waiting, seen = [tree], set[int]()
     while waiting:
-        part = waiting.pop()
-        if not _holds(type(part)):
-            found.append(part)
-        elif id(part) not in seen:  # parts may hold each other
-            seen.add(id(part))
-            waiting += [held for _, held in _parts(part)]
-    return found
+        node = waiting.pop()
+        if not _holds(type(node)):
+            flat.append(node)
+        elif id(node) not in seen:  # parts may hold each other
+            seen.add(id(node))
+            waiting += [child for _, child in _parts(node)]
+    return flat
 
 
 @lru_cache(maxsize=4096)

@@ -34,8 +34,8 @@ def limited(size: float) -> Iterator[None]:
 
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     with open("/proc/self/status") as lines:
-        held = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
-    limit = held + int(size) if soft == resource.RLIM_INFINITY else min(held + int(size), soft)
+        used = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
+    limit = used + int(size) if soft == resource.RLIM_INFINITY else min(used + int(size), soft)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
     try:
         yield

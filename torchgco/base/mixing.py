@@ -36,8 +36,8 @@ def why(error: Exception, function: Callable[..., Any], *arguments: Any) -> str:
     The first floating-point tensor of the arguments has the type of x0.
     """
     real = [z for z in arguments if isinstance(z, Tensor) and z.is_floating_point()]
-    if (found := foreign(real[0].dtype, function, *arguments) if real else None) is not None:
-        return found
+    if (mismatch := foreign(real[0].dtype, function, *arguments) if real else None) is not None:
+        return mismatch
     return (str(error).splitlines() or [""])[0] or type(error).__name__
 
 

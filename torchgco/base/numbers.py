@@ -6,6 +6,7 @@ stages stays shared. Each part names its own in `numbers`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -67,21 +68,21 @@ class Number:
             InputError: another shape, no numbers, or numbers that the problem can't have.
         """
         value = value if self.none is None else bound_of(value, self.none)
-        given, shape = as_floats(value, self.name), self.shape
-        if given.shape != shape and given.shape != shape[1:]:
+        floats, shape = as_floats(value, self.name), self.shape
+        if floats.shape != shape and floats.shape != shape[1:]:
             expected = f"shape {shape}" if len(shape) == 1 else f"shape {shape}, or {shape[1:]} for all problems"
-            raise InputError(self.name, expected, given.shape)
-        if (wrong := self.check(given)) is not None:
+            raise InputError(self.name, expected, floats.shape)
+        if (wrong := self.check(floats)) is not None:
             raise InputError(self.name, *wrong)
-        return given
+        return floats
 
-    def write(self, given: Floats) -> None:
+    def write(self, floats: Floats) -> None:
         """Write numbers that are `checked`."""
         if len(self.views) == 1:
-            self.views[0][...] = given
+            self.views[0][...] = floats
         else:
             first, last = self.views
-            first[...], last[...] = given[..., :-1, :], given[..., -1, :]
+            first[...], last[...] = floats[..., :-1, :], floats[..., -1, :]
         if self.after is not None:
             self.after()
 
@@ -120,7 +121,7 @@ def numbers(
 
 def numbers_of_fields(part: Any, where: str, place: str | int) -> list[Number]:
     """The floating numbers of any part, its `values` by their own names."""
-    found = []
+    entries = []
     for field in (*part.batched, *part.per_element) if isinstance(part, PerElement) else ():
         value = getattr(part, field)
         tensors: dict[str, Any] = {field: value}
@@ -128,11 +129,11 @@ def numbers_of_fields(part: Any, where: str, place: str | int) -> list[Number]:
             names = (*value.names, *value.knot_names)
             tensors = dict(zip(names, (*value.rows, *value.knot_rows), strict=True))
         elif isinstance(value, PerElement):
-            found += numbers_of_fields(value, f"{where}.{field}", place)
-        for own, tensor in tensors.items():
+            entries += numbers_of_fields(value, f"{where}.{field}", place)
+        for key, tensor in tensors.items():
             if isinstance(tensor, Tensor) and tensor.is_floating_point() and tensor.dim() > 0:
-                found += numbers(where, {own: (tensor, finite)}, place)
-    return found
+                entries += numbers(where, {key: (tensor, finite)}, place)
+    return entries
 
 
 def crossed(part: Any, where: str, is_over: Callable[..., Any], expected: str) -> Joint:
@@ -177,3 +178,17 @@ def angles(new: Floats) -> Wrong:
 
 def directions(new: Floats) -> Wrong:
     return finite(new) or (None if (np.abs(new).max(-1) > 0).all() else ("vectors other than 0", new.tolist()))
+
+
+def measured(x: Any, B: int, n: int) -> Floats:
+    """States (B, n), or (n,) of all vehicles.
+
+    Raises:
+        InputError: another shape, no numbers, NaN or infinity.
+    """
+    state = as_floats(x, "x")
+    if state.shape not in ((B, n), (n,)):
+        raise InputError("x", f"shape ({B}, {n}), or ({n},) for all vehicles", state.shape)
+    if not math.isfinite(state.sum()) and not np.isfinite(state).all():  # a sum takes a third of the time
+        raise InputError("x", "finite states", "NaN or infinity")
+    return state

@@ -145,8 +145,8 @@ def _plain(value: Any, rule: Rule, field: str) -> Any:
 def _rules(cls: type) -> tuple[tuple[str, Rule], ...]:
     """The fields of a dataclass that can be checked, with their rules."""
     hints = _hints(cls)
-    found = ((f.name, _rule(hints[f.name])) for f in fields(cls) if f.init and f.name in hints)
-    return tuple((name, rule) for name, rule in found if rule is not None)
+    rules = ((f.name, _rule(hints[f.name])) for f in fields(cls) if f.init and f.name in hints)
+    return tuple((name, rule) for name, rule in rules if rule is not None)
 
 
 def _hints(cls: type) -> dict[str, Any]:
@@ -263,11 +263,11 @@ PLAIN_RULES: dict[Any, Rule] = {
 
 def option_places(part: Any, inside: str = "") -> list[str]:
     """The options of an object and of its parts, such as "passes.paths.num_paths"; parts have fields or keys."""
-    held = dict[str, Any]()
+    values = dict[str, Any]()
     if is_dataclass(part) and not isinstance(part, type):
-        held = {field.name: getattr(part, field.name) for field in fields(part) if field.init}
+        values = {field.name: getattr(part, field.name) for field in fields(part) if field.init}
     elif hasattr(part, "keys"):
         rows: Any = part
-        held = dict(rows)
-    here = {f"{inside}{name}": value for name, value in held.items()}
-    return [place for name, value in here.items() for place in (name, *option_places(value, f"{name}."))]
+        values = dict(rows)
+    here = {f"{inside}{name}": value for name, value in values.items()}
+    return [path for name, value in here.items() for path in (name, *option_places(value, f"{name}."))]

@@ -19,10 +19,10 @@ def exponential(a: Tensor) -> Tensor:
     """The exponentials of matrices (B, n, n), by their Taylor series at a share of them, squared again."""
     norm = a.abs().amax((1, 2)) * a.shape[-1]
     halvings = torch.ceil(torch.log2(2.0 * norm)).nan_to_num(0.0, 0.0, 0.0).clamp(0, HALVINGS)
-    small, one = a * torch.exp2(-halvings).view(-1, 1, 1), torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
-    power = one + small / TAYLOR
+    small, eye = a * torch.exp2(-halvings).view(-1, 1, 1), torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
+    power = eye + small / TAYLOR
     for k in range(TAYLOR - 1, 0, -1):
-        power = one + product(small, power) / k
+        power = eye + product(small, power) / k
     for done in range(int(halvings.amax()) if len(a) else 0):
         power = torch.where((done < halvings).view(-1, 1, 1), product(power, power), power)
     return power
@@ -33,15 +33,15 @@ def least_squares(rows: Tensor, values: Tensor) -> Tensor:
 
     By Gram and Schmidt, twice for each row.
     """
-    known, found = rows.new_zeros(rows.shape[0], 0, rows.shape[2]), rows.new_zeros(rows.shape[0], 0)
+    known, solved = rows.new_zeros(rows.shape[0], 0, rows.shape[2]), rows.new_zeros(rows.shape[0], 0)
     for row, value in zip(rows.unbind(1), values.unbind(1), strict=True):
         size = row.square().sum(-1, keepdim=True).sqrt()
         for _ in range(2):
             shares = (known * row.unsqueeze(1)).sum(-1)
-            row, value = row - (shares.unsqueeze(-1) * known).sum(1), value - (shares * found).sum(-1)
+            row, value = row - (shares.unsqueeze(-1) * known).sum(1), value - (shares * solved).sum(-1)
         left = row.square().sum(-1, keepdim=True).sqrt()
         kept = left > REPEATS * size
         row = torch.where(kept, row / left, 0.0)
         known = torch.cat((known, row.unsqueeze(1)), dim=1)
-        found = torch.cat((found, torch.where(kept, value.unsqueeze(-1) / left, 0.0)), dim=1)
-    return (found.unsqueeze(-1) * known).sum(1)
+        solved = torch.cat((solved, torch.where(kept, value.unsqueeze(-1) / left, 0.0)), dim=1)
+    return (solved.unsqueeze(-1) * known).sum(1)

@@ -52,7 +52,7 @@ def bound_of(value: Any, none: float) -> Any:
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
     if isinstance(value, list | tuple):
-        return [bound_of(one, none) for one in value]
+        return [bound_of(entry, none) for entry in value]
     return none if value is None else value
 
 
@@ -184,10 +184,10 @@ def per_row(value: Any, field: str, dims: Dimensions, *size: int | str) -> Tenso
     Raises:
         InputError: not numbers, or of another shape.
     """
-    found = tensor(value, field, dims.like)
-    found = found.expand(dims.B, *found.shape) if found.dim() == len(size) else found
-    check_shape(found, (dims.B, *size), field)
-    return found
+    values = tensor(value, field, dims.like)
+    values = values.expand(dims.B, *values.shape) if values.dim() == len(size) else values
+    check_shape(values, (dims.B, *size), field)
+    return values
 
 
 def check_finite(value: Tensor, field: str, expected: str = "finite numbers") -> None:

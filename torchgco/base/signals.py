@@ -24,11 +24,11 @@ def handled(
     """
     before: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        before = {number: held for number in numbers if replaces(held := signal.getsignal(number))}
+        before = {number: old for number in numbers if replaces(old := signal.getsignal(number))}
     for number in before:
         signal.signal(number, handler)
     try:
         yield
     finally:
-        for number, held in before.items():
-            signal.signal(number, held)
+        for number, old in before.items():
+            signal.signal(number, old)

@@ -96,7 +96,7 @@ class _Precision(TorchFunctionMode):
 
     def _converted(self, leaf: Any) -> Any:
         if isinstance(leaf, (tuple, list)):
-            return type(leaf)(self._converted(part) for part in leaf)
+            return type(leaf)(self._converted(entry) for entry in leaf)
         if isinstance(leaf, float):
             return torch.tensor(leaf, dtype=self.dtype)
         return leaf.to(self.dtype) if isinstance(leaf, Tensor) and leaf.dtype is not torch.bool else leaf
@@ -127,11 +127,11 @@ def bound_values(
     knots = dims.N + 1 if knots is None else knots
     if isinstance(values, Values):
         return _checked(values, dims, field, knots)
-    found: dict[str, dict[str, Tensor]] = {"values": {}, "knot_values": {}}
-    for kind, given, shape in (("values", values, (dims.B,)), ("knot_values", knot_values, (dims.B, knots))):
-        if given is not None and not isinstance(given, Mapping):
-            raise InputError(f"{field}.{kind}", "a dict of tensors by name, or None", shown(given))
-        for name, value in (given or {}).items():
+    by_kind: dict[str, dict[str, Tensor]] = {"values": {}, "knot_values": {}}
+    for kind, named, shape in (("values", values, (dims.B,)), ("knot_values", knot_values, (dims.B, knots))):
+        if named is not None and not isinstance(named, Mapping):
+            raise InputError(f"{field}.{kind}", "a dict of tensors by name, or None", shown(named))
+        for name, value in (named or {}).items():
             where = f"{field}.{kind}[{name!r}]"
             value = tensor(value, where, dims.like)
             if kind == "knot_values" and value.shape[:1] == (1,):
@@ -140,8 +140,8 @@ def bound_values(
                 raise InputError(where, f"shape ({', '.join(map(str, shape))}, ...)", tuple(value.shape))
             if not any(name in keywords(function) for function in functions if function is not None):
                 raise InputError(where, "the name of an argument of the function", "a name that it doesn't take")
-            found[kind][name] = value
-    rows, at_knots = found["values"], found["knot_values"]
+            by_kind[kind][name] = value
+    rows, at_knots = by_kind["values"], by_kind["knot_values"]
     return Values(tuple(rows), tuple(rows.values()), tuple(at_knots), tuple(at_knots.values()), dims.N)
 
 
@@ -165,10 +165,10 @@ class _All(frozenset):
 
 def keywords(function: Callable[..., Any]) -> frozenset[str]:
     """The arguments that a function takes by name; all of them where it takes **anything."""
-    found = _parameters(function)
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in found):
+    parameters = _parameters(function)
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
         return _All()
-    return frozenset(p.name for p in found if p.kind in NAMED_PARAMETERS)
+    return frozenset(p.name for p in parameters if p.kind in NAMED_PARAMETERS)
 
 
 def asks_for_knot(function: Callable[..., Any]) -> bool:
@@ -181,12 +181,12 @@ def _parameters(function: Callable[..., Any]) -> tuple[inspect.Parameter, ...]:
         return _known[function]
     called = function.forward if isinstance(function, torch.nn.Module) else function
     try:
-        found = tuple(inspect.signature(called).parameters.values())
+        parameters = tuple(inspect.signature(called).parameters.values())
     except (TypeError, ValueError):  # a builtin without a signature
-        found = ()
+        parameters = ()
     with suppress(TypeError):
-        _known[function] = found
-    return found
+        _known[function] = parameters
+    return parameters
 
 
 # A rollout by PyTorch's kernels asks at every knot; what a function captures must not outlive it for that.

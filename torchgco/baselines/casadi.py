@@ -109,14 +109,14 @@ class CasADiSolver(Solver, named="solver"):
     def _options(self, problem: Problem, program: Program) -> dict[str, Any]:
         """Options of the plugin and of CasADi around it; neither prints."""
         quiet = {"print_time": False, "show_eval_warnings": False}
-        given = dict(self.options or {})
+        chosen = dict(self.options or {})
         if self.plugin == "ipopt":
-            own = {"print_level": 0, "sb": "yes", "max_iter": self.max_iterations, "tol": self.tolerance}
-            return {**quiet, "ipopt": {**own, **given}}
-        own = {"print_level": 0, "max_iter": self.max_iterations, "tolerance": self.tolerance}
+            defaults = {"print_level": 0, "sb": "yes", "max_iter": self.max_iterations, "tol": self.tolerance}
+            return {**quiet, "ipopt": {**defaults, **chosen}}
+        defaults = {"print_level": 0, "max_iter": self.max_iterations, "tolerance": self.tolerance}
         return {
             **quiet,
-            "fatrop": {**own, **given},
+            "fatrop": {**defaults, **chosen},
             "structure_detection": "manual",  # the stages are known: nothing to guess
             "N": problem.N,
             "nx": [problem.n] * (problem.N + 1),
@@ -159,15 +159,15 @@ class PreparedCasADi(Solver):
         X0 = torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1))
         valid = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
         U, start, ends = U0.clone(), problem.x0.clone(), [(Status.CONVERGED, 0)] * problem.B
-        own, left = math.inf if self.solver.max_seconds is None else self.solver.max_seconds, list(range(problem.B))
+        limit, left = math.inf if self.solver.max_seconds is None else self.solver.max_seconds, list(range(problem.B))
         while left:
             cut = []
             for done, b in enumerate(left):
                 # One that hangs takes its share of the time alone; what others leave of theirs is for those cut short.
                 share, before = call.seconds_left / (len(left) - done), ends[b]
                 if bool(valid[b]):
-                    start[b], U[b], ends[b] = self._one(b, X0[b], U0[b], min(share, own))
-                if ends[b][0] == Status.TIME_LIMIT and 0.0 < share < own:
+                    start[b], U[b], ends[b] = self._one(b, X0[b], U0[b], min(share, limit))
+                if ends[b][0] == Status.TIME_LIMIT and 0.0 < share < limit:
                     cut.append(b)
                 if call.callback is not None and before[0] != Status.TIME_LIMIT:
                     rows = torch.arange(b, b + int(valid[b]), device=U.device)
@@ -196,21 +196,21 @@ class PreparedCasADi(Solver):
         lowest = np.where(self.program.equality, 0.0, -np.inf)
 
         def solve() -> tuple[np.ndarray, bool, int]:
-            found = self.function(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
+            result = self.function(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
             stats = self.function.stats()
-            return np.array(found["x"]).reshape(-1)[:-n], bool(stats["success"]), int(stats["iter_count"])
+            return np.array(result["x"]).reshape(-1)[:-n], bool(stats["success"]), int(stats["iter_count"])
 
         try:
             if seconds <= 0.0:
                 raise TimeoutError
-            found, success, iterations = solve() if seconds == math.inf else limited(solve, seconds)
+            result, success, iterations = solve() if seconds == math.inf else limited(solve, seconds)
         except TimeoutError:
             return X0[0], U0, (Status.TIME_LIMIT, 0)
         except (RuntimeError, ChildProcessError) as error:  # crossed bounds, for example; others are still solved
             if "option" in str(error).lower():  # FATROP reads its options only here
                 raise _refused(self.solver.plugin, error) from None
             return X0[0], U0, (Status.LINE_SEARCH_FAILED, 0)
-        v = torch.from_numpy(found).to(U0).view(U0.shape[0], -1)
+        v = torch.from_numpy(result).to(U0).view(U0.shape[0], -1)
         at_limit = iterations >= self.solver.max_iterations
         failed = Status.MAX_ITERATIONS if at_limit else Status.LINE_SEARCH_FAILED
         return v[0, :n], v[:, n:], (Status.CONVERGED if success else failed, iterations)

@@ -48,8 +48,8 @@ class Track:
 
     def target(self, p: Array, nearest: int) -> tuple[int, Array, float]:
         """The point nearest to p (d,), from `nearest` on as far as is looked ahead; the one to steer to; the speed."""
-        some = self.points[nearest : nearest + 2 * self.ahead + 1]
-        nearest += int(((some - p) ** 2).sum(1).argmin())
+        window = self.points[nearest : nearest + 2 * self.ahead + 1]
+        nearest += int(((window - p) ** 2).sum(1).argmin())
         left = self.step * (len(self.points) - 1 - nearest)
         speed = min(self.speed, math.sqrt(2.0 * self.braking * left))
         return nearest, self.points[min(nearest + self.ahead, len(self.points) - 1)], speed
@@ -74,13 +74,13 @@ def is_point(problem: Problem) -> bool:
 
     In every direction about equally well, for the first problem at its start and at rest.
     """
-    one = problem.take(torch.arange(1, device=problem.x0.device))
-    model = own_model(one.dynamics.at(0))
-    x = one.x0[:, : model.n].nan_to_num(0.0, 0.0, 0.0)  # a bad start says nothing about the model
-    u = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
+    single = problem.take(torch.arange(1, device=problem.x0.device))
+    model = own_model(single.dynamics.at(0))
+    x = single.x0[:, : model.n].nan_to_num(0.0, 0.0, 0.0)  # a bad start says nothing about the model
+    u = single.cost.rest_controls(single.x0.new_zeros(1, single.N, single.m))[:, 0]
     A, B = jacobian(model.field if model.stretches else model.step, x, u)
-    at = one.position
-    orders = [_numbers(part[0, at]) for part in (B, A @ B)]
+    position = single.position
+    orders = [_numbers(gain[0, position]) for gain in (B, A @ B)]
     first = next((push for push in orders if push.any()), orders[0])
     if not np.isfinite(first).all() or min(first.shape) < len(first):
         return False
@@ -109,14 +109,14 @@ def drive_unicycle(problem: Problem, track: Track) -> Array:
 
 def push_of(problem: Problem) -> Array:
     """How far controls, held for a few stages, push the position of the first problem at its start, (d, m)."""
-    one = problem.take(torch.arange(1, device=problem.x0.device))
-    x, u = one.x0, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))[:, 0]
-    total = x.new_zeros(1, one.n, one.m)
-    for k in range(min(PREDICTED_STAGES, one.N)):
-        model = one.dynamics.at(k)
+    single = problem.take(torch.arange(1, device=problem.x0.device))
+    x, u = single.x0, single.cost.rest_controls(single.x0.new_zeros(1, single.N, single.m))[:, 0]
+    total = x.new_zeros(1, single.n, single.m)
+    for k in range(min(PREDICTED_STAGES, single.N)):
+        model = single.dynamics.at(k)
         fx, fu = model.jacobians(x, u)
         total, x = fx @ total + fu, model.step(x, u)
-    return _numbers(total[0, one.position])
+    return _numbers(total[0, single.position])
 
 
 def drive_point(problem: Problem, track: Track) -> Array:
@@ -124,17 +124,17 @@ def drive_point(problem: Problem, track: Track) -> Array:
 
     The controls take the place after a few stages to where the wanted speed would.
     """
-    push, stages, at = push_of(problem), int(problem.stages[0]), problem.position
+    push, stages, position = push_of(problem), int(problem.stages[0]), problem.position
     low, high = bounds_of(problem)
     rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
     inverse, time = np.linalg.pinv(push), PREDICTED_STAGES * float(problem.dynamics.dt)
     x, U, nearest = problem.x0, rest.clone(), 0
     for k in range(stages):
-        p = _numbers(x[0, at])
+        p = _numbers(x[0, position])
         nearest, aim, wanted = track.target(p, nearest)
         far = float(np.linalg.norm(aim - p))
         goal = p + (aim - p) * min(1.0, wanted * time / max(far, 1e-12))
-        change = inverse @ (goal - _numbers(_after(problem, x, rest, k)[0, at]))
+        change = inverse @ (goal - _numbers(_after(problem, x, rest, k)[0, position]))
         U[0, k] = U.new_tensor(np.clip(_numbers(rest[0, k]) + change, low[k], high[k]))
         x = problem.dynamics.at(k).step(x, U[:, k])
     return _numbers(U[0])
@@ -153,7 +153,7 @@ def bounds_of(problem: Problem) -> tuple[Array, Array]:
     if bounds is None:
         wide = np.full((problem.N, problem.m), np.inf)
         return -wide, wide
-    lower, upper = (_numbers(part[0]) for part in bounds.over(problem.N))
+    lower, upper = (_numbers(bound[0]) for bound in bounds.over(problem.N))
     slack = np.where(np.isfinite(upper - lower), 0.5 * (1.0 - WITHIN) * (upper - lower), 0.0)
     wide = np.ones((problem.N, 1))
     return (lower + slack) * wide, (upper - slack) * wide

@@ -40,8 +40,8 @@ class Program:
     def values(self, problem: Problem, b: int) -> np.ndarray:
         """p for problem b of the batch."""
         index = torch.tensor([b], device=problem.x0.device)
-        own = [source.parameters(index) for source in self.sources]
-        return np.concatenate([problem.x0[b].double().cpu().numpy(), *own])
+        parameters = [source.parameters(index) for source in self.sources]
+        return np.concatenate([problem.x0[b].double().cpu().numpy(), *parameters])
 
     def of(self, problem: Problem) -> Program:
         """The same program for other problems, whose parts differ from those of the first in their own numbers alone.
@@ -68,10 +68,10 @@ class _Limits:
     def bounds(self, p: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
         """lower and upper (size,) for the parameters p."""
         lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
-        at = -np.asarray(self.offset(p)).reshape(-1) / self.slope
+        limit = -np.asarray(self.offset(p)).reshape(-1) / self.slope
         rising = self.slope > 0
-        np.minimum.at(upper, self.variable[rising], at[rising])
-        np.maximum.at(lower, self.variable[~rising], at[~rising])
+        np.minimum.at(upper, self.variable[rising], limit[rising])
+        np.maximum.at(lower, self.variable[~rising], limit[~rising])
         lower[lower <= -LOOSE], upper[upper >= LOOSE] = -np.inf, np.inf
         return lower, upper
 
@@ -83,7 +83,7 @@ def transcribe(problem: Problem) -> Program:
         InputError: a part that can't be traced, or that uses an operation without a counterpart in CasADi; horizons;
             maps.
     """
-    if any(part.map is not None for part in problem.obstacles):
+    if any(obstacle.map is not None for obstacle in problem.obstacles):
         expected = "no Field: ipopt and fatrop can't take maps; gco, multistart and interior_point do"
         raise InputError("problem.constraints", expected, "a Field")
     if problem.horizon is not None:
@@ -93,29 +93,29 @@ def transcribe(problem: Problem) -> Program:
     sources = (step, cost, *constraints)
     variables = ca.SX.sym("v", N * (n + m) + n)
     start = ca.SX.sym("x0", n)
-    own = [ca.SX.sym(f"p{i}", source.count) for i, source in enumerate(sources)]
+    symbols = [ca.SX.sym(f"p{i}", source.count) for i, source in enumerate(sources)]
     stages = [k * (n + m) for k in range(N + 1)]
-    x = [variables[at : at + n] for at in stages]
-    u = [variables[at + n : at + n + m] for at in stages[:-1]]
+    x = [variables[i : i + n] for i in stages]
+    u = [variables[i + n : i + n + m] for i in stages[:-1]]
     X, U = np.stack([elements(z) for z in x])[None], np.stack([elements(z) for z in u])[None]
 
     at_knot: list[list[tuple[ca.SX, bool]]] = [[] for _ in range(N + 1)]  # rows, and whether each is an equality
     free = _free(problem)
     at_knot[0] = [(row, True) for row, is_free in zip(elements(x[0] - start), free, strict=True) if not is_free]
-    for constraint, traced, p in zip(problem.constraints, constraints, own[2:], strict=True):
+    for constraint, traced, p in zip(problem.constraints, constraints, symbols[2:], strict=True):
         values = traced(elements(p), X, U)[0]
         for k, rows in zip(_knots(constraint.knots, N), values, strict=True):
             at_knot[k] += [(row, constraint.sense == "equality") for row in rows]
-    parameters = ca.vertcat(start, *own)
+    parameters = ca.vertcat(start, *symbols)
     limits, at_knot = _limits(at_knot, variables, parameters)
 
-    rows, equality, ahead = [], [], _ahead(problem, step, own[0], X, U)
+    rows, equality, ahead = [], [], _ahead(problem, step, symbols[0], X, U)
     for k in range(N + 1):
         gap = [(row, True) for row in elements(x[k + 1] - ahead[k])] if k < N else []
         rows += [row for row, _ in gap + at_knot[k]]
         equality += [is_equality for _, is_equality in gap + at_knot[k]]
     return Program(
-        variables, parameters, _column(cost(elements(own[1]), X, U)), _column(rows), equality,
+        variables, parameters, _column(cost(elements(symbols[1]), X, U)), _column(rows), equality,
         [len(knot) for knot in at_knot], limits, free, sources,
     )  # fmt: skip
 
@@ -148,13 +148,13 @@ def _changes(problem: Problem) -> bool:
     return problem.along is not problem.dynamics
 
 
-def _ahead(problem: Problem, step: Traced, own: ca.SX, X: np.ndarray, U: np.ndarray) -> list[ca.SX]:
+def _ahead(problem: Problem, step: Traced, p: ca.SX, X: np.ndarray, U: np.ndarray) -> list[ca.SX]:
     """step(x_k, u_k) of each stage, from X (1, N+1, n) and U (1, N, m)."""
     if _changes(problem):
-        return [_column(after) for after in step(elements(own), X[:, :-1], U)[0]]
+        return [_column(after) for after in step(elements(p), X[:, :-1], U)[0]]
     first = [_column(z[0, 0]) for z in (X, U)]
-    one = ca.Function("step", [*first, own], [_column(step(elements(own), X[:, 0], U[:, 0])[0])])
-    return [one(_column(x), _column(u), own) for x, u in zip(X[0], U[0], strict=False)]
+    single = ca.Function("step", [*first, p], [_column(step(elements(p), X[:, 0], U[:, 0])[0])])
+    return [single(_column(x), _column(u), p) for x, u in zip(X[0], U[0], strict=False)]
 
 
 def _limits(
@@ -171,16 +171,16 @@ def _limits(
     per_row = np.bincount(entry_row, minlength=rows.numel())
     single = {int(entry_row[i]): i for i in range(len(entries)) if per_row[entry_row[i]] == 1}
     left: list[list[tuple[ca.SX, bool]]] = []
-    bounds, place = [], 0
+    bounds, index = [], 0
     for knot in at_knot:
         left.append([])
         for row, is_equality in knot:
-            entry = single.get(place)
+            entry = single.get(index)
             if entry is not None and not is_equality and entries[entry].is_constant():
                 bounds.append((row, int(entry_variable[entry]), float(entries[entry])))
-            elif per_row[place]:
+            elif per_row[index]:
                 left[-1].append((row, is_equality))
-            place += 1
+            index += 1
     at_zero = ca.substitute(_column([row for row, *_ in bounds]), variables, ca.SX.zeros(*variables.shape))
     offset = ca.Function("offset", [parameters], [at_zero])
     limits = _Limits(np.array([v for _, v, _ in bounds], dtype=int), np.array([s for *_, s in bounds]), offset)

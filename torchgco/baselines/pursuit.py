@@ -77,13 +77,13 @@ class PathPursuit(Solver, named="solver"):
     def run(self, call: Call) -> Solution:
         """Find a path for each problem, pursue it, and solve."""
         session, admitted = Session(call, own_units=True), self.solver.admitted(call.problem)
-        held = session.call
-        U, found = self.guess(held.problem, held.U0)
-        held = replace(held, U0=U)
-        guess = guessed(held)
-        end = self._cleared(held, self.solver.no_worse(held, guess, self.solver.solved(held, guess=guess)))
-        solution = session.finished(least_violated(held, end, admitted), admitted)
-        return replace(solution, guided=found.long())
+        scaled = session.call
+        U, has_path = self.guess(scaled.problem, scaled.U0)
+        scaled = replace(scaled, U0=U)
+        guess = guessed(scaled)
+        end = self._cleared(scaled, self.solver.no_worse(scaled, guess, self.solver.solved(scaled, guess=guess)))
+        solution = session.finished(least_violated(scaled, end, admitted), admitted)
+        return replace(solution, guided=has_path.long())
 
     def guess(self, problem: Problem, U0: Tensor) -> tuple[Tensor, Tensor]:
         """Controls (B, N, m) along the paths, and where (B,) there is one; else U0.
@@ -92,16 +92,16 @@ class PathPursuit(Solver, named="solver"):
             InputError: as the class says.
         """
         driver, scene = self._checked(problem)
-        U, found = U0.clone(), torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
+        U, has_path = U0.clone(), torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
         sound = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
         for b in sound.nonzero().flatten().tolist():
             row = torch.tensor([b], device=problem.x0.device)
-            one = problem.take(row)
-            track = self._track(one, None if scene is None else scene.take(row))
+            single = problem.take(row)
+            track = self._track(single, None if scene is None else scene.take(row))
             if track is not None:
-                last = int(one.stages[0])
-                U[b, :last], found[b] = U.new_tensor(driver(one, track)[:last]), True
-        return U, found
+                last = int(single.stages[0])
+                U[b, :last], has_path[b] = U.new_tensor(driver(single, track)[:last]), True
+        return U, has_path
 
     def _checked(self, problem: Problem) -> tuple[Driver, Scene | None]:
         """The controller, and start, goal and obstacles; None where there are no obstacles."""
@@ -114,7 +114,7 @@ class PathPursuit(Solver, named="solver"):
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         scene = scene_of(problem, rest)
         if scene is None and problem.obstacles:
-            kinds = ", ".join(type(part).__name__ for part in problem.obstacles)
+            kinds = ", ".join(type(obstacle).__name__ for obstacle in problem.obstacles)
             raise InputError("problem.constraints", "obstacles at rest, of kinds that path_pursuit knows", kinds)
         return driver, scene
 
@@ -162,9 +162,9 @@ class PathPursuit(Solver, named="solver"):
         def once(rows: Tensor, grown: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
             new = self.solver.solved(replace(grown, callback=None), old.X)
             end.iterations[rows] += new.iterations
-            serves, found, clearance = serving(problem.take(rows), new.best, old, least, ADMITTED)
+            serves, iterates, clearance = serving(problem.take(rows), new.best, old, least, ADMITTED)
             kept = serves.nonzero().flatten()
-            put(best, rows[kept], take(found, kept))
+            put(best, rows[kept], take(iterates, kept))
             end.status[rows[kept]] = new.status[kept]
             return serves, clearance
 
@@ -175,18 +175,18 @@ class PathPursuit(Solver, named="solver"):
 
 def region(scene: Scene, margin: float) -> tuple[Array, Array]:
     """The corners (d,) of the space in which a way is sought, in a scene of one."""
-    low, high = (part[0].double().cpu().numpy() for part in scene.obstacles.region(scene.start, scene.goal))
-    for part in scene.obstacles.maps:
-        which = int(part.which[0])
-        low, high = np.minimum(low, part.field.origin[which]), np.maximum(high, part.field.upper[which])
+    low, high = (corner[0].double().cpu().numpy() for corner in scene.obstacles.region(scene.start, scene.goal))
+    for obstacle in scene.obstacles.maps:
+        which = int(obstacle.which[0])
+        low, high = np.minimum(low, obstacle.field.origin[which]), np.maximum(high, obstacle.field.upper[which])
     return low - margin, high + margin
 
 
 def clearance(problem: Problem, points: Tensor) -> Tensor:
     """Clearances (K,) at points (1, K, d) from all obstacles of a batch of one, m."""
-    found = torch.full_like(points[0, :, 0], torch.inf)
-    for part in problem.obstacles:
-        if part.margins.shape[1] > 0:
-            away = part.signed_distance(points, points.new_zeros(points.shape[1]))[0]
-            found = torch.minimum(found, away.masked_fill(part.absent[0], torch.inf).amin(-1))
-    return found
+    nearest = torch.full_like(points[0, :, 0], torch.inf)
+    for obstacle in problem.obstacles:
+        if obstacle.margins.shape[1] > 0:
+            away = obstacle.signed_distance(points, points.new_zeros(points.shape[1]))[0]
+            nearest = torch.minimum(nearest, away.masked_fill(obstacle.absent[0], torch.inf).amin(-1))
+    return nearest

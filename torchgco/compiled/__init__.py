@@ -10,5 +10,5 @@ from torchgco.compiled.command import MPPIController as MPPIController
 from torchgco.compiled.compiled import Compiled as Compiled
 from torchgco.compiled.compiled import compile as compile
 from torchgco.compiled.mpc import MPC as MPC
-from torchgco.compiled.plan import Instant as Instant
-from torchgco.compiled.plan import Plan as Plan
+from torchgco.receding.plan import Instant as Instant
+from torchgco.receding.plan import Plan as Plan

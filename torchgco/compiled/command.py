@@ -10,16 +10,18 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
-from torchgco.base.numbers import as_floats
+from torchgco.base.numbers import as_floats, measured
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
 from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
-from torchgco.compiled.numbers import Numbers, measured
-from torchgco.compiled.stages import moved, stage_of, stages_between
+from torchgco.compiled.numbers import Numbers
+from torchgco.compiled.stages import stage_of
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current, open_loop
+from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.alone import check_rows
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.receding.plan import stages_between
 
 
 class MPPIController:
@@ -97,7 +99,7 @@ class MPPIController:
         state, B = measured(x, *self._problem.x0.shape), self._problem.B
         self.numbers.write(self.numbers.named(numbers, named, {"x0": state}))
         with torch.no_grad(), torch.inference_mode(False), computing_on(CPU):
-            before = moved(self.U, self._stages) if shift and self._commands else self.U
+            before = shifted(self.U, self._stages) if shift and self._commands else self.U
             key = DrawKey(self.seed, self._ids, torch.full_like(self._ids, self._commands))
             now = current(with_numbers_as_they_are(self._problem))
             found = self.sampler.improved(now, before, key)

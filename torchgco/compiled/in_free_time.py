@@ -140,17 +140,10 @@ def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:
 
 
 def later(problem: Problem, last: Solution, shift: float) -> Solution:
-    """A guess for a horizon that begins so many stages, or seconds, later; parts of one as `Kept.shift` takes them."""
+    """A guess for a horizon that begins so many stages, or seconds, later."""
     if problem.time is not None:
         return _later_in_time(problem, last, shift)
-    whole = int(shift)
-    guess, part = last.shifted(whole) if whole else last, shift - whole
-    if part == 0:
-        return guess
-    one = guess.shifted()
-    X, U, K, d = (torch.lerp(getattr(guess, name), getattr(one, name), part) for name in ("X", "U", "K", "d"))
-    lam = tuple(torch.lerp(*pair, part) for pair in zip(guess.multipliers.lam, one.multipliers.lam, strict=True))
-    return replace(one, X=X, U=U, K=K, d=d, multipliers=Multipliers(lam, guess.multipliers.mu))
+    return last.shifted(shift) if shift else last
 
 
 def _later_in_time(problem: Problem, last: Solution, seconds: float) -> Solution:

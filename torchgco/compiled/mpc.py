@@ -11,17 +11,18 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import measured
 from torchgco.base.options import PositiveOrInfinite, Seconds, check_value
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.status import Status
 from torchgco.compiled.answer import Answer
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled, compile
-from torchgco.compiled.holding import Held, better, held
-from torchgco.compiled.numbers import Numbers, measured
-from torchgco.compiled.plan import Plan
-from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of, stages_between
-from torchgco.compiled.stopping import clamped
+from torchgco.compiled.numbers import Numbers
+from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.receding.holding import Held, better, held
+from torchgco.receding.plan import Plan, stages_between
+from torchgco.receding.stopping import clamped
 from torchgco.solution import Solution
 
 
@@ -212,7 +213,7 @@ class MPC:
         self, answer: Answer, solved: np.ndarray, now: float, state: np.ndarray, known: dict[int, Held]
     ) -> Tensor:
         """The controls (B, m), where some problems have no plan that was solved for now."""
-        made, before, kept = self._made(answer, now), self.plan, np.zeros_like(solved)
+        plan, before, kept = self._made(answer, now), self.plan, np.zeros_like(solved)
         if self._free:
             kept = ~solved & (before is not None)
         else:
@@ -222,13 +223,16 @@ class MPC:
                 self._known(self.compiled.now.take(missing), missing, now, known)
             found = Held(*map(torch.cat, zip(*(known[b] for b in rows.tolist()), strict=True)))
             found = better(self.compiled.now.take(rows), found, answer.U[rows])
-            made = made.with_rows(rows, found.X, found.U, found.K)
+            plan = plan.with_rows(rows, replace(plan.take(rows), X=found.X, U=found.U, K=found.K))
             # At other times than its knots a plan before isn't, to the last millimetre, what was looked at.
             at_knots = [isinstance(stages_between(float(now - self._begun[b]) / self.dt), int) for b in rows.tolist()]
             kept[rows.numpy()] = found.is_before.numpy() & at_knots
             self._feasible[rows.numpy()] = found.feasible
         self._begun = np.where(kept, self._begun, now)
-        self._plan = made if before is None else _mixed(~kept, made, before)
+        if before is not None:
+            rows = torch.from_numpy(kept).nonzero().flatten()
+            plan = plan.with_rows(rows, before.take(rows))
+        self._plan = plan
         return self._plan.mean(now, self.period, state) if self._free else self._plan.at(now, state).u
 
     def _within(self, u: Tensor) -> Tensor:
@@ -242,8 +246,10 @@ class MPC:
     def _made(self, answer: Answer, now: float | None = None) -> Plan:
         """An answer's plans, from the times that they were made at, or all from now."""
         problem, begun = self.compiled.problem, self._begun if now is None else np.full_like(self._begun, now)
-        parts = answer.X, answer.U, answer.K, begun, self.dt, problem.dynamics, problem.control_bounds
-        return Plan(*parts, answer.t)
+        return Plan(
+            X=answer.X, U=answer.U, K=answer.K, start=torch.from_numpy(begun), dt=self.dt, dynamics=problem.dynamics,
+            bounds=problem.control_bounds, knots=answer.t,
+        )  # fmt: skip
 
     def _time(self, t: float | None) -> float:
         first = self.answer is None
@@ -252,14 +258,3 @@ class MPC:
         if isinstance(t, bool) or not isinstance(t, int | float) or not np.isfinite(t) or (not first and t <= self.t):
             raise InputError("t", "a time in seconds" if first else f"a time after {self.t:g} s", shown(t))
         return float(t)
-
-
-def _mixed(new: np.ndarray, plan: Plan, before: Plan) -> Plan:
-    """The plan where `new` (B,), elsewhere the one before."""
-    rows = torch.from_numpy(new)
-    X, U, K = (
-        torch.where(rows.view(-1, *[1] * (a.dim() - 1)), a, b)
-        for a, b in ((plan.X, before.X), (plan.U, before.U), (plan.K, before.K))
-    )
-    knots = None if plan.knots is None else torch.where(rows.unsqueeze(-1), plan.knots, before.knots)  # type: ignore[arg-type]
-    return replace(plan, X=X, U=U, K=K, start=np.where(new, plan.start, before.start), knots=knots)

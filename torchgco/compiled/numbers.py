@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.numbers import Floats, Number, as_floats
+from torchgco.base.numbers import Floats, Number
 
 
 class Numbers(Mapping[str, Floats]):
@@ -88,20 +87,6 @@ class Numbers(Mapping[str, Floats]):
     def _named(self, name: str) -> str:
         short = _short(name)
         return short if self._by_name.get(short) is self._all[name] else name
-
-
-def measured(x: Any, B: int, n: int) -> Floats:
-    """States (B, n), or (n,) of all vehicles.
-
-    Raises:
-        InputError: another shape, no numbers, NaN or infinity.
-    """
-    state = as_floats(x, "x")
-    if state.shape not in ((B, n), (n,)):
-        raise InputError("x", f"shape ({B}, {n}), or ({n},) for all vehicles", state.shape)
-    if not math.isfinite(state.sum()) and not np.isfinite(state).all():  # a sum takes a third of the time
-        raise InputError("x", "finite states", "NaN or infinity")
-    return state
 
 
 def _short(name: str) -> str:

@@ -1,19 +1,16 @@
-"""Stages of a receding horizon: their length, and how many lie between two steps of a loop."""
+"""What a loop can serve: stages of one length, or a free time."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.constraints.gates import has_gates
-from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.problem import Problem
 from torchgco.problem.times import times
-
-STAGE_ROUNDING = 1e-6  # of the stages between two steps: times are sums of periods
+from torchgco.receding.plan import STAGE_ROUNDING
 
 
 def stage_of(problem: Problem) -> float:
@@ -56,17 +53,3 @@ def follows(part: Any) -> bool:
 def _check_no_gates(problem: Problem) -> None:
     if has_gates(problem):
         raise InputError("problem", "one without Gates in a loop, whose plans begin again at their knot 0", "Gates")
-
-
-def stages_between(count: float) -> float:
-    """A number of stages, whole where it is but for rounding."""
-    whole = round(count)
-    return whole if abs(count - whole) <= STAGE_ROUNDING * max(1.0, count) else count
-
-
-def moved(values: Tensor, stages: float) -> Tensor:
-    """Values (B, K, ...) of knots that follow each other, so many stages later; see `Kept.shift`."""
-    whole = int(stages)
-    values = shifted(values, whole) if whole else values
-    part = stages - whole
-    return torch.lerp(values, shifted(values), part) if part > 0 else values

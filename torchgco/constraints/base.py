@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown, undefined
@@ -18,7 +19,7 @@ from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.constraints.carried import Carried
-from torchgco.costs.base import add_blocks, add_first
+from torchgco.costs.base import add_first, add_slopes
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 TOUCH = 1.0 - CONTACT_FACTOR  # the same, as a share beneath the full surface
@@ -76,8 +77,13 @@ class Constraint(PerElement):
         raise undefined(self, "value")
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        """Add sum_i g_i dc_i and sum_i h_i dc_i' dc_i (Gauss-Newton) to H (B, N+1, s, s); g, h are (B, K, p)."""
-        raise undefined(self, "accumulate")
+        """Add sum_i g_i dc_i and sum_i h_i dc_i' dc_i (Gauss-Newton) to H (B, N+1, s, s); g, h are (B, K, p).
+
+        By default PyTorch differentiates `value`, whose rows read the state and the control of their own knot alone.
+        """
+        n, z = X.shape[-1], torch.cat((X, pad(U, (0, 0, 0, 1))), dim=-1)
+        (slopes,) = jacobian(lambda z: self.value(z[..., :n], z[:, :-1, n:]), z)
+        add_slopes(H, self.knots, n, g, h, slopes[..., :n], slopes[..., n:])
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """By how much each row is violated, (B, K, p) >= 0: lengths in metres, all else in the units of c."""
@@ -227,8 +233,8 @@ class Distance(Constraint):
 
     def clearances(self, X: Tensor) -> tuple[Tensor, Tensor]:
         """The smallest of these (B,) to where bodies touch: at the states, and there and between; infinite without."""
-        at, between = (least(part + self.contact_depths.unsqueeze(1)) for part in self.measured(X))
-        return at, torch.minimum(at, between)
+        at_knots, between = (least(gap + self.contact_depths.unsqueeze(1)) for gap in self.measured(X))
+        return at_knots, torch.minimum(at_knots, between)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """Smallest distance (B,) of the straight lines between knots from where bodies touch, m; negative in contact.
@@ -314,8 +320,8 @@ class CountedRows(WrappedConstraint):
 
     def at(self, x: Tensor, k: int) -> Tensor:
         rows, knots = self.constraint.at(x, k), self.knots
-        place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
-        return torch.where(self.counts[:, place, None, None] > 0, rows, NO_ROW)
+        index = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
+        return torch.where(self.counts[:, index, None, None] > 0, rows, NO_ROW)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)
@@ -433,19 +439,8 @@ class FunctionConstraint(Constraint):
         return self.rows_at(k, x)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n = X.shape[-1]
         parts = dict(zip(self.of, jacobian(self._along(X), *self._arguments(X, U)), strict=True))
-        cx, cu = parts.get("x"), parts.get("u")
-        add = H.new_zeros(*g.shape[:2], *H.shape[2:])
-
-        def gradient(c: Tensor | None) -> Tensor | None:
-            return None if c is None else (g.unsqueeze(-2) @ c).squeeze(-2)
-
-        def product(a: Tensor | None, b: Tensor | None) -> Tensor | None:
-            return None if a is None or b is None else (h.unsqueeze(-1) * a).mT @ b
-
-        add_blocks(add, n, gradient(cx), gradient(cu), product(cx, cx), product(cu, cu), product(cu, cx))
-        H[:, self.knots] += add
+        add_slopes(H, self.knots, X.shape[-1], g, h, parts.get("x"), parts.get("u"))
 
     def _arguments(self, X: Tensor, U: Tensor) -> tuple[Tensor, ...]:
         return tuple((X if a == "x" else U)[:, self.knots] for a in self.of)

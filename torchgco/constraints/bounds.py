@@ -66,10 +66,10 @@ class _Bounds(Constraint):
     def numbers(self, where: str, place: int) -> list[Number]:
         fields = {side: (getattr(self, side), partial(self._check_new, side=side)) for side in ("lower", "upper")}
         joint = crossed(self, where, np.greater, "lower bounds of at most the upper ones")
-        found = numbers(where, fields, place, joint=joint)
-        for number, none in zip(found, (-np.inf, np.inf), strict=True):
+        pair = numbers(where, fields, place, joint=joint)
+        for number, none in zip(pair, (-np.inf, np.inf), strict=True):
             number.none = none
-        return found
+        return pair
 
     def _check_new(self, new: Floats, side: str) -> Wrong:
         sign = 1.0 if side == "lower" else -1.0
@@ -95,7 +95,7 @@ class _Bounds(Constraint):
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         places = torch.arange(self.lower.shape[-1])
-        above, below = (places[part].tolist() for part in (self.above, self.below))
+        above, below = (places[which].tolist() for which in (self.above, self.below))
         side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
         kind, of = ("control", controls_of) if self.of == "u" else ("state", states_of)
         named = getattr(dynamics, f"{kind}_names")
@@ -126,11 +126,11 @@ class _Bounds(Constraint):
         """The same of the knots 0..count-1, (B|1, count|1, size); infinite where the bounds don't hold."""
         if self.knots == slice(0, count):
             return self.by_knot
-        found = []
+        wide = []
         for bound, free in zip(self.by_knot, (-torch.inf, torch.inf), strict=True):
-            found.append(bound.new_full((bound.shape[0], count, bound.shape[2]), free))
-            found[-1][:, self.knots] = bound
-        return found[0], found[1]
+            wide.append(bound.new_full((bound.shape[0], count, bound.shape[2]), free))
+            wide[-1][:, self.knots] = bound
+        return wide[0], wide[1]
 
     @property
     def range(self) -> Tensor:
@@ -200,14 +200,14 @@ class _Bounds(Constraint):
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n, size = X.shape[-1], self.upper.shape[-1]
-        at = slice(n + 1, n + 1 + size) if self.of == "u" else slice(0, size)
+        span = slice(n + 1, n + 1 + size) if self.of == "u" else slice(0, size)
         gradient, diagonal = self._by_component(g, h)
-        H[:, self.knots, at, n] += gradient
-        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, span, n] += gradient
+        H[:, self.knots, n, span] += gradient
         if isinstance(self.knots, slice):
-            H[:, self.knots, at, at].diagonal(dim1=-2, dim2=-1).add_(diagonal)
+            H[:, self.knots, span, span].diagonal(dim1=-2, dim2=-1).add_(diagonal)
         else:
-            H[:, self.knots, at, at] += torch.diag_embed(diagonal)
+            H[:, self.knots, span, span] += torch.diag_embed(diagonal)
 
 
 def _bounded(bound: Tensor) -> slice | Tensor:
@@ -237,7 +237,7 @@ class Bounds(_Bounds):
 
 def bounds_of(parts: Iterable[Constraint], of: Literal["x", "u"] | None = None) -> list[Bounds]:
     """The bounds among constraints, of states or controls alone where `of` says so."""
-    return [part for part in parts if isinstance(part, Bounds) and of in (None, part.of)]
+    return [bounds for bounds in parts if isinstance(bounds, Bounds) and of in (None, bounds.of)]
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ class ControlBounds(Bounds):
 
 def rates_of(parts: Iterable[Constraint]) -> RateBounds | None:
     """The bounds on rates, of which a problem has one at most; None where there are none."""
-    return next((part for part in parts if isinstance(part, RateBounds)), None)
+    return next((rates for rates in parts if isinstance(rates, RateBounds)), None)
 
 
 def joined_bounds(parts: Sequence[Bounds], N: int) -> Bounds | None:
@@ -264,7 +264,7 @@ def joined_bounds(parts: Sequence[Bounds], N: int) -> Bounds | None:
     """
     if len(parts) < 2:
         return parts[0] if parts else None
-    lower, upper = zip(*(part.over(N) for part in parts), strict=True)
+    lower, upper = zip(*(bounds.over(N) for bounds in parts), strict=True)
     upper = reduce(torch.minimum, upper)
     lower = torch.minimum(reduce(torch.maximum, lower), upper)
     ends = {"above": _bounded(upper), "below": _bounded(lower)}
@@ -364,13 +364,13 @@ class RateBounds(_Bounds):
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         if self.states is None:
             raise NotImplementedError("rows of two knots have no block; solvers take `with_carried`")
-        one, controls = X.shape[-1], self.controls
-        x, u = self.states[controls], one + 1 + controls
+        n, controls = X.shape[-1], self.controls
+        x, u = self.states[controls], n + 1 + controls
         gradient, diagonal = self._by_component(g, h)[..., controls]
         add = H.new_zeros(*g.shape[:2], *H.shape[2:])
-        for at, sign in ((u, 1.0), (x, -1.0)):
-            add[..., at, one] = add[..., one, at] = sign * gradient
-            add[..., at, at] = diagonal
+        for i, sign in ((u, 1.0), (x, -1.0)):
+            add[..., i, n] = add[..., n, i] = sign * gradient
+            add[..., i, i] = diagonal
         add[..., u, x] = add[..., x, u] = -diagonal
         H[:, self.knots] += add
 
@@ -391,7 +391,7 @@ class RatesInTime(FirstRowsInTime):
         return self.value(X, U).clamp(min=0.0)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        rates, one = self.constraint, X.shape[-1]
+        rates, n = self.constraint, X.shape[-1]
         upper, lower = rates.limits()
         every, before = torch.arange(self.m, device=H.device), rates.states
         assert before is not None
@@ -400,11 +400,11 @@ class RatesInTime(FirstRowsInTime):
         for which, limit, sign in ((rates.above, upper, 1.0), (rates.below, lower, -1.0)):
             controls = every[which]
             rows = first + torch.arange(len(controls), device=H.device)
-            J[..., rows, one + 1 + controls], J[..., rows, before[controls]] = sign, -sign
+            J[..., rows, n + 1 + controls], J[..., rows, before[controls]] = sign, -sign
             J[..., rows, self.n] = -sign * limit
             first += len(controls)
         slope = (g.unsqueeze(-2) @ J).squeeze(-2)
         add = (h.unsqueeze(-1) * J).mT @ J
-        add[..., one, :] += slope
-        add[..., :, one] += slope
+        add[..., n, :] += slope
+        add[..., :, n] += slope
         H[:, rates.knots] += add

@@ -49,9 +49,9 @@ class Carried:
 
 def joined(parts: Sequence[Carried], B: int, N: int) -> Carried:
     """The states of several, of B problems with N stages, one after the other."""
-    start = torch.cat([part.start.expand(B, -1) for part in parts], dim=-1)
-    each, stages = [part.taken for part in parts], None
-    if any(part.stages is not None for part in each):
-        stages = [start.new_ones(N, len(part)) if part.stages is None else part.stages for part in each]
+    start = torch.cat([carried.start.expand(B, -1) for carried in parts], dim=-1)
+    each, stages = [carried.taken for carried in parts], None
+    if any(taken.stages is not None for taken in each):
+        stages = [start.new_ones(N, len(taken)) if taken.stages is None else taken.stages for taken in each]
         stages = torch.cat(stages, dim=-1)
-    return Carried(start, Taken(torch.cat([part.components for part in each]), stages))
+    return Carried(start, Taken(torch.cat([taken.components for taken in each]), stages))

@@ -68,17 +68,17 @@ class Gates(Constraint):
         ends = torch.full((dims.B,), last, device="cpu") if dims.horizon is None else dims.horizon.cpu() + 1 - gap
         if bool((1 + gap * (G - 1) > ends).any()):
             raise InputError("gates.centers", f"at most {(int(ends.min()) - 1) // gap + 1} gates in N = {dims.N}", G)
-        given = self.knots
-        places = _by_length(centers, dims, gap, ends) if given is None else _given(given, dims, G, gap, ends)
-        at = list(range(dims.n))[dims.position]  # type: ignore[index]
+        knots = self.knots
+        places = _by_length(centers, dims, gap, ends) if knots is None else _given(knots, dims, G, gap, ends)
+        position = list(range(dims.n))[dims.position]  # type: ignore[index]
         if self.normals is None:
             radius = _sizes(self.radius, "gates.radius", dims, G)
-            return _balls(at, centers, radius, places, dims)
+            return _balls(position, centers, radius, places, dims)
         normals = _each(self.normals, "gates.normals", dims, (d,), G)
         if not bool((normals.norm(dim=-1) > 0).all()):
             raise InputError("gates.normals", "vectors other than 0", normals.tolist())
         half = _sizes(self.half_widths, "gates.half_widths", dims, G)
-        components = torch.tensor(at, device=centers.device)
+        components = torch.tensor(position, device=centers.device)
         return GateSquares(centers, _axes(normals), half, places, components=components).bind(dims)
 
 
@@ -156,16 +156,16 @@ class GateSquares(Vectors):
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         off = knot - self.places[0]
-        at = (off == 0) | (off == 1)
-        what = "side" if row > 0 and bool(at.any()) else "plane"
-        at = at if bool(at.any()) else off == (2 if row > 0 else -1)
-        return f"the {what} of gate {int(at.nonzero()[0]) + 1}"
+        gate = (off == 0) | (off == 1)
+        what = "side" if row > 0 and bool(gate.any()) else "plane"
+        gate = gate if bool(gate.any()) else off == (2 if row > 0 else -1)
+        return f"the {what} of gate {int(gate.nonzero()[0]) + 1}"
 
     def numbers(self, where: str, place: int) -> list[Number]:
         normals = self.axes[:, :, 0].clone()
         fields = {"centers": (self.centers, finite), "half_widths": (self.half_widths, above_zero)}
-        found = numbers("gates", fields, place, after=self.write)
-        return found + numbers("gates", {"normals": (normals, directions)}, place, after=lambda: self.write(normals))
+        fresh = numbers("gates", fields, place, after=self.write)
+        return fresh + numbers("gates", {"normals": (normals, directions)}, place, after=lambda: self.write(normals))
 
     def write(self, normals: Tensor | None = None) -> None:
         """Make the rows of the centres and half widths as they are, and of other normals (B, G, d), in this memory."""
@@ -178,8 +178,8 @@ class GateSquares(Vectors):
             rows = torch.cat((sign * normal, sides, -sides), dim=2)  # (B, G, p, d)
             room = torch.cat((torch.full_like(half, -ROOM), half.expand(B, G, p - 1)), dim=-1)
             limits = room + (rows @ self.centers.unsqueeze(-1))[..., 0]
-            at = each, self.places - 1 + ahead
-            self.slopes[at], self.limits[at] = rows, limits
+            index = each, self.places - 1 + ahead
+            self.slopes[index], self.limits[index] = rows, limits
             b, g, k = self._beside(ahead)
             # A knot may lie after one gate and before the next: its rows of the two are different ones.
             self.slopes[b, k - 1, ahead], self.limits[b, k - 1, ahead] = rows[b, g, 0], limits[b, g, 0] - 2.0 * ROOM
@@ -187,12 +187,12 @@ class GateSquares(Vectors):
     def _beside(self, ahead: int) -> tuple[Tensor, Tensor, Tensor]:
         """The gates, each as b and g, with a knot k behind or ahead of theirs that is no gate's own."""
         N = self.slopes.shape[1]
-        own = torch.zeros(len(self.places), N + 2, dtype=torch.bool, device=self.places.device)
-        own[:, 0] = own[:, N + 1] = True
+        taken = torch.zeros(len(self.places), N + 2, dtype=torch.bool, device=self.places.device)
+        taken[:, 0] = taken[:, N + 1] = True
         for shift in (0, 1):
-            own.scatter_(1, self.places + shift, True)
+            taken.scatter_(1, self.places + shift, True)
         knots = self.places + (2 if ahead else -1)
-        b, g = (~own.gather(1, knots)).nonzero(as_tuple=True)
+        b, g = (~taken.gather(1, knots)).nonzero(as_tuple=True)
         return b, g, knots[b, g]
 
     def on_the_way(self, X: Tensor) -> Tensor:
@@ -205,13 +205,13 @@ class GateSquares(Vectors):
         return self.slopes
 
 
-def _balls(at: list[int], centers: Tensor, radius: Tensor, places: Tensor, dims: Dimensions) -> GateBalls:
+def _balls(position: list[int], centers: Tensor, radius: Tensor, places: Tensor, dims: Dimensions) -> GateBalls:
     """Balls as bounds on norms, with a centre and a radius at their own knots; an infinite one elsewhere."""
     each = torch.arange(dims.B, device=centers.device).unsqueeze(-1)
     middles = centers.new_zeros(dims.B, dims.N, centers.shape[-1])
     upper = centers.new_full((dims.B, dims.N), torch.inf)
     middles[each, places - 1], upper[each, places - 1] = centers, radius
-    return GateBalls(("x", at), None, upper, slice(1, dims.N + 1), middles, places=places).bind(dims)
+    return GateBalls(("x", position), None, upper, slice(1, dims.N + 1), middles, places=places).bind(dims)
 
 
 def _axes(normals: Tensor) -> Tensor:
@@ -229,20 +229,20 @@ def _axes(normals: Tensor) -> Tensor:
 
 def _each(value: Any, name: str, dims: Dimensions, size: tuple[int, ...], G: int | None = None) -> Tensor:
     """Vectors (B, G, d): given so, or as (G, d) for all problems."""
-    found = per_row(value, name, dims, "G" if G is None else G, *size)
-    if found.shape[1] == 0 or not bool(torch.isfinite(found).all()):
-        raise InputError(name, "one gate at least, of finite numbers", found.tolist())
-    return found.contiguous()
+    vectors = per_row(value, name, dims, "G" if G is None else G, *size)
+    if vectors.shape[1] == 0 or not bool(torch.isfinite(vectors).all()):
+        raise InputError(name, "one gate at least, of finite numbers", vectors.tolist())
+    return vectors.contiguous()
 
 
 def _sizes(value: Any, name: str, dims: Dimensions, G: int) -> Tensor:
     """Lengths (B, G), m: given as one, (G,) or (B, G)."""
-    found = tensor(value, name, dims.like)
-    if found.dim() > 2 or (found.dim() > 0 and tuple(found.shape) not in ((G,), (dims.B, G))):
-        raise InputError(name, f"a number, shape ({G},) or ({dims.B}, {G})", tuple(found.shape))
-    if not bool((torch.isfinite(found) & (found > 0)).all()):
-        raise InputError(name, "finite numbers above 0 m", found.tolist())
-    return found.expand(dims.B, G).contiguous()
+    lengths = tensor(value, name, dims.like)
+    if lengths.dim() > 2 or (lengths.dim() > 0 and tuple(lengths.shape) not in ((G,), (dims.B, G))):
+        raise InputError(name, f"a number, shape ({G},) or ({dims.B}, {G})", tuple(lengths.shape))
+    if not bool((torch.isfinite(lengths) & (lengths > 0)).all()):
+        raise InputError(name, "finite numbers above 0 m", lengths.tolist())
+    return lengths.expand(dims.B, G).contiguous()
 
 
 def has_gates(problem: Any) -> bool:
@@ -252,8 +252,8 @@ def has_gates(problem: Any) -> bool:
 
 def gates_of(problem: Any) -> GateBalls | GateSquares | None:
     """The first gates that a trajectory has to pass; None where there are none."""
-    bare = (part.bare for part in problem.constraints)
-    return next((part for part in bare if isinstance(part, GateBalls | GateSquares)), None)
+    bare = (constraint.bare for constraint in problem.constraints)
+    return next((gates for gates in bare if isinstance(gates, GateBalls | GateSquares)), None)
 
 
 def _given(knots: Any, dims: Dimensions, G: int, gap: int, ends: Tensor) -> Tensor:
@@ -261,17 +261,17 @@ def _given(knots: Any, dims: Dimensions, G: int, gap: int, ends: Tensor) -> Tens
     name, expected = "gates.knots", f"{G} whole numbers, or {dims.B} rows of them"
     try:
         rows = knots if len(knots) and hasattr(knots[0], "__len__") else [knots] * dims.B
-        found = torch.tensor([[whole(k) for k in row] for row in rows], device="cpu")
+        places = torch.tensor([[whole(k) for k in row] for row in rows], device="cpu")
     except (TypeError, ValueError):
         raise InputError(name, expected, shown(knots)) from None
-    if tuple(found.shape) != (dims.B, G):
-        raise InputError(name, expected, f"shape {tuple(found.shape)}")
-    if bool((found.diff(dim=1) < gap).any()):
+    if tuple(places.shape) != (dims.B, G):
+        raise InputError(name, expected, f"shape {tuple(places.shape)}")
+    if bool((places.diff(dim=1) < gap).any()):
         rise = "knots that rise: no two gates at one" if gap == 1 else "knots that rise by 2 at least"
-        raise InputError(name, rise, found.tolist())
-    if bool((found < 1).any() | (found > ends.unsqueeze(-1)).any()):
-        raise InputError(name, f"knots within 1..{int(ends.min())}", found.tolist())
-    return found.to(dims.like.device)
+        raise InputError(name, rise, places.tolist())
+    if bool((places < 1).any() | (places > ends.unsqueeze(-1)).any()):
+        raise InputError(name, f"knots within 1..{int(ends.min())}", places.tolist())
+    return places.to(dims.like.device)
 
 
 def _by_length(centers: Tensor, dims: Dimensions, gap: int, ends: Tensor) -> Tensor:

@@ -38,8 +38,8 @@ class HalfSpaces(Constraint):
             raise InputError("half_spaces.dynamics", "a position in space", "dynamics without one")
         check_shape(self.normals, (dims.B, dims.N, "R", 3), "half_spaces.normals")
         check_shape(self.offsets, tuple(self.normals.shape[:3]), "half_spaces.offsets")
-        for part in (self.normals, self.offsets):
-            check_tensor(part, "half_spaces", dims.like)
+        for values in (self.normals, self.offsets):
+            check_tensor(values, "half_spaces", dims.like)
         return replace(self, knots=slice(1, dims.N + 1), position=dims.position)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:

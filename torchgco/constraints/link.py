@@ -78,13 +78,13 @@ class Link(Constraint):
         return replace(self, function=function, knots=slice(j, j + 1), components=chosen, values=values, earlier=i)
 
     def _pair(self, N: int) -> tuple[int, int]:
-        given = self.knots if self.earlier is None else (self.earlier, self.knots.start)
+        knots = self.knots if self.earlier is None else (self.earlier, self.knots.start)
         try:
-            pair = [whole(k) + (N + 1 if k < 0 else 0) for k in given]
+            pair = [whole(k) + (N + 1 if k < 0 else 0) for k in knots]
         except TypeError:
             pair = []
         if len(pair) != 2 or not 0 <= pair[0] < pair[1] <= N:
-            raise InputError(f"{self.name}.knots", f"two of 0..{N}, the earlier one first", shown(given))
+            raise InputError(f"{self.name}.knots", f"two of 0..{N}, the earlier one first", shown(knots))
         return pair[0], pair[1]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ class _Rows(FunctionConstraint):
 
     def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
         (x,) = arguments
-        return self.values.call(self.function, *(x[..., place] for place in self.places))
+        return self.values.call(self.function, *(x[..., components] for components in self.places))
 
     def with_more(self, n: int, m: int) -> Constraint:
         return self

@@ -63,8 +63,8 @@ class Vectors(Constraint):
         }  # fmt: skip
         both = all(getattr(self, side, None) is not None for side in ("lower", "upper"))
         joint = crossed(self, where, np.greater_equal, "lower bounds below the upper ones") if both else None
-        given = {field: getattr(self, field) for field in self.per_element if field in checks}
-        fields = {field: (tensor, checks[field]) for field, tensor in given.items() if tensor is not None}
+        tensors = {field: getattr(self, field) for field in self.per_element if field in checks}
+        fields = {field: (tensor, checks[field]) for field, tensor in tensors.items() if tensor is not None}
         return numbers(where, fields, place, joint=joint)
 
     def _components_told(self) -> str:
@@ -112,8 +112,8 @@ class NormBounds(Vectors):
         kind, components = _chosen(self.of, self.components, ("x", "u"), dims, f"{name}.of")
         knots, K = _knots(self.knots, kind, dims, f"{name}.knots")
         lower, upper = (
-            None if given is None else _per_knot(bound_of(given, none), f"{name}.{side}", dims, K)
-            for side, given, none in (("lower", self.lower, 0.0), ("upper", self.upper, math.inf))
+            None if value is None else _per_knot(bound_of(value, none), f"{name}.{side}", dims, K)
+            for side, value, none in (("lower", self.lower, 0.0), ("upper", self.upper, math.inf))
         )
         if lower is not None and not bool((torch.isfinite(lower) & (lower >= 0)).all()):
             raise InputError(f"{name}.lower", "finite numbers of at least 0", lower.tolist())
@@ -305,7 +305,7 @@ class Cone(Vectors):
             torch.stack((-x, -w, z_, y), dim=-1),
             torch.stack((w, -x, -y, z_), dim=-1),
         )
-        along = sum(self._direction[..., i : i + 1] * part for i, part in enumerate(by_axis))
+        along = sum(self._direction[..., i : i + 1] * vector for i, vector in enumerate(by_axis))
         return (2.0 * (cosine * z - along) / sine).unsqueeze(-2)
 
 
@@ -314,20 +314,20 @@ def within_norms(U: Tensor, constraints: Iterable[Constraint]) -> Tensor:
 
     Sizes move first, then directions: what had none, as a norm's lower bound has no slope there, takes the cone's.
     """
-    parts = [part for part in constraints if isinstance(part, Vectors) and part.of == "u"]  # type: ignore[attr-defined]
-    found = U.clone()
-    for part in (part for part in parts if isinstance(part, NormBounds)):
-        _put(found, part, part.moved_inside(found))
-    for part in (part for part in parts if isinstance(part, Cone)):
-        began = part._vectors(U, U).abs().amax(-1, keepdim=True)
-        _put(found, part, part.moved_inside(found, began == 0))
-    return found
+    parts = [row for row in constraints if isinstance(row, Vectors) and row.of == "u"]  # type: ignore[attr-defined]
+    moved = U.clone()
+    for row in (row for row in parts if isinstance(row, NormBounds)):
+        _put(moved, row, row.moved_inside(moved))
+    for row in (row for row in parts if isinstance(row, Cone)):
+        began = row._vectors(U, U).abs().amax(-1, keepdim=True)
+        _put(moved, row, row.moved_inside(moved, began == 0))
+    return moved
 
 
-def _put(U: Tensor, part: Vectors, vectors: Tensor) -> None:
-    some = U[:, part.knots]  # type: ignore[attr-defined]
-    some[..., part.components] = vectors
-    U[:, part.knots] = some  # type: ignore[attr-defined]
+def _put(U: Tensor, row: Vectors, vectors: Tensor) -> None:
+    values = U[:, row.knots]  # type: ignore[attr-defined]
+    values[..., row.components] = vectors
+    U[:, row.knots] = values  # type: ignore[attr-defined]
 
 
 def _chosen(
@@ -353,28 +353,28 @@ def _chosen(
 def _knots(knots: Any, kind: str, dims: Dimensions, field: str) -> tuple[slice | Tensor, int]:
     """The knots at which a constraint holds, and how many."""
     last, first = (dims.N - 1, 0) if kind == "u" else (dims.N, 1)
-    found = resolve_knots(knots, last, field, dims.like.device, first)
-    return found, count_of(found, last + 1)
+    resolved = resolve_knots(knots, last, field, dims.like.device, first)
+    return resolved, count_of(resolved, last + 1)
 
 
 def _per_knot(value: Any, field: str, dims: Dimensions, K: int) -> Tensor:
     """Numbers (B|1, K|1): given as one, (B,), or (B|1, K)."""
-    given = tensor(value, field, dims.like)
-    found = given.view(1, 1) if given.dim() == 0 else given.unsqueeze(-1) if given.dim() == 1 else given
-    if found.dim() != 2 or found.shape[0] not in (1, dims.B) or found.shape[1] not in (1, K):
-        raise InputError(field, f"a number, shape ({dims.B},), or per knot ({dims.B} or 1, {K})", tuple(given.shape))
-    if bool(torch.isnan(found).any()):
+    raw = tensor(value, field, dims.like)
+    values = raw.view(1, 1) if raw.dim() == 0 else raw.unsqueeze(-1) if raw.dim() == 1 else raw
+    if values.dim() != 2 or values.shape[0] not in (1, dims.B) or values.shape[1] not in (1, K):
+        raise InputError(field, f"a number, shape ({dims.B},), or per knot ({dims.B} or 1, {K})", tuple(raw.shape))
+    if bool(torch.isnan(values).any()):
         raise InputError(field, "numbers", "NaN")
-    return found
+    return values
 
 
 def _points(value: Any, field: str, dims: Dimensions, K: int, size: int) -> Tensor:
     """Vectors (B|1, K|1, size): given as (size,), (B, size), or (B|1, K, size)."""
-    given = tensor(value, field, dims.like)
-    found = given.view(1, 1, -1) if given.dim() == 1 else given.unsqueeze(1) if given.dim() == 2 else given
-    fits = found.dim() == 3 and found.shape[0] in (1, dims.B) and found.shape[1] in (1, K) and found.shape[2] == size
+    raw = tensor(value, field, dims.like)
+    rows = raw.view(1, 1, -1) if raw.dim() == 1 else raw.unsqueeze(1) if raw.dim() == 2 else raw
+    fits = rows.dim() == 3 and rows.shape[0] in (1, dims.B) and rows.shape[1] in (1, K) and rows.shape[2] == size
     if not fits:
         expected = f"shape ({size},), ({dims.B}, {size}), or per knot ({dims.B} or 1, {K}, {size})"
-        raise InputError(field, expected, tuple(given.shape))
-    check_finite(found, field)
-    return found
+        raise InputError(field, expected, tuple(raw.shape))
+    check_finite(rows, field)
+    return rows

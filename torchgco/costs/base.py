@@ -181,6 +181,20 @@ def add_blocks(
         H[..., :n, n + 1 :] += lux.mT
 
 
+def add_slopes(H: Tensor, knots: Any, n: int, g: Tensor, h: Tensor, cx: Tensor | None, cu: Tensor | None) -> None:
+    """Add g' dc and dc' h dc (g, h (B, K, p)) of rows with slopes cx (B, K, p, n), cu (B, K, p, m), or none, to H."""
+    add = H.new_zeros(*g.shape[:2], *H.shape[2:])
+
+    def gradient(c: Tensor | None) -> Tensor | None:
+        return None if c is None else (g.unsqueeze(-2) @ c).squeeze(-2)
+
+    def product(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+        return None if a is None or b is None else (h.unsqueeze(-1) * a).mT @ b
+
+    add_blocks(add, n, gradient(cx), gradient(cu), product(cx, cx), product(cu, cu), product(cu, cx))
+    H[:, knots] += add
+
+
 @dataclass(frozen=True)
 class FirstStates(WrappedCost):
     """A cost of the first n states."""
@@ -214,17 +228,17 @@ class OwnTotal(OwnExpansion):
         return self.cost.total(X[..., : self.n], U)
 
 
-def add_at(H: Tensor, knots: Any, at: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
-    """Add gradients (B, K, c) and Hessians (B, K, c, c) of components `at` to homogeneous blocks H of n states."""
-    H[:, knots, at, n] += gradient
-    H[:, knots, n, at] += gradient
-    H[:, knots, at, at] += hessian
+def add_at(H: Tensor, knots: Any, span: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:
+    """Add gradients (B, K, c) and Hessians (B, K, c, c) of components `span` to homogeneous blocks H of n states."""
+    H[:, knots, span, n] += gradient
+    H[:, knots, n, span] += gradient
+    H[:, knots, span, span] += hessian
 
 
 def add_first(H: Tensor, X: Tensor, n: int, m: int, write: Callable[[Tensor], None]) -> None:
     """Add homogeneous blocks of the first n states and m controls, which `write` fills, to H, of all states X."""
     blocks = H.new_zeros(*H.shape[:2], n + 1 + m, n + 1 + m)
     write(blocks)
-    one = X.shape[-1]
-    own = torch.tensor([*range(n), *range(one, one + 1 + m)], device=H.device)
-    H[..., own.unsqueeze(-1), own] += blocks
+    count = X.shape[-1]
+    index = torch.tensor([*range(n), *range(count, count + 1 + m)], device=H.device)
+    H[..., index.unsqueeze(-1), index] += blocks

@@ -43,8 +43,8 @@ class QuadraticInFreeTime(WrappedCost):
 
     def write(self) -> None:
         """Read the references of `cost` as they are, in this memory."""
-        for own, new in zip((self.along, self.rests), _read(self.cost), strict=True):
-            own.copy_(new)
+        for old, new in zip((self.along, self.rests), _read(self.cost), strict=True):
+            old.copy_(new)
 
     def numbers(self, where: str) -> list[Number]:
         return self.cost.numbers(where, self.write)
@@ -62,14 +62,14 @@ class QuadraticInFreeTime(WrappedCost):
     def terminal_at(self, x: Tensor, tau: Tensor) -> Tensor:
         """`terminal` where stages last tau (...) times as long."""
         count = self.along.shape[1] - 1
-        rests, there = (_spread(part, x) for part in (self.rests, self.cost.xf_ref))
+        rests, there = (_spread(row, x) for row in (self.rests, self.cost.xf_ref))
         return self.of_errors.terminal(x - torch.where(rests, there, self.reference(count * tau)))
 
     def reference(self, s: Tensor) -> Tensor:
         """References (B, ..., n) at times s (B, ...), in stages of dt."""
         c, last = self.along, self.along.shape[1] - 1
         within = torch.where(s < 0.0, 0.0, torch.where(s < last, s, float(last)))
-        ends = (_spread(part, s, 1) for part in (c[:, 1] - c[:, 0], c[:, -1] - c[:, -2]))
+        ends = (_spread(slope, s, 1) for slope in (c[:, 1] - c[:, 0], c[:, -1] - c[:, -2]))
         ahead = torch.where((s < 0.0).unsqueeze(-1), *ends)
         c = torch.cat((2.0 * c[:, :1] - c[:, 1:2], c, 2.0 * c[:, -1:] - c[:, -2:-1]), dim=1)
         places = torch.arange(-1, last + 2, dtype=s.dtype, device=s.device)
@@ -99,13 +99,13 @@ def coefficients(rows: Tensor) -> Tensor:
     by row: a problem's bits don't depend on the batch.
     """
     r = rows.unbind(1)
-    shares, found = [0.0], [r[0]]  # c_k = found_k - shares_k c_{k+1}
+    shares, forward = [0.0], [r[0]]  # c_k = forward_k - shares_k c_{k+1}
     for row in r[1:-1]:
         pivot = 4.0 - shares[-1]
-        found.append((6.0 * row - found[-1]) / pivot)
+        forward.append((6.0 * row - forward[-1]) / pivot)
         shares.append(1.0 / pivot)
     c = [r[-1]]
-    for value, share in zip(found[:0:-1], shares[:0:-1], strict=True):
+    for value, share in zip(forward[:0:-1], shares[:0:-1], strict=True):
         c.append(value - share * c[-1])
     return torch.stack([r[0], *c[::-1]] if len(r) > 1 else c, dim=1)
 

@@ -53,10 +53,10 @@ class QuadraticCost(Cost):
         check_semidefinite(Q.detach(), R.detach(), Qf.detach(), None if H is None else H.detach())
         x_ref = _vector(self.x_ref, "x_ref", n, B, N + 1, dims.like)
         weights = (self.Q, Q), (self.R, R), (self.Qf, Qf)
-        diagonal = H is None and all(_is_diagonal(given, W) for given, W in weights)
+        diagonal = H is None and all(_is_diagonal(value, W) for value, W in weights)
         if diagonal:
             Q, R, Qf = (W.diagonal(dim1=-2, dim2=-1).contiguous() for W in (Q, R, Qf))
-        found = BoundQuadratic(
+        cost = BoundQuadratic(
             Q=Q,
             R=R,
             Qf=Qf,
@@ -69,7 +69,7 @@ class QuadraticCost(Cost):
             H=H,
             diagonal=diagonal,
         )
-        return (QuadraticInFreeTime.of(found) or found) if dims.free_time else found
+        return (QuadraticInFreeTime.of(cost) or cost) if dims.free_time else cost
 
 
 @dataclass(frozen=True)
@@ -105,19 +105,19 @@ class BoundQuadratic(Cost):
     def numbers(self, where: str, after: Callable[[], object] | None = None) -> list[Number]:
         if type(self) is not BoundQuadratic:  # of which kernels read what its code computes
             return super().numbers(where)
-        found = [Number(f"{where}.x_ref", (self.x_ref.numpy(), self.xf_ref.numpy()), where, False, finite, after)]
+        entries = [Number(f"{where}.x_ref", (self.x_ref.numpy(), self.xf_ref.numpy()), where, False, finite, after)]
         for name in ("u_ref", *WEIGHTS, "q", "r", "qf", "H"):
             tensor = getattr(self, name)
             if tensor is not None:
                 check = finite if name not in WEIGHTS else at_least_zero if self.diagonal else _matrices
                 joint = self._check_new if name in ("Q", "R", "H") and self.H is not None else None
-                found += numbers(where, {name: (tensor, check)}, where, False, joint=joint)
-        return found
+                entries += numbers(where, {name: (tensor, check)}, where, False, joint=joint)
+        return entries
 
     def _check_new(self, new: Mapping[str, Floats]) -> None:
         """Check Q, R and H together: each alone may be fine, and the stage cost still fall without end."""
-        own = {name: new.get(f"cost.{name}", getattr(self, name).numpy()) for name in (*WEIGHTS, "H")}
-        check_semidefinite(**{name: torch.tensor(weights) for name, weights in own.items()})
+        matrices = {name: new.get(f"cost.{name}", getattr(self, name).numpy()) for name in (*WEIGHTS, "H")}
+        check_semidefinite(**{name: torch.tensor(weights) for name, weights in matrices.items()})
 
     def by_knot(self, N: int) -> BoundQuadratic:
         """The same with references of its own memory for each stage."""
@@ -130,7 +130,7 @@ class BoundQuadratic(Cost):
 
     def names_by_stage(self) -> set[str]:
         names = "x_ref", "u_ref", "Q", "R", "q", "r", "H"
-        return {name for name in names if (part := getattr(self, name)) is not None and part.shape[1] > 1}
+        return {name for name in names if (value := getattr(self, name)) is not None and value.shape[1] > 1}
 
     def with_more(self, n: int, r: int) -> Cost:
         if type(self) is not BoundQuadratic:
@@ -153,8 +153,8 @@ class BoundQuadratic(Cost):
         parts: dict[str, Tensor | None] = {"u_ref": torch.where(running.unsqueeze(-1), self.u_ref, resting)}
         for name in ("Q", "H", "q", "r"):
             value = getattr(self, name)
-            own = running.unsqueeze(-1) if name in ("q", "r") else runs
-            parts[name] = None if value is None else torch.where(own, value, 0.0)
+            mask = running.unsqueeze(-1) if name in ("q", "r") else runs
+            parts[name] = None if value is None else torch.where(mask, value, 0.0)
         weights = torch.where(self.control_curvatures > 0, self.control_curvatures, 1.0)
         parts["R"] = torch.where(runs, self.R, weights if self.diagonal else torch.diag_embed(weights))
         if self.x_ref.shape[1] > 1:
@@ -177,12 +177,12 @@ class BoundQuadratic(Cost):
         return replace(self, **{name: lead(factor, W) * W for name, W in weights.items() if W is not None})
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        def at_k(part: Tensor) -> Tensor:
-            if not isinstance(k, int) or (x.dim() == 3 and part.shape[1] == 1):
-                return part
-            at = k if part.shape[1] > 1 else 0
+        def at_k(values: Tensor) -> Tensor:
+            if not isinstance(k, int) or (x.dim() == 3 and values.shape[1] == 1):
+                return values
+            index = k if values.shape[1] > 1 else 0
             # The axis of samples, if any, follows the batch axis.
-            return part[:, at] if x.dim() == 2 else part[:, at : at + 1]
+            return values[:, index] if x.dim() == 2 else values[:, index : index + 1]
 
         ex, eu = x - at_k(self.x_ref), u - at_k(self.u_ref)
         value = 0.5 * ((ex * self._times(at_k(self.Q), ex)).sum(-1) + (eu * self._times(at_k(self.R), eu)).sum(-1))
@@ -231,8 +231,8 @@ class BoundQuadratic(Cost):
         Axes that all weights share keep length 1, so that most problems fill H with copies of a single block.
         """
         n, s = self.Q.shape[-1], like.shape[-1]
-        parts = [part for part in (self.Q, self.R, self.H) if part is not None]
-        lead = [max(part.shape[axis] for part in parts) for axis in (0, 1)]
+        parts = [weight for weight in (self.Q, self.R, self.H) if weight is not None]
+        lead = [max(weight.shape[axis] for weight in parts) for axis in (0, 1)]
         stage, terminal = like.new_zeros(*lead, s, s), like.new_zeros(self.Qf.shape[0], s, s)
         Q, R, Qf = (torch.diag_embed(W) if self.diagonal else W for W in (self.Q, self.R, self.Qf))
         add_blocks(stage, n, None, None, Q, R, self.H)
@@ -275,9 +275,9 @@ def _optional(value: Any, field: str, size: int, B: int, N: int | None, like: Te
     return v if asks(v) or bool((v != 0).any()) else None
 
 
-def _is_diagonal(given: Any, W: Tensor) -> bool:
+def _is_diagonal(value: Any, W: Tensor) -> bool:
     """Whether a weight is one for good: a matrix that asks for gradients may have them off its diagonal."""
-    if asks(W) and isinstance(given, Tensor) and given.dim() > 1:
+    if asks(W) and isinstance(value, Tensor) and value.dim() > 1:
         return False
     return bool((W - torch.diag_embed(W.diagonal(dim1=-2, dim2=-1)) == 0).all())
 

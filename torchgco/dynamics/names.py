@@ -29,9 +29,9 @@ def states_of(dynamics: Dynamics) -> list[Quantity]:
     """
     if len(dynamics.state_names) > 0 or len(dynamics.state_units) > 0:
         return _named(dynamics.state_names, dynamics.state_units, dynamics.n, "state", "x")
-    at = dynamics.position
-    place = range(0) if at is None or at.stop - at.start > 3 else range(at.start, at.stop)
-    return [Quantity("xyz"[i - place.start], "m") if i in place else Quantity(f"x[{i}]") for i in range(dynamics.n)]
+    span = dynamics.position
+    axes = range(0) if span is None or span.stop - span.start > 3 else range(span.start, span.stop)
+    return [Quantity("xyz"[i - axes.start], "m") if i in axes else Quantity(f"x[{i}]") for i in range(dynamics.n)]
 
 
 def controls_of(dynamics: Dynamics) -> list[Quantity]:
@@ -51,5 +51,5 @@ def _named(names: Sequence[str], units: Sequence[str], count: int, kind: str, le
             raise InputError(f"dynamics.{field}", f"{count} texts, one per {kind}", shown(texts))
     if len(set(names)) < len(names):
         raise InputError(f"dynamics.{kind}_names", "a name of its own for each", shown(names))
-    own = names if len(names) else [f"{letter}[{i}]" for i in range(count)]
-    return [Quantity(*pair) for pair in zip(own, units if len(units) else [""] * count, strict=True)]
+    labels = names if len(names) else [f"{letter}[{i}]" for i in range(count)]
+    return [Quantity(*pair) for pair in zip(labels, units if len(units) else [""] * count, strict=True)]

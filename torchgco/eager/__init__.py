@@ -1,5 +1,6 @@
-"""The interior point and MPPI's rounds in PyTorch: any device, any dtype, any code that PyTorch can differentiate.
+"""What PyTorch computes of any code, on any device and in any precision: derivatives of functions, and MPPI's rounds.
 
-`loop` is the interior point of `native/c/interior.c` for what can't be traced, `sampling` MPPI's rounds. It imports
-`ilqr` and `lagrangian`. Begin with `loop.py`.
+`functions` has the values and derivatives of a problem, for which the interior point in C asks where it can't call the
+problem's code (`native.called`), and `curvature` the ways to differentiate; `sampling` has MPPI's rounds. It imports
+`problem`. Begin with `functions.py`.
 """

@@ -52,7 +52,7 @@ class Sampling:
         spread = gap.kthvalue(self.elite, dim=1, keepdim=True).values
         return torch.softmax(-gap / spread.clamp(min=self.temperature), dim=1)
 
-    def scores(self, problem: Problem, flight: Flight) -> Tensor:
+    def scores(self, problem: Problem, flight: Rollouts) -> Tensor:
         """S (B, S) in float64 of a block of samples."""
         cost = flight.cost + problem.cost.terminal(flight.x)
         if self.dwell_cost > 0:
@@ -81,7 +81,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Flight:
+class Rollouts:
     """Rolled-out samples."""
 
     V: Tensor  # (N, B, S, m) controls
@@ -135,7 +135,7 @@ def draw(mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Te
     return V if bounds is None else torch.clamp(V, *bounds)
 
 
-def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Flight:
+def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Rollouts:
     """The samples of `draw`, rolled out (Algorithm 3, lines 5-11)."""
     V = draw(mean, noise, bounds)
     x = problem.x0.unsqueeze(1).expand(-1, V.shape[2], -1)
@@ -149,7 +149,7 @@ def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tens
     likelihood = torch.zeros_like(cost)
     if noise.left is None:
         likelihood = sum((mean / noise.scale.square() * noise.eps).sum(-1).unbind(0), likelihood)
-    return Flight(V, x, cost, hits, likelihood)
+    return Rollouts(V, x, cost, hits, likelihood)
 
 
 def average(V: Tensor, weights: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torchgco.base.tree import put
 from torchgco.envs.missions import MissionVectorEnv
 from torchgco.missions.mission import CPU
 from torchgco.missions.pilot import SEED_STEP
-from torchgco.missions.planner import OTHERS, TRAJECTORY, Plan, Planner
+from torchgco.missions.planner import MissionPlan, Planner
 from torchgco.missions.tracker import RATES
 
 AHEAD = 2  # the knot of a plan that is asked for
@@ -43,11 +43,11 @@ class PlannerPolicy:
     def __init__(self, env: Any, planner: Planner | None = None, seed: int = 0) -> None:
         env = env.unwrapped
         if not isinstance(env, MissionVectorEnv) or env.episodes.control != "rates":
-            given = type(env).__name__ if not isinstance(env, MissionVectorEnv) else 'control "rotors"'
-            raise InputError("env", 'a MissionVectorEnv with control "rates"', given)
+            got = type(env).__name__ if not isinstance(env, MissionVectorEnv) else 'control "rotors"'
+            raise InputError("env", 'a MissionVectorEnv with control "rates"', got)
         self.env, self.seed = env, seed
         self.planner = env.episodes.mission.planner if planner is None else planner
-        self._plan: Plan | None = None
+        self._plan: MissionPlan | None = None
         self._step, self._number = 0, torch.zeros_like(env.episodes.number)
 
     def __call__(self, observation: Any = None) -> np.ndarray:
@@ -65,14 +65,14 @@ class PlannerPolicy:
             action = torch.zeros(len(x), 4, dtype=x.dtype)
             action[:, 3] = flying.airframe.gravity
             for rows, anew in ((begun, True), (~begun & ~waiting, False)):
-                at = rows.nonzero().flatten()
-                if len(at) > 0:
-                    X = self._planned(x, at, anew).X
-                    action[at] = X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
+                indices = rows.nonzero().flatten()
+                if len(indices) > 0:
+                    X = self._planned(x, indices, anew).X
+                    action[indices] = X[:, min(AHEAD, X.shape[1] - 1), RATES.start :]
             self._number, self._step = torch.where(waiting, self._number, flying.number), self._step + 1
             return action.clamp(*self.env._bounds).to(torch.float32).numpy()
 
-    def _planned(self, x: Tensor, rows: Tensor, anew: bool) -> Plan:
+    def _planned(self, x: Tensor, rows: Tensor, anew: bool) -> MissionPlan:
         """The plans of the environments `rows` (b,), which are kept for the next call."""
         flying, planner = self.env.episodes, self.planner
         whole, x = flying.problem.take(flying.layout[rows]), x[rows]
@@ -80,10 +80,10 @@ class PlannerPolicy:
         ids, seed = torch.tensor(self.env.ids)[rows], self.seed + SEED_STEP * self._step
         posed = planner.problem(whole, x)
         plan, _, _ = planner.plan(whole, posed, x, self._step, before, seed, ids)
-        plan = replace(plan, model=whole.dynamics)
+        plan = replace(plan, dynamics=whole.dynamics)
         if self._plan is None:
             self._plan = plan.take(torch.zeros(len(flying.x), dtype=torch.int64))  # room for the plans of all
-        for name in (*TRAJECTORY, *OTHERS):
+        for name in (*plan.trajectory, *plan.beside):
             put(getattr(self._plan, name), rows, getattr(plan, name))
-        self._plan = replace(self._plan, model=flying.problem.dynamics.take(flying.layout), step=plan.step)
+        self._plan = replace(self._plan, dynamics=flying.problem.dynamics.take(flying.layout))
         return plan

@@ -43,8 +43,8 @@ class Episodes:
     def __init__(self, mission: Mission, problem: Problem, count: int, control: Control) -> None:
         problem, _, _ = check_flown(mission, problem, 0, None)
         if not mission.sees_all or mission.latency or has_gates(problem):
-            given = "a sensor" if not mission.sees_all else "a latency" if mission.latency else "a race"
-            raise InputError("mission", "no sensor, latency or race in an environment", given)
+            got = "a sensor" if not mission.sees_all else "a latency" if mission.latency else "a race"
+            raise InputError("mission", "no sensor, latency or race in an environment", got)
         self.mission, self.problem, self.control = mission, problem, control
         check_no_body(problem, "vehicle_radius", "a number for an environment, whose vehicle is a ball")
         self.contacts = Contact.among(problem)
@@ -127,8 +127,8 @@ class Episodes:
         first = self._tracking is None or len(fresh) == len(seen)
         tracking = tracker.track(seen, reference, offset, None if first else self._tracking)
         if not first and len(fresh) > 0:
-            part = Reference(reference.X[fresh], self.period, self.airframe)
-            begun = tracker.track(seen[fresh], part, offset)
+            restarted = Reference(reference.X[fresh], self.period, self.airframe)
+            begun = tracker.track(seen[fresh], restarted, offset)
             for name in ("commands", "violation", "U", "multipliers"):
                 put(getattr(tracking, name), fresh, getattr(begun, name))
         self._tracking = tracking

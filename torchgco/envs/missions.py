@@ -140,7 +140,7 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
         seeds = list(seed) if isinstance(seed, Sequence) else [seed] * self.num_envs
         if len(seeds) != self.num_envs:
             raise InputError("seed", f"one number or {self.num_envs}", len(seeds))
-        super().reset(seed=next((one for one in seeds if one is not None), None))
+        super().reset(seed=next((entry for entry in seeds if entry is not None), None))
         rows = np.arange(self.num_envs)
         if options is not None and "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
@@ -214,10 +214,10 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
     def _begin(self, rows: np.ndarray, layouts: np.ndarray | None = None) -> None:
         """Another episode for the environments `rows` (b,), of `layouts` (B,) or drawn ones."""
         draws = [self._streams[row].integers((len(self.episodes.layouts), 2**62)) for row in rows]
-        at = self.episodes.layouts[torch.tensor([int(first) for first, _ in draws])]
-        at = at if layouts is None else torch.from_numpy(layouts[rows])
+        chosen = self.episodes.layouts[torch.tensor([int(first) for first, _ in draws])]
+        chosen = chosen if layouts is None else torch.from_numpy(layouts[rows])
         seeds, ids = [int(seed) for _, seed in draws], [self.ids[row] for row in rows]
-        self.episodes.begin(torch.from_numpy(rows), at, seeds, ids)
+        self.episodes.begin(torch.from_numpy(rows), chosen, seeds, ids)
         self.waiting[rows] = False
 
     def _observed(self) -> np.ndarray:
@@ -229,17 +229,17 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
 
     def _info(self, outcome: np.ndarray, rows: np.ndarray | None = None) -> dict[str, Any]:
         """Outcome, layout and distance, and for which environments they are given: all, or `rows`."""
-        given = np.zeros(self.num_envs, bool)
-        given[slice(None) if rows is None else rows] = True
+        mask = np.zeros(self.num_envs, bool)
+        mask[slice(None) if rows is None else rows] = True
         values = {
             "outcome": outcome,
             "layout": self.episodes.layout.numpy(),
             "distance": self.episodes.distance().numpy(),
         }
-        found = dict[str, Any]()
+        info = dict[str, Any]()
         for name, value in values.items():
-            found[name], found[f"_{name}"] = np.where(given, value, np.zeros_like(value)), given.copy()
-        return found
+            info[name], info[f"_{name}"] = np.where(mask, value, np.zeros_like(value)), mask.copy()
+        return info
 
     def _final(self, done: np.ndarray, outcome: np.ndarray) -> dict[str, Any]:
         """Observations and infos of episodes that end in the step in which the next ones begin."""

@@ -30,8 +30,8 @@ def names(nearest: int) -> Texts:
     them, w the body rates, a the joint thrust by the mass. Of each obstacle, nearest first, the direction in which it
     lies, of length 1, and its distance from the vehicle's ball.
     """
-    own = (*(f"toward {axis}" for axis in AXES), "distance")
-    return (*VEHICLE, *(f"obstacle {k} {name}" for k in range(1, nearest + 1) for name in own))
+    fields = (*(f"toward {axis}" for axis in AXES), "distance")
+    return (*VEHICLE, *(f"obstacle {k} {name}" for k in range(1, nearest + 1) for name in fields))
 
 
 def units(nearest: int) -> Texts:
@@ -42,8 +42,8 @@ def units(nearest: int) -> Texts:
 def observed(x: Tensor, goal: Tensor, obstacles: Sequence[Any], airframe: Airframe, nearest: int, sight: float):
     """Observations (B, 19 + 4 nearest) of plants x (B, 17) with goals (B, 3)."""
     v, w, a = x[:, 3:6], x[:, 10:13], x[:, 13:].sum(-1, keepdim=True) / airframe.mass
-    own = torch.cat((goal - x[:, :3], v, rotation(x[:, 6:10]).flatten(1), w, a), dim=-1)
-    return torch.cat((own, surroundings(x[:, :3], obstacles, nearest, sight).flatten(1)), dim=-1)
+    state = torch.cat((goal - x[:, :3], v, rotation(x[:, 6:10]).flatten(1), w, a), dim=-1)
+    return torch.cat((state, surroundings(x[:, :3], obstacles, nearest, sight).flatten(1)), dim=-1)
 
 
 def rotation(q: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ def surroundings(p: Tensor, obstacles: Sequence[Any], nearest: int, sight: float
         return seen
     offsets = STEP * torch.cat((torch.zeros(1, 3), torch.eye(3), -torch.eye(3))).to(p)
     points, times = p.unsqueeze(1) + offsets, p.new_zeros(len(offsets))
-    d = torch.cat([part.signed_distance(points, times) for part in obstacles], dim=-1)  # (B, 7, M)
+    d = torch.cat([obstacle.signed_distance(points, times) for obstacle in obstacles], dim=-1)  # (B, 7, M)
     distance, which = d[:, 0].topk(min(nearest, d.shape[-1]), largest=False)
     slope = (d[:, 1:4] - d[:, 4:]) / (2.0 * STEP)
     toward = -slope.gather(2, which.unsqueeze(1).expand(-1, 3, -1)).transpose(1, 2)

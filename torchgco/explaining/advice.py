@@ -33,9 +33,13 @@ OTHER_START = (
     "rows."
 )
 NO_SLOPE = (
-    "The violated rows have no slope where it ended, as a comparison or a rounding has none: no step lowers them."
+    "The violated rows have no slope where it ended, as a comparison or a rounding has none, and a product whose "
+    "factors are 0: no step lowers them."
 )
-SMOOTH_ROWS = "Rows that change smoothly with states and controls, such as x - 1 in the place of (x > 1) * 1.0."
+SMOOTH_ROWS = (
+    "Another guess U0; or rows that change smoothly with states and controls, such as x - 1 in the place of "
+    "(x > 1) * 1.0."
+)
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 MISSED = "The goal is required, and no trajectory that was found meets it: the best one misses it by {missed}."
 TOUCHES = "All constraints hold at the knots, and the vehicle touches an obstacle between two of them."
@@ -157,30 +161,30 @@ def advice(facts: Facts) -> list[str]:
         size = "a narrower body" if facts.body else f"a vehicle_radius of at most {facts.passage:.3g} m"
         smaller = f", or {size}" if facts.passage > 0 else ""
         return [f"A goal on the start's side of the walls, or a map with a wider way{smaller}."]
-    found = list[str]()
+    sentences = list[str]()
     if facts.steps is not None:
-        found.append(SHORTER_STEPS)
+        sentences.append(SHORTER_STEPS)
     if facts.among_obstacles and facts.seeks_paths is False and not (facts.status in FITS and facts.reached):
-        found.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')
+        sentences.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')
     if facts.horizon is not None and facts.horizon.suffices is False and not facts.reached:
-        found.append(str(facts.horizon))
+        sentences.append(str(facts.horizon))
     if facts.pathless and not facts.reached:
-        found.append("A look at the scene (torchgco.plot): no path to the goal was found between the obstacles.")
+        sentences.append("A look at the scene (torchgco.plot): no path to the goal was found between the obstacles.")
     if facts.touches:
-        found.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
+        sentences.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
     elif facts.status in FITS and facts.reached is False:
         suffices = facts.horizon is not None and facts.horizon.suffices
-        found.append(ENOUGH if suffices else capital(STOPS_SHORT.format(longer=facts.longer).removeprefix("or ")))
+        sentences.append(ENOUGH if suffices else capital(STOPS_SHORT.format(longer=facts.longer).removeprefix("or ")))
     elif facts.missed is not None and facts.status is Status.INFEASIBLE:
-        found.append(OTHER_GOAL if facts.covered else capital(NEARER.format(longer=facts.longer)))
+        sentences.append(OTHER_GOAL if facts.covered else capital(NEARER.format(longer=facts.longer)))
     elif facts.status in BY_STATUS:
         limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
         row = "the row named above" if facts.named else "one constraint after the other"
         limited = f" ({', '.join(limits)})" if limits else ""
-        found.append(BY_STATUS[facts.status].format(limits=limited, row=row, longer=facts.longer))
+        sentences.append(BY_STATUS[facts.status].format(limits=limited, row=row, longer=facts.longer))
     if tells_to_record(facts):
-        found.append("torchgco.solve(..., record=True), after which explain tells what each pass did.")
-    return found
+        sentences.append("torchgco.solve(..., record=True), after which explain tells what each pass did.")
+    return sentences
 
 
 def capital(text: str) -> str:

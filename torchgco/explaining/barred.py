@@ -19,7 +19,7 @@ from torchgco.problem.problem import Problem
 
 def goal_facts(problem: Problem, X: Tensor, U: Tensor) -> dict[str, Any]:
     """Those of `Facts` on a required goal that X (1, N+1, n), U (1, N, m) misses; none where it doesn't."""
-    row = next((part for part in problem.constraints if part.is_goal), None)
+    row = next((constraint for constraint in problem.constraints if constraint.is_goal), None)
     if row is None:
         return {}
     last = int(problem.stages[0])  # of a problem with its own horizon, whose rows stand at knot N
@@ -32,18 +32,18 @@ def goal_facts(problem: Problem, X: Tensor, U: Tensor) -> dict[str, Any]:
 
 def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]:
     """Those of `Facts` that maps know, for a batch of one; none where the vehicle arrived without contact."""
-    fields = [part for part in problem.obstacles if part.map is not None]
+    fields = [field for field in problem.obstacles if field.map is not None]
     if status is Status.INVALID_START:
-        return {"in_unknown": any(_is_unknown(problem, one.map) for one in fields if one.body is None)}
+        return {"in_unknown": any(_is_unknown(problem, field.map) for field in fields if field.body is None)}
     if arrived or problem.goal is None:
         return {}
-    found = [fact for field in fields if field.holds_at(problem.N) and (fact := _barred(problem, field)) is not None]
-    return min(found, key=lambda fact: fact["passage"], default={})
+    facts = [fact for field in fields if field.holds_at(problem.N) and (fact := _barred(problem, field)) is not None]
+    return min(facts, key=lambda fact: fact["passage"], default={})
 
 
-def _barred(problem: Problem, part: Obstacles) -> dict[str, Any] | None:
+def _barred(problem: Problem, obstacle: Obstacles) -> dict[str, Any] | None:
     """The vehicle's radius and the largest that gets to the goal, where this one touches the map on every way."""
-    field = part.inscribed  # of a body, as the ball meets it that the body holds
+    field = obstacle.inscribed  # of a body, as the ball meets it that the body holds
     assert problem.goal is not None and isinstance(field, BoundField)
     start = problem.x0[0, problem.position].detach().cpu().double().numpy()
     goal = problem.goal.position[0].detach().cpu().double().numpy()
@@ -55,17 +55,17 @@ def _barred(problem: Problem, part: Obstacles) -> dict[str, Any] | None:
     if passage is None:
         return None
     ends = {"start": start, "goal": goal}
-    off = [name for name, place in ends.items() if passage == 0.0 and _shuts_out(field, place)]
-    return {"radius": radius, "passage": passage, "body": part is not field, "off_map": off[0] if off else None}
+    off = [name for name, point in ends.items() if passage == 0.0 and _shuts_out(field, point)]
+    return {"radius": radius, "passage": passage, "body": obstacle is not field, "off_map": off[0] if off else None}
 
 
-def _shuts_out(field: BoundField, place: np.ndarray) -> bool:
+def _shuts_out(field: BoundField, point: np.ndarray) -> bool:
     """Whether a place lies outside of a grid whose outermost cells are all occupied."""
     source = field.field.single(int(field.which[0])).source
-    if not isinstance(source, OccupancyGrid) or source.holds(place):
+    if not isinstance(source, OccupancyGrid) or source.holds(point):
         return False
-    (held,) = source.held(field.field.unknown)
-    return all(bool(held.take((0, -1), axis).all()) for axis in range(source.d))
+    (cells,) = source.held(field.field.unknown)
+    return all(bool(cells.take((0, -1), axis).all()) for axis in range(source.d))
 
 
 def _is_unknown(problem: Problem, field: BoundField) -> bool:

@@ -77,13 +77,13 @@ def _explanation(solved: Solved, b: int, problem: Problem | None, what: str | No
         problem = current_problem(problem)
         check_shape(solved.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
         check_shape(solved.U, (problem.B, problem.N, problem.m), "problem: solution.U")
-    one = None if whole is None else _One(whole, solved, b)
-    facts = _facts(solved, b, account, one)
+    single = None if whole is None else _One(whole, solved, b)
+    facts = _facts(solved, b, account, single)
     by = f" by {account.name}" if account.name else ""
     parts = [
         ("", [f"{what or f'Problem {b} of {B}'}, solved{by}: {facts.status.name}."]),
-        ("Result", _result(solved, b, facts, one)),
-        ("Caught", _caught(solved, b, one)),
+        ("Result", _result(solved, b, facts, single)),
+        ("Caught", _caught(solved, b, single)),
         ("Passes", _passes(solved, b, account, facts)),
         ("Iterations", _iterations(solved, b)),
         ("Why it ended", facts.told),
@@ -124,8 +124,8 @@ class _One:
 
     def long_steps(self) -> str | None:
         """What shows that dt is too long for the model; None where nothing does."""
-        found = step_errors(self.problem, self.X, self.U, self.times, self.lams, doubted=True)
-        return found.told(0, self.problem) if bool(found.large) else None
+        errors = step_errors(self.problem, self.X, self.U, self.times, self.lams, doubted=True)
+        return errors.told(0, self.problem) if bool(errors.large) else None
 
     def verdict(self) -> dict[str, Any]:
         """`clearance` and `reached` by the judge, where it knows them."""
@@ -136,59 +136,59 @@ class _One:
             return {}
 
 
-def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
+def _facts(solved: Solved, b: int, account: Account, single: _One | None) -> Facts:
     solver, status = account.solver, Status(int(solved.status[b]))
     recording = getattr(solver, "recording", None)
     could = solved.trace is None and recording is not None and recording() != solver
-    if one is None:
+    if single is None:
         return Facts(status, solver, could_record=could)
     horizon = getattr(solver, "horizon", None)
-    verdict = one.verdict()
+    verdict = single.verdict()
     reached = bool(verdict["reached"]) if "reached" in verdict else None
     clearance = float(verdict["clearance"]) if "clearance" in verdict else None
     return Facts(
         status=status,
         solver=solver,
         seeks_paths=None if solver is None else hasattr(solver, "passes"),
-        among_obstacles=bool(one.problem.obstacles),
+        among_obstacles=bool(single.problem.obstacles),
         reached=reached,
-        goal_distance=one.goal_distance,
+        goal_distance=single.goal_distance,
         clearance=clearance,
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
-        unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.full_X, one.full_U, ADMITTED)),
-        horizon=None if reached or horizon is None else horizon(one.problem),
-        flat=one.lost_at is None and bool(without_slope(one.held, one.full_X, one.full_U, ADMITTED)),
-        steps=one.long_steps(),
-        named=one.lost_at is None and place_told(one.problem, one.X, one.U, one.t) is not None,
-        **goal_facts(one.problem, one.X, one.U),
-        **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
+        unmoved=status is Status.INFEASIBLE and bool(unmoved(single.held, single.full_X, single.full_U, ADMITTED)),
+        horizon=None if reached or horizon is None else horizon(single.problem),
+        flat=single.lost_at is None and bool(without_slope(single.held, single.full_X, single.full_U, ADMITTED)),
+        steps=single.long_steps(),
+        named=single.lost_at is None and place_told(single.problem, single.X, single.U, single.t) is not None,
+        **goal_facts(single.problem, single.X, single.U),
+        **map_facts(single.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
     )
 
 
-def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]:
+def _result(solved: Solved, b: int, facts: Facts, single: _One | None) -> list[str]:
     counts = f"{int(solved.iterations[b])} iterations"
     if outer := int(solved.outer_iterations[b]):
         counts += f", {outer} outer iteration{'s' if outer > 1 else ''}"
     if guided := int(solved.guided[b]):
         counts += f", {guided} of them guided"
     lines = [f"cost {number(float(solved.cost[b]))}, violation {number(float(solved.violation[b]))}, after {counts}"]
-    if one is None:
+    if single is None:
         return lines
-    if one.lost_at is not None:
-        lines.append(f"the state at knot {one.lost_at} isn't finite: the stage before it is where the model fails")
+    if single.lost_at is not None:
+        lines.append(f"the state at knot {single.lost_at} isn't finite: the stage before it is where the model fails")
         return lines
-    lines += _duration(solved, b, one)
-    worst = place_told(one.problem, one.X, one.U, one.t)
+    lines += _duration(solved, b, single)
+    worst = place_told(single.problem, single.X, single.U, single.t)
     lines.append("no constraint is violated" if worst is None else f"violated most: {worst}")
-    lines += gates_told(one.held, one.full_X, one.full_U)
+    lines += gates_told(single.held, single.full_X, single.full_U)
     if facts.steps is not None:
         lines.append(f"steps are too long for the model: {facts.steps}")
     if facts.clearance is not None and facts.clearance < float("inf"):
         side = "touches an obstacle" if facts.clearance < 0 else "clear of obstacles"
         lines.append(f"{side}: {number(facts.clearance)} m to contact, between the knots too")
-    if facts.goal_distance is not None and one.problem.goal is not None:
-        radius = float(one.problem.goal.radius[0])
+    if facts.goal_distance is not None and single.problem.goal is not None:
+        radius = float(single.problem.goal.radius[0])
         near = facts.goal_distance < radius
         within = "reached" if facts.reached else "not judged" if facts.reached is None else "not reached"
         within = "not reached, as constraints are violated" if near and facts.reached is False else within
@@ -197,14 +197,14 @@ def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]
     return lines
 
 
-def _duration(solved: Solved, b: int, one: _One) -> list[str]:
+def _duration(solved: Solved, b: int, single: _One) -> list[str]:
     """How long the trajectory lasts, where that was free, and whether the longest time does."""
-    time = one.problem.time
-    if time is None or one.t is None:
+    time = single.problem.time
+    if time is None or single.t is None:
         return []
-    sizes = torch.bincount(time.of_stages(one.problem.N))
-    least, most = ((factors[0] * sizes).sum() * one.problem.dynamics.dt for factors in (time.least, time.most))
-    lines = [f"duration {number(float(one.t[-1]))} s, of {number(float(least))} to {number(float(most))} s allowed"]
+    sizes = torch.bincount(time.of_stages(single.problem.N))
+    least, most = ((factors[0] * sizes).sum() * single.problem.dynamics.dt for factors in (time.least, time.most))
+    lines = [f"duration {number(float(single.t[-1]))} s, of {number(float(least))} to {number(float(most))} s allowed"]
     if solved.needed is not None and float(solved.violation[b]) > ADMITTED:
         needed = float(solved.needed[b])
         told = "none longer that was tried does" if needed != needed else f"{number(needed)} s would do"
@@ -212,20 +212,20 @@ def _duration(solved: Solved, b: int, one: _One) -> list[str]:
     return lines
 
 
-def _caught(solved: Solved, b: int, one: _One | None) -> list[str]:
+def _caught(solved: Solved, b: int, single: _One | None) -> list[str]:
     """Where the first solve was caught, where that is recorded; else where the returned trajectory is."""
-    if one is None:
+    if single is None:
         return []
     if solved.search is not None and solved.search.caught is not None:
         rows, X = solved.search.caught
-        at = (rows == b).nonzero().flatten()
-        if at.numel() == 0:
+        index = (rows == b).nonzero().flatten()
+        if index.numel() == 0:
             return ["no: the first solve wasn't stopped between obstacles"]
-        told = caught_told(one.held, X[at], one.full_U, one.t)
+        told = caught_told(single.held, X[index], single.full_U, single.t)
         return [f"the first solve was stopped {told}" if told else "the first solve was stopped between obstacles"]
-    if one.lost_at is not None:
+    if single.lost_at is not None:
         return []
-    told = caught_told(one.held, one.full_X, one.full_U, one.t, ADMITTED)
+    told = caught_told(single.held, single.full_X, single.full_U, single.t, ADMITTED)
     return [f"the returned trajectory lies {told}"] if told else []
 
 

@@ -74,7 +74,7 @@ def iterations_told(trace: pd.DataFrame, b: int) -> list[str]:
 
 def is_pathless(record: SearchRecord, b: int) -> bool:
     """Whether paths were sought for the problem at place b, and none was found."""
-    fates = [one.fate[one.rows == b] for one in record.comparisons if bool((one.rows == b).any())]
+    fates = [trial.fate[trial.rows == b] for trial in record.comparisons if bool((trial.rows == b).any())]
     return bool(fates) and all(bool((fate == Fate.ABSENT).all()) for fate in fates)
 
 
@@ -83,11 +83,11 @@ class _Standing(tuple[float, float, float, bool]):
 
     @classmethod
     def of(cls, standing: Standing, b: int) -> _Standing | None:
-        at = (standing.rows == b).nonzero().flatten().tolist()
-        if not at:
+        index = (standing.rows == b).nonzero().flatten().tolist()
+        if not index:
             return None
         parts = (standing.cost, standing.violation, standing.goal_distance, standing.arrived)
-        return cls(part[at[0]].item() for part in parts)
+        return cls(values[index[0]].item() for values in parts)
 
     @property
     def told(self) -> str:
@@ -117,23 +117,23 @@ def _gained(before: _Standing | None, after: _Standing | None) -> str:
 def _compared(comparisons: list[Comparison], number_: int, b: int, again: bool) -> str | None:
     """What became of the candidates of a pass; None where it compared none."""
     told = []
-    for one in comparisons:
-        at = (one.rows == b).nonzero().flatten().tolist()
-        if one.number == number_ and one.again == again and at:
-            told.append(_fates(one, at[0]))
+    for trial in comparisons:
+        index = (trial.rows == b).nonzero().flatten().tolist()
+        if trial.number == number_ and trial.again == again and index:
+            told.append(_fates(trial, index[0]))
     return ". Then ".join(told) if told else None
 
 
-def _fates(one: Comparison, i: int) -> str:
-    followed = one.fate[i] != Fate.ABSENT
+def _fates(trial: Comparison, i: int) -> str:
+    followed = trial.fate[i] != Fate.ABSENT
     if not bool(followed.any()):
         return "found no path to the goal"
-    paths, ways = one.paths.shape[1], one.path[i][followed].unique().numel()
+    paths, ways = trial.paths.shape[1], trial.path[i][followed].unique().numel()
     parts = []
     for fate, words in FATES.items():
-        here = one.fate[i] == fate
+        here = trial.fate[i] == fate
         if bool(here.any()):
-            costs = one.cost[i][here]
+            costs = trial.cost[i][here]
             costs = costs[torch.isfinite(costs)]
             ends = (costs.min(), costs.max()) if len(costs) else ()
             span = " to ".join(dict.fromkeys(number(float(cost)) for cost in ends))

@@ -70,17 +70,15 @@ class SearchRecord:
         """The same with the first n states alone."""
         caught = None if self.caught is None else (self.caught[0], self.caught[1][..., :n])
         names = "tracked", "relaxed", "refined"
-        each = [replace(one, **{name: getattr(one, name)[..., :n] for name in names}) for one in self.comparisons]
+        each = [replace(trial, **{name: getattr(trial, name)[..., :n] for name in names}) for trial in self.comparisons]
         return replace(self, caught=caught, comparisons=each)
 
     def in_costs(self, unit: Tensor, constant: Tensor) -> SearchRecord:
         """The same with costs times a unit, plus a constant, both by place in the batch: those of the user."""
-        standings = [
-            one and replace(one, cost=one.cost * unit[one.rows] + constant[one.rows]) for one in self.standings
-        ]
+        standings = [s and replace(s, cost=s.cost * unit[s.rows] + constant[s.rows]) for s in self.standings]
         each = [
-            replace(one, cost=one.cost * unit[one.rows].unsqueeze(-1) + constant[one.rows].unsqueeze(-1))
-            for one in self.comparisons
+            replace(trial, cost=trial.cost * unit[trial.rows].unsqueeze(-1) + constant[trial.rows].unsqueeze(-1))
+            for trial in self.comparisons
         ]
         return replace(self, comparisons=each, standings=standings)
 
@@ -91,7 +89,7 @@ class SearchRecord:
             solved = torch.cat([torch.as_tensor(rows) for _, _, rows in again.passes]).to(caught[0])
             stays = ~torch.isin(caught[0], solved)
             caught = torch.cat((caught[0][stays], late[0])), torch.cat((caught[1][stays], late[1]))
-        more = [replace(one, again=True) for one in again.comparisons]
+        more = [replace(trial, again=True) for trial in again.comparisons]
         return SearchRecord(
             self.passes + again.passes, caught, self.comparisons + more, self.standings + again.standings
         )

@@ -30,13 +30,13 @@ from torchgco.exploration.explorer import (
 from torchgco.exploration.movers import Known, Movers, Tracks, Unaware
 from torchgco.exploration.safety import AT_REST, braking, ends_at_rest, former_plans
 from torchgco.exploration.scout import DRIFT, SEARCH_OPTIONS, SPARE, Scout
+from torchgco.exploration.sensing.cells import CellSearch
 from torchgco.exploration.sensing.grid import NOT_FREE, SEEN_OCCUPIED
-from torchgco.exploration.sensing.search import Search
 from torchgco.exploration.sensing.sensors import Sensor
 from torchgco.exploration.sensing.world import World
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.missions.log import TIMED_PARTS, SeenLog
-from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planner import MissionPlan, Planner
 from torchgco.missions.planning_problem import EARLY, airframe_of
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
@@ -89,7 +89,7 @@ class Exploration:
         start, goal = self.whole.x0[b, :3].numpy(), self.whole.goal.position[b].numpy()  # type: ignore[union-attr]
         seen, radius = self.explorer.map_of(start, goal), float(self.radius[b])
         size = seen.resolution
-        search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH_OPTIONS)
+        search = CellSearch(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH_OPTIONS)
         log = SeenLog(seen.corner, seen.shape, seen.resolution)
         world = World.of(self.whole, b)
         scout = Scout(
@@ -141,27 +141,29 @@ class Exploration:
             scout.changed = scout.changed[:0]
             scout.seconds = dict(zip(TIMED_PARTS, (*took, 0.0), strict=True))
 
-    def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
+    def plan(
+        self, step: int, x: Tensor, before: MissionPlan | None, measured: Tensor | None = None
+    ) -> tuple[MissionPlan, float]:
         """Plans from plants measured at x (B, 17), and the seconds that they took, those of the maps among them."""
-        began = clock.seconds()
+        began, t = clock.seconds(), step * self.dt
         sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
         bias = self.planner.estimated(x, before, self.dt)
         for scout in self.scouts:
-            scout.moving = scout.movers.now(step * self.dt)
+            scout.moving = scout.movers.now(t)
         self.seek(x)
-        reference = self._reference(x)
-        reference = self._evading(reference)
+        reference = self._evading(self._reference(x))
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
-        former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
-        if before is not None:
-            former = torch.where(ends_at_rest(before.X).view(-1, 1, 1), former, braking(x, self.explorer, self.dt))
-        seeds = [former, reference[:, 1:, :3]]
+        former = None if before is None else before.moved_to(t)
+        if former is not None and before is not None:
+            clear, brakes = self._clear_part(former.X[:, 1:, :3]), braking(x, self.explorer, self.dt)
+            rest = torch.where(ends_at_rest(before.X).view(-1, 1, 1), clear, brakes)
+        seeds = [rest, reference[:, 1:, :3]]
         problem = self._problem(x, bias, reference, seeds)
-        kept = former_plans(problem, before).take(slice(0, len(self.scouts)))
+        kept = former_plans(problem, former, t).take(slice(0, len(self.scouts)))
         plan = self._chosen(problem, kept, len(seeds))
         for b, scout in enumerate(self.scouts):
             scout.log.safe.append(plan.X[b, :, :3].numpy().copy())
-        return replace(plan, measured=x, bias=bias, step=step), clock.seconds() - began + sensed
+        return replace(plan, measured=x, bias=bias), clock.seconds() - began + sensed
 
     def parts(self) -> dict[str, Tensor]:
         """Seconds of the last period by part, (B,)."""
@@ -242,7 +244,7 @@ class Exploration:
                 former[b, at:] = former[b, at].clone()
         return former
 
-    def _chosen(self, problem: Problem, kept: Plan, count: int) -> Plan:
+    def _chosen(self, problem: Problem, kept: MissionPlan, count: int) -> MissionPlan:
         """Of the new plans, `count` for each mission, the cheapest that is safe, or else the one that is kept.
 
         Where that isn't safe either, as cells have turned out to be occupied, the one that keeps the most distance.
@@ -261,15 +263,11 @@ class Exploration:
             came_through = float(excess[last]) <= FLYABLE and self.spare(found.X[last].numpy(), b) >= 0
             scout.slow_down(came_through)
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
-        new = torch.tensor([choice is not None for choice in best])
-        wide = new.view(-1, 1, 1)
-        one = problem.take(rows)
-        return Plan(
-            torch.where(wide, found.X[rows], kept.X), torch.where(wide, found.U[rows], kept.U),
-            torch.where(wide.unsqueeze(-1), K[rows], kept.K), kept.multipliers, kept.penalty,
-            torch.where(new, found.cost[rows], kept.cost), torch.where(new, found.violation[rows], 0.0), ~new,
-            found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0, torch.zeros_like(new),
-        )  # fmt: skip
+        stay = torch.tensor([b for b, choice in enumerate(best) if choice is None], dtype=torch.int64)
+        plan = MissionPlan.of_solution(found.take(rows), problem.take(rows), 0.0)
+        plan = replace(plan, K=K[rows], start=kept.start, multipliers=kept.multipliers, penalty=kept.penalty)
+        plan.put(stay, kept.take(stay))
+        return plan
 
     def _best(self, X: Tensor, cost: Tensor, excess: Tensor, kept: Tensor, b: int) -> int | None:
         """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14).

@@ -7,6 +7,7 @@ points along the plan from all cubes near it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,9 +17,9 @@ from torch import Tensor
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.exploration.explorer import Explorer, within_bounds
 from torchgco.exploration.sensing.grid import FREE
-from torchgco.lagrangian.lagrangian import Multipliers, shifted
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.missions.log import MissionLog, SeenLog
-from torchgco.missions.planner import Plan
+from torchgco.missions.planner import MissionPlan
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
@@ -79,25 +80,27 @@ def least_gap(log: SeenLog, state: np.ndarray, plan: Sequence[np.ndarray] | np.n
     return float(min(gap - slack, reach))
 
 
-def former_plans(problem: Problem, before: Plan | None) -> Plan:
-    """The previous plans one stage later, brought back to by feedback; of a first plan, rest."""
-    if before is None:
-        x0, B, N = problem.x0, problem.B, problem.N
-        U = problem.cost.rest_controls(x0.new_zeros(B, N, 4))
-        X, K = x0.unsqueeze(1).repeat(1, N + 1, 1), x0.new_zeros(B, N, 4, 14)
-        penalty = torch.full_like(x0[:, 0], 1.0)
+def former_plans(problem: Problem, former: MissionPlan | None, t: float) -> MissionPlan:
+    """The previous plans moved on to a time t, s, brought back to by feedback; of a first plan, rest.
+
+    Args:
+        problem: seed by seed, the same number of times for each vehicle.
+    """
+    x0, C = problem.x0, 1 if former is None else problem.B // former.X.shape[0]
+    if former is None:
+        U = problem.cost.rest_controls(x0.new_zeros(problem.B, problem.N, 4))
+        X, K = x0.unsqueeze(1).repeat(1, problem.N + 1, 1), x0.new_zeros(*U.shape, 14)
+        penalty = torch.ones_like(x0[:, 0])
     else:
-        C = problem.B // before.X.shape[0]
-        X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
+        X, U, K = (part.repeat(C, *[1] * (part.dim() - 1)) for part in (former.X, former.U, former.K))
         X[:, -1] = resting(X[:, -1], airframe_of(problem.dynamics))
         U[:, -1] = problem.cost.rest_controls(U[:, -1:])[:, 0]
         X, U = within_bounds(problem, X, U, K)
-        penalty = before.penalty.repeat(C)
-    none = torch.zeros(problem.B, dtype=torch.int64)
-    return Plan(
-        X, U.nan_to_num(), K, Multipliers.zero(problem, 1.0), penalty, problem.cost.total(X, U),
-        problem.x0.new_zeros(problem.B), torch.ones(problem.B, dtype=torch.bool), none, none.clone(),
-        problem.x0, problem.x0[:, :3], problem.dynamics, 0, none.bool(),
+        penalty = former.penalty.repeat(C)
+    plan = MissionPlan.of_states(X, x0, problem.dynamics, t, float(problem.dynamics.dt))
+    return replace(
+        plan, U=U.nan_to_num(), K=K, multipliers=Multipliers.zero(problem, 1.0), penalty=penalty,
+        cost=problem.cost.total(X, U), violation=torch.zeros_like(penalty), shifted=~plan.shifted,
     )  # fmt: skip
 
 

@@ -11,8 +11,8 @@ from torchgco.base import clock
 from torchgco.exploration.explorer import Explorer
 from torchgco.exploration.movers import Movers, Moving, nothing
 from torchgco.exploration.reference import between, motion, swings, taut
+from torchgco.exploration.sensing.cells import CellSearch
 from torchgco.exploration.sensing.grid import SEEN_OCCUPIED, SeenMap
-from torchgco.exploration.sensing.search import Search
 from torchgco.exploration.sensing.world import World
 from torchgco.missions.log import SeenLog
 from torchgco.obstacles.base import CONTACT_FACTOR
@@ -44,7 +44,7 @@ class Scout:
     explorer: Explorer
     world: World
     seen: SeenMap
-    search: Search
+    search: CellSearch
     log: SeenLog
     goal: np.ndarray
     radius: float

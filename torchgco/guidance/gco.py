@@ -80,12 +80,12 @@ class GCO(Checked, named="gco"):
         plan, taken = U.clone(), torch.zeros_like(knots[:, 0])
         rows = knots.any(-1).nonzero().flatten()
         if rows.numel() > 0:
-            part = problem.take(rows)
+            subset = problem.take(rows)
             mean = problem.cost.rest_controls(U)[rows] if self.sample_from_rest else U[rows]
-            X_safe, plan[rows] = self.sampler.improve(part, mean, key.take(rows))
-            holds = part.cost.total(X_safe, plan[rows]).abs() <= DIVERGED * part.N * cost_unit(part)
+            X_safe, plan[rows] = self.sampler.improve(subset, mean, key.take(rows))
+            holds = subset.cost.total(X_safe, plan[rows]).abs() <= DIVERGED * subset.N * cost_unit(subset)
             if self.start_from_sample:
-                taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1) & holds
+                taken[rows] = ~active_counts(subset, X_safe, plan[rows]).any(-1) & holds
             near = torch.where(knots[rows] & holds.unsqueeze(-1), _radius(problem, X)[rows].unsqueeze(-1), torch.inf)
             attracted = replace(take(region, rows), center=X_safe[..., region.position], radius=near)
             put(region, rows[~taken[rows]], take(attracted, (~taken[rows]).nonzero().flatten()))
@@ -96,6 +96,6 @@ def _radius(problem: Problem, X: Tensor) -> Tensor:
     """r_guide (B,), m."""
     if problem.obstacles:
         return problem.obstacles[0].vehicle_radius
-    at = problem.position
-    ends = X[:, 1:, at] if problem.goal is None else problem.goal.position.unsqueeze(1)
-    return R_GUIDE * (ends - problem.x0[:, None, at]).square().sum(-1).sqrt().amax(-1)
+    position = problem.position
+    ends = X[:, 1:, position] if problem.goal is None else problem.goal.position.unsqueeze(1)
+    return R_GUIDE * (ends - problem.x0[:, None, position]).square().sum(-1).sqrt().amax(-1)

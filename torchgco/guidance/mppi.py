@@ -102,9 +102,9 @@ class MPPI:
         """The knot of the noise before each stage (N,), and the share of the interval to the next; None: white."""
         if self.noise_knots == 0:
             return None, None
-        place = torch.linspace(0, self.noise_knots - 1, problem.N, dtype=problem.x0.dtype, device=problem.x0.device)
-        left = place.floor().clamp(max=self.noise_knots - 2)
-        return left.long(), place - left
+        knot = torch.linspace(0, self.noise_knots - 1, problem.N, dtype=problem.x0.dtype, device=problem.x0.device)
+        left = knot.floor().clamp(max=self.noise_knots - 2)
+        return left.long(), knot - left
 
     def _bounds(self, problem: Problem) -> tuple[Tensor, Tensor] | None:
         """Limits of the samples as `saturation` says (Algorithm 3, line 7): two tensors (N|1, B|1, 1, m)."""

@@ -32,13 +32,13 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
     sampler.check(problem)
     if kernels_of(problem).compiled:
         return sampler, None  # natively it samples the same traced functions that the solver runs
-    own = problem.x0.dtype
-    wanted = own if sampler.dtype is None else getattr(torch, sampler.dtype)
+    dtype = problem.x0.dtype
+    wanted = dtype if sampler.dtype is None else getattr(torch, sampler.dtype)
     why = failure(_sample, problem, wanted)
     if why is None:
         return sampler, None
-    if wanted != own and failure(_sample, problem, own) is None:
-        return replace(sampler, dtype=None), f"samples are drawn in {_name(own)}, as {_name(wanted)} fails ({why})"
+    if wanted != dtype and failure(_sample, problem, dtype) is None:
+        return replace(sampler, dtype=None), f"samples are drawn in {_name(dtype)}, as {_name(wanted)} fails ({why})"
     return None, f"no trajectory can be sampled ({why})"
 
 

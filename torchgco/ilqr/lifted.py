@@ -30,40 +30,40 @@ def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Ten
 def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
     """The first rollout that lowers L_M = merit (B,) by `GAIN`, from X (B, N+1, n), U (B, N, m); else not accepted."""
     none = torch.zeros_like(merit, dtype=torch.bool)
-    found = Rollouts(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), none)
+    rollouts = Rollouts(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), none)
     rows = torch.arange(X.shape[0], device=X.device)
     for i in range(LIFTED_STEPS):
         if rows.numel() == 0:
             break
-        part, dynamics = lagrangian.take(rows), lagrangian.problem.dynamics.take(rows)
-        n, F = X.shape[-1], linearise(part.problem, X, U)
-        F[:, :, :n, n] = (part.problem.along.step(X[:, :-1], U) - X[:, 1:]).transpose(0, 1)
-        step = backward(F, part.expand(X, U), torch.zeros_like(X[:, 0, 0]))
+        subset, dynamics = lagrangian.take(rows), lagrangian.problem.dynamics.take(rows)
+        n, F = X.shape[-1], linearise(subset.problem, X, U)
+        F[:, :, :n, n] = (subset.problem.along.step(X[:, :-1], U) - X[:, 1:]).transpose(0, 1)
+        step = backward(F, subset.expand(X, U), torch.zeros_like(X[:, 0, 0]))
         if i > 0:  # the first gains are those that failed
-            _keep(found, rows, part, *closed_loop(dynamics, X, U, step.gains, torch.ones_like(X[:, 0, 0])))
+            _keep(rollouts, rows, subset, *closed_loop(dynamics, X, U, step.gains, torch.ones_like(X[:, 0, 0])))
         X, U = _linear_step(F, step.gains, X, U)
-        going = ~found.accepted[rows] & ~step.failed & torch.isfinite(X).flatten(1).all(-1)
+        going = ~rollouts.accepted[rows] & ~step.failed & torch.isfinite(X).flatten(1).all(-1)
         rows, X, U = rows[going], X[going], U[going]
-    return found
+    return rollouts
 
 
-def _keep(found: Rollouts, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:
-    """Write the trajectories with a low enough L_M into `found`."""
+def _keep(rollouts: Rollouts, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:
+    """Write the trajectories with a low enough L_M into `rollouts`."""
     cost, value = lagrangian.value(X, U)
-    low = torch.isfinite(value) & (value < found.merit[rows] - GAIN * found.merit[rows].abs())
+    low = torch.isfinite(value) & (value < rollouts.merit[rows] - GAIN * rollouts.merit[rows].abs())
     won = rows[low]
-    for tensor, new in ((found.X, X), (found.U, U), (found.cost, cost), (found.merit, value)):
+    for tensor, new in ((rollouts.X, X), (rollouts.U, U), (rollouts.cost, cost), (rollouts.merit, value)):
         tensor[won] = new[low]
-    found.accepted[won] = True
+    rollouts.accepted[won] = True
 
 
 def _linear_step(F: Tensor, G: Tensor, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
     """States and controls after a full step of the linearised dynamics F (N, B, n+1, s) under the gains G."""
-    n, one = X.shape[-1], torch.ones_like(X[:, 0, :1])
+    n, unit = X.shape[-1], torch.ones_like(X[:, 0, :1])
     dx = torch.zeros_like(X[:, 0])
     new_X, new_U = [X[:, 0]], []
     for k in range(U.shape[1]):
-        z = torch.cat((dx, one), dim=-1).unsqueeze(-1)
+        z = torch.cat((dx, unit), dim=-1).unsqueeze(-1)
         du = torch.bmm(G[k], z)
         dx = torch.bmm(F[k, :, :n], torch.cat((z, du), dim=1)).squeeze(-1)
         new_X.append(X[:, k + 1] + dx)

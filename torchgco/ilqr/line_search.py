@@ -75,10 +75,10 @@ class LineSearch(Checked, named="line_search"):
         `accepted` is False, alpha is 0, and the rollout is not to be used.
         """
         ladder = merit.new_tensor(self.ladder(accept_last))
-        found = self._try(lagrangian, X, U, merit, step, ladder[rung], accept_last)
+        rollouts = self._try(lagrangian, X, U, merit, step, ladder[rung], accept_last)
         rungs = list(range(1, len(ladder)))
         while rungs:
-            refused = (~found.accepted & (rung + rungs[0] < len(ladder))).nonzero().flatten()
+            refused = (~rollouts.accepted & (rung + rungs[0] < len(ladder))).nonzero().flatten()
             if refused.numel() == 0:
                 break
             width = max(PARALLEL, SIDE_BY_SIDE // refused.numel())
@@ -86,17 +86,17 @@ class LineSearch(Checked, named="line_search"):
             rows = refused.repeat_interleave(len(chunk))
             places = rung[rows] + torch.tensor(chunk, device=rung.device).repeat(refused.numel())
             alpha = ladder[places.clamp(max=len(ladder) - 1)]  # trying the last rung twice does no harm
-            part = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
-            tried = self._try(lagrangian.take(rows), X[rows], U[rows], merit[rows], part, alpha, accept_last)
-            found = self._first_accepted(found, tried, refused, len(chunk))
-        return replace(found, alpha=torch.where(found.accepted, found.alpha, 0.0))
+            repeats = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
+            tried = self._try(lagrangian.take(rows), X[rows], U[rows], merit[rows], repeats, alpha, accept_last)
+            rollouts = self._first_accepted(rollouts, tried, refused, len(chunk))
+        return replace(rollouts, alpha=torch.where(rollouts.accepted, rollouts.alpha, 0.0))
 
-    def next_rung(self, found: Rollouts, accept_last: bool) -> Tensor:
+    def next_rung(self, rollouts: Rollouts, accept_last: bool) -> Tensor:
         """The first rung of the next search of each problem, (B,) int64: 0 after one that found nothing."""
         ladder = self.ladder(accept_last)
-        landed = (found.alpha.unsqueeze(-1) == found.alpha.new_tensor(ladder)).to(torch.int8).argmax(-1)
+        landed = (rollouts.alpha.unsqueeze(-1) == rollouts.alpha.new_tensor(ladder)).to(torch.int8).argmax(-1)
         back = len(ladder) if self.back is None else self.back
-        return torch.where(found.accepted, (landed - back).clamp(min=0), 0)
+        return torch.where(rollouts.accepted, (landed - back).clamp(min=0), 0)
 
     def _try(
         self,
@@ -117,8 +117,8 @@ class LineSearch(Checked, named="line_search"):
         return Rollouts(new_X, new_U, cost, value, alpha, accepted & torch.isfinite(value))
 
     @staticmethod
-    def _first_accepted(found: Rollouts, tried: Rollouts, refused: Tensor, rungs: int) -> Rollouts:
-        """Write the first accepted rung of each problem that refused the first into a copy of `found`."""
+    def _first_accepted(rollouts: Rollouts, tried: Rollouts, refused: Tensor, rungs: int) -> Rollouts:
+        """Write the first accepted rung of each problem that refused the first into a copy of `rollouts`."""
         ok = tried.accepted.view(-1, rungs)
         rung = ok.to(torch.int8).argmax(dim=1)  # the first True
         pick = torch.arange(refused.numel(), device=refused.device) * rungs + rung
@@ -126,6 +126,6 @@ class LineSearch(Checked, named="line_search"):
         target, source = refused[won], pick[won]
         merged = {}
         for name in ("X", "U", "cost", "merit", "alpha", "accepted"):
-            merged[name] = getattr(found, name).clone()
+            merged[name] = getattr(rollouts, name).clone()
             merged[name][target] = getattr(tried, name)[source]
         return Rollouts(**merged)

@@ -53,15 +53,15 @@ def _forward(
     if rows.numel() < moving.numel():
         step = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
         lagrangian = lagrangian.take(rows)
-    found = how.line_search.search(lagrangian, s.X[rows], s.U[rows], s.merit[rows], step, s.rung[rows], how.as_printed)
-    won = rows[found.accepted]
+    tried = how.line_search.search(lagrangian, s.X[rows], s.U[rows], s.merit[rows], step, s.rung[rows], how.as_printed)
+    won = rows[tried.accepted]
     for name in ("X", "U", "cost", "merit"):
         values = getattr(s, name).clone()
-        values[won] = getattr(found, name)[found.accepted]
+        values[won] = getattr(tried, name)[tried.accepted]
         setattr(s, name, values)
-    s.rung = s.rung.index_copy(0, rows, how.line_search.next_rung(found, how.as_printed))
-    alpha[rows] = found.alpha
-    refused[rows] = ~found.accepted
+    s.rung = s.rung.index_copy(0, rows, how.line_search.next_rung(tried, how.as_printed))
+    alpha[rows] = tried.alpha
+    refused[rows] = ~tried.accepted
     return old_merit, alpha, refused
 
 
@@ -82,12 +82,12 @@ def _lift(how: Descent, s: InnerState, lagrangian: Lagrangian, step: BackwardPas
     rows = (refused & (s.inner == 0)).nonzero().flatten()
     if how.as_printed or rows.numel() == 0:
         return refused
-    part, X, U, merit = lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]
-    lost = diverges(part, X, U, merit, step.gains[:, rows], how.line_search.smallest).nonzero().flatten()
+    subset, X, U, merit = lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]
+    lost = diverges(subset, X, U, merit, step.gains[:, rows], how.line_search.smallest).nonzero().flatten()
     refused = refused.clone()
     if lost.numel() > 0:
         refused[
-            rows[lost][keep_lifted(s, rows[lost], lifted_search(part.take(lost), X[lost], U[lost], merit[lost]))]
+            rows[lost][keep_lifted(s, rows[lost], lifted_search(subset.take(lost), X[lost], U[lost], merit[lost]))]
         ] = False
     return refused
 
@@ -108,9 +108,9 @@ def _raise_regularisation(s: InnerState, step: BackwardPass, F: Tensor, H: Tenso
     status[step.failed & ~finite] = Status.NON_FINITE
 
 
-def keep_lifted(s: InnerState, rows: Tensor, found: Rollouts) -> Tensor:
+def keep_lifted(s: InnerState, rows: Tensor, rollouts: Rollouts) -> Tensor:
     """Replace the iterates in `rows` by the result of their lifted search; returns which rows have one."""
-    won = rows[found.accepted]
+    won = rows[rollouts.accepted]
     for name in ("X", "U", "cost", "merit"):
-        getattr(s, name)[won] = getattr(found, name)[found.accepted]
-    return found.accepted
+        getattr(s, name)[won] = getattr(rollouts, name)[rollouts.accepted]
+    return rollouts.accepted

@@ -108,14 +108,14 @@ def certify(
     if multipliers is not None:
         multipliers = _checked_multipliers(problem, multipliers)
     with computing_on(problem.x0.device):
-        given = None if times is None else doubled(times, "times", problem)
-        columns = _certified(*at_times(problem, X, U, given), asked, multipliers)
+        seconds = None if times is None else doubled(times, "times", problem)
+        columns = _certified(*at_times(problem, X, U, seconds), asked, multipliers)
         steps = columns.new_full((2, problem.B), torch.nan)
-        if (some := (~columns[0].isnan()).nonzero().flatten()).numel() > 0:
-            part, t = problem.take(some), None if given is None else given[some]
-            lams = None if multipliers is None else [lam[some] for lam in multipliers]
-            errors = step_errors(part, X[some], U[some], t, lams)
-            steps[:, some] = torch.stack((errors.step_error, errors.step_cost))
+        if (rows := (~columns[0].isnan()).nonzero().flatten()).numel() > 0:
+            subset, t = problem.take(rows), None if seconds is None else seconds[rows]
+            lams = None if multipliers is None else [lam[rows] for lam in multipliers]
+            errors = step_errors(subset, X[rows], U[rows], t, lams)
+            steps[:, rows] = torch.stack((errors.step_error, errors.step_cost))
         return Certificate(*columns, *steps)
 
 
@@ -123,10 +123,10 @@ def _checked_multipliers(problem: Problem, multipliers: Sequence[Tensor]) -> lis
     count = len(problem.constraints)
     if not isinstance(multipliers, list | tuple) or len(multipliers) != count:
         raise InputError("multipliers", f"{count} tensors, one per constraint", shown(multipliers))
-    given = [doubled(lam, f"multipliers[{i}]", problem) for i, lam in enumerate(multipliers)]
-    for i, (lam, shape) in enumerate(zip(given, problem.row_shapes, strict=True)):
+    lams = [doubled(lam, f"multipliers[{i}]", problem) for i, lam in enumerate(multipliers)]
+    for i, (lam, shape) in enumerate(zip(lams, problem.row_shapes, strict=True)):
         check_shape(lam, (problem.B, *shape), f"multipliers[{i}]")
-    return given
+    return lams
 
 
 def _certified(problem: Problem, X: Tensor, U: Tensor, asked: Tensor, multipliers: Sequence[Tensor] | None) -> Tensor:
@@ -136,11 +136,11 @@ def _certified(problem: Problem, X: Tensor, U: Tensor, asked: Tensor, multiplier
     for b in (asked & finite).nonzero().flatten():
         # One at a time: no number depends on the other problems, and memory stays that of one problem.
         row = b.view(1)
-        part, x, u = within_horizons(problem.take(row)), X[row], U[row]
+        single, x, u = within_horizons(problem.take(row)), X[row], U[row]
         lams = None if multipliers is None else [lam[row] for lam in multipliers]
-        kkt = _fitted_kkt(part, x, u) if lams is None else _given_kkt(part, x, u, lams)
+        kkt = _fitted_kkt(single, x, u) if lams is None else _given_kkt(single, x, u, lams)
         columns[:, b] = torch.stack(
-            (_dynamics_residual(part, x, u), _clearance(part, x, u), _bound_violation(part, x, u), kkt)
+            (_dynamics_residual(single, x, u), _clearance(single, x, u), _bound_violation(single, x, u), kkt)
         )
     return columns
 
@@ -174,24 +174,24 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     nearest = X.new_full((), torch.inf)
-    own = int(problem.stages[0])  # the chords after them are points
-    for part in (constraint.bare for constraint in problem.constraints):
-        if isinstance(part, Distance):
-            chords = part.measured(X)[1][0]
-            bulge = _bulge(part, problem, X, U)  # (N|1, P|1)
+    stages = int(problem.stages[0])  # the chords after them are points
+    for distance in (constraint.bare for constraint in problem.constraints):
+        if isinstance(distance, Distance):
+            chords = distance.measured(X)[1][0]
+            bulge = _bulge(distance, problem, X, U)  # (N|1, P|1)
             gaps = chords.unflatten(-1, (bulge.shape[-1], -1)) - bulge.unsqueeze(-1)
-            nearest = torch.minimum(nearest, least(gaps[:own].flatten(1).unsqueeze(0))[0])
+            nearest = torch.minimum(nearest, least(gaps[:stages].flatten(1).unsqueeze(0))[0])
     return nearest
 
 
-def _bulge(part: Distance, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+def _bulge(distance: Distance, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """How far a part's places may leave their chord of each interval, (N|1, P|1), m: along a known field, else where
     the states change evenly."""
     dynamics = problem.along
     if not bends(problem):
-        return part.even_bulge(X)[0]
+        return distance.even_bulge(X)[0]
     field = lambda x: dynamics.field(x, U)
-    velocity = lambda x: slope_along(part.places, (x,), (field(x),))
+    velocity = lambda x: slope_along(distance.places, (x,), (field(x),))
     half = X[:, :-1] + 0.5 * dynamics.dt * field(X[:, :-1])
     samples = [slope_along(velocity, (x,), (field(x),))[0] for x in (X[:, :-1], half, X[:, 1:])]
     a = torch.stack(samples)  # (3, N, P, d)
@@ -245,13 +245,13 @@ def _of_factors(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor
     if not bounds:
         return []
     reduced, _, start = _reduced(problem, X, U, *gradients(_lagrangian(problem, multipliers), X, U))
-    found = []
-    for part in bounds:
-        slopes = reduced[:, part.knots] if part.of == "u" else start[0].unsqueeze(1)
-        upper, lower = -slopes[..., part.above], slopes[..., part.below]
+    lams = []
+    for bound in bounds:
+        slopes = reduced[:, bound.knots] if bound.of == "u" else start[0].unsqueeze(1)
+        upper, lower = -slopes[..., bound.above], slopes[..., bound.below]
         lam = torch.cat((upper, lower), dim=-1).clamp(min=0.0)
-        found.append(torch.where(part.value(X, U) >= -ACTIVE_WITHIN, lam, 0.0))
-    return found
+        lams.append(torch.where(bound.value(X, U) >= -ACTIVE_WITHIN, lam, 0.0))
+    return lams
 
 
 def _free(problem: Problem) -> Tensor:
@@ -300,7 +300,7 @@ def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
 def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, ...]]]:
     """Per constraint with rows that may be active: whether it is an equality, and the rows' gradients, (q, N+1, n) by X
     and (q, N, m) by U, without dynamics."""
-    found = []
+    active = []
     for constraint in problem.constraints:
         equality = constraint.sense == "equality"
         is_obstacle = isinstance(constraint, Obstacles)
@@ -312,8 +312,8 @@ def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tup
             which = torch.arange(q, device=X.device), knots, columns
             rows = lambda x, u, twins=twins, which=which: twins.value(x, u)[which]
             # Row j is computed from repetition j of the trajectory.
-            found.append((equality, gradients(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
-    return found
+            active.append((equality, gradients(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
+    return active
 
 
 def _reduced(

@@ -30,13 +30,13 @@ def contacts(
     """
     places, _ = pieces(path)
     depth = np.full(max(len(places) - 1, 0), -np.inf)
-    for part in obstacles if len(places) else ():
+    for obstacle in obstacles if len(places) else ():
         along = None
-        if part.body is not None:
+        if obstacle.body is not None:
             if states is None:
                 raise InputError("states", "those of a body's attitude", "none")
             along = pieces(states)[0]
-        depth = np.maximum(depth, _depth(part, places, dt / BETWEEN if len(path) > 1 else 0.0, along))
+        depth = np.maximum(depth, _depth(obstacle, places, dt / BETWEEN if len(path) > 1 else 0.0, along))
     return deepest(places, depth)
 
 
@@ -62,23 +62,23 @@ def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """The deepest places (C, d) of each run of pieces, with ends (P+1, d), whose depth (P,) is above 0."""
     middle, touching = 0.5 * (places[1:] + places[:-1]), np.flatnonzero(depth > 0)
     runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
-    found = [middle[run[depth[run] > depth[run].max() - SAME_DEPTH]].mean(axis=0) for run in runs if len(run)]
-    return np.array(found).reshape(-1, places.shape[1])
+    points = [middle[run[depth[run] > depth[run].max() - SAME_DEPTH]].mean(axis=0) for run in runs if len(run)]
+    return np.array(points).reshape(-1, places.shape[1])
 
 
-def _depth(part: Obstacles, places: np.ndarray, dt: float, states: np.ndarray | None) -> np.ndarray:
+def _depth(obstacle: Obstacles, places: np.ndarray, dt: float, states: np.ndarray | None) -> np.ndarray:
     """How deep (P,), m, the pieces between places (P+1, d), `dt` seconds apart, are in contact with a part.
 
     Args:
         states: (P+1, n) there, of which the places are a part; None: only places are known.
     """
-    one = part.with_step(dt) if part.moving else part
-    X = torch.zeros(len(places), part.position.stop, dtype=torch.float64, device="cpu")
-    X[:, part.position] = torch.from_numpy(places)
+    timed = obstacle.with_step(dt) if obstacle.moving else obstacle
+    X = torch.zeros(len(places), obstacle.position.stop, dtype=torch.float64, device="cpu")
+    X[:, obstacle.position] = torch.from_numpy(places)
     if states is not None:
         X = torch.from_numpy(np.array(states, dtype=float))
-    beneath = _beneath(one, X) - part.contact_depths[0].double().cpu()
-    beneath = beneath.masked_fill(part.absent[0].cpu(), -torch.inf)
+    beneath = _beneath(timed, X) - obstacle.contact_depths[0].double().cpu()
+    beneath = beneath.masked_fill(obstacle.absent[0].cpu(), -torch.inf)
     return beneath.amax(-1).numpy() if beneath.shape[-1] else np.full(len(places) - 1, -np.inf)
 
 

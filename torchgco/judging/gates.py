@@ -44,20 +44,20 @@ def passages(problem: Problem, X: Tensor, U: Tensor, along: Sequence[Paths] | No
     Returns:
         By the places of the constraints that are gates.
     """
-    held = [i for i, part in enumerate(problem.constraints) if isinstance(part.bare, GateBalls | GateSquares)]
-    if not held:
+    numbers = [i for i, row in enumerate(problem.constraints) if isinstance(row.bare, GateBalls | GateSquares)]
+    if not numbers:
         return {}
     along = paths(problem, X, U) if along is None else along
     order = torch.cat([path.rows for path in along]).argsort()
-    found = {}
-    for i in held:
+    by_gate = {}
+    for i in numbers:
         ways = []
         for path in along:
             way = passes(problem.constraints[i].take(path.rows), path.X)
             assert way is not None
             ways.append(way._replace(when=-(-way.when // path.pieces)))
-        found[i] = Passes(*(torch.cat(column)[order] for column in zip(*ways, strict=True)))
-    return found
+        by_gate[i] = Passes(*(torch.cat(column)[order] for column in zip(*ways, strict=True)))
+    return by_gate
 
 
 def passes(constraint: Constraint, X: Tensor) -> Passes | None:
@@ -80,7 +80,7 @@ def through_balls(centers: Tensor, radii: Tensor, p: Tensor) -> Passes:
         # Where on the line it is within the ball: |a + share move| <= reach.
         middle = -(a * move).sum(-1) / square
         half = (middle.square() - (a.square().sum(-1) - reach.square()) / square).clamp(min=0.0).sqrt()
-        enters, leaves = ((middle + part).clamp(0.0, 1.0) for part in (-half, half))
+        enters, leaves = ((middle + shift).clamp(0.0, 1.0) for shift in (-half, half))
         meets = away <= reach
         return Meetings(k + torch.where(meets, leaves, 1.0), k + enters, away, meets)
 
@@ -114,7 +114,7 @@ def _through_squares(gates: GateSquares, p: Tensor) -> Passes:
 
 def _in_order(p: Tensor, gates: Iterable[Meetings]) -> Passes:
     """The first passage of each gate along p (B, N+1, d) after that of the gate before."""
-    (B, K, _), found = p.shape, []
+    (B, K, _), passed = p.shape, []
     k = torch.arange(K - 1, device=p.device)
     since, left = p.new_zeros(B, 1), torch.zeros(B, 1, dtype=torch.bool, device=p.device)
     for time, next_, away, passes in gates:
@@ -123,6 +123,6 @@ def _in_order(p: Tensor, gates: Iterable[Meetings]) -> Passes:
         left = first == K - 1
         until = torch.where(~passes & (k > first), k, K - 1).amin(-1, keepdim=True)
         way = later & (left | ((k >= first) & (k < until)))
-        found.append((~left, first + 1, torch.where(way, away, torch.inf).amin(-1, keepdim=True)))
+        passed.append((~left, first + 1, torch.where(way, away, torch.inf).amin(-1, keepdim=True)))
         since = torch.where(left, since, torch.maximum(since, next_.gather(1, first.clamp(max=K - 2))))
-    return Passes(*(torch.cat(column, dim=1) for column in zip(*found, strict=True)))
+    return Passes(*(torch.cat(column, dim=1) for column in zip(*passed, strict=True)))

@@ -104,11 +104,11 @@ def judge(
     with computing_on(problem.x0.device):
         end = _goal(problem, *stated[:2])
         first = _start(problem, stated[2])
-        held = first.unsqueeze(1).expand(-1, problem.N + 1, -1)
+        X0 = first.unsqueeze(1).expand(-1, problem.N + 1, -1)
         times = None if times is None else doubled(times, "times", problem)
-        given, controls = problem, U
-        problem, held, U = at_times(problem, held, U, times)
-        first = held[:, 0]
+        user, controls = problem, U
+        problem, X0, U = at_times(problem, X0, U, times)
+        first = X0[:, 0]
         X, moved = [first], _moved(problem, first)
         cost = torch.zeros_like(problem.x0[:, 0])
         for k in range(problem.N):
@@ -117,7 +117,7 @@ def judge(
             X.append(torch.where(runs.unsqueeze(-1), problem.dynamics.at(k).step(x, U[:, k]), x))
         cost = cost + problem.cost.terminal(X[-1])
         states = torch.stack(X, dim=1)
-        errors = step_errors(given, states[..., : given.n], controls, times)
+        errors = step_errors(user, states[..., : user.n], controls, times)
         return _verdict(problem, states, U, cost, end, moved, errors)
 
 
@@ -220,7 +220,7 @@ def _verdict(
         goal_distance = (X[:, -1, problem.position] - goal[0]).square().sum(-1).sqrt()
         required = problem.goal is not None and problem.goal.required  # rows among the others are kept as far as these
         reached = feasible & (goal_distance < goal[1] + (ADMITTED if required else 0.0))
-    if problem.dynamics.position is None and not any(isinstance(part, Distance) for part in problem.constraints):
+    if problem.dynamics.position is None and not any(isinstance(row, Distance) for row in problem.constraints):
         clearance_knots = clearance = torch.full_like(cost, torch.nan)
     of_goal, of_steps = (goal_distance, feasible, reached), (errors.step_error, errors.step_cost)
     return Verdict(cost, violation, clearance_knots, clearance, *of_goal, clear_95, passed, *of_steps)
@@ -242,26 +242,26 @@ def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor
     return worst
 
 
-def _clearances(problem: Problem, part: Distance, X: Tensor, along: Sequence[Paths]) -> tuple[Tensor, Tensor]:
+def _clearances(problem: Problem, distance: Distance, X: Tensor, along: Sequence[Paths]) -> tuple[Tensor, Tensor]:
     """Smallest distances (B,) at the knots and between them; those of a horizon's own knots where horizons differ."""
     at_knots, between = (torch.empty_like(X[:, 0, 0]) for _ in range(2))
     for path in along:
         stages = problem.stages[path.rows]
         for last in [problem.N] if problem.horizon is None else stages.unique().tolist():
-            own = (stages == last).nonzero().flatten()
-            rows = path.rows[own]
-            at_knots[rows], between[rows] = _measured(part.take(rows), X[rows, : last + 1])
+            index = (stages == last).nonzero().flatten()
+            rows = path.rows[index]
+            at_knots[rows], between[rows] = _measured(distance.take(rows), X[rows, : last + 1])
             if path.pieces > 1:
-                fine = part.take(rows).in_pieces(path.pieces)
-                between[rows] = _measured(fine, path.X[own, : path.pieces * last + 1])[1]
+                fine = distance.take(rows).in_pieces(path.pieces)
+                between[rows] = _measured(fine, path.X[index, : path.pieces * last + 1])[1]
     return at_knots, between
 
 
-def _measured(part: Distance, X: Tensor) -> tuple[Tensor, Tensor]:
+def _measured(distance: Distance, X: Tensor) -> tuple[Tensor, Tensor]:
     """The clearances (B,) of a part, of as many problems at a time as memory should hold distances of."""
-    size = max(1, NUMBERS_AT_ONCE // (X.shape[1] * X.shape[2] * max(1, part.contact_depths.shape[1])))
+    size = max(1, NUMBERS_AT_ONCE // (X.shape[1] * X.shape[2] * max(1, distance.contact_depths.shape[1])))
     starts = (slice(i, i + size) for i in range(0, len(X), size))
-    at_knots, between = zip(*(part.take(some).clearances(X[some]) for some in starts), strict=True)
+    at_knots, between = zip(*(distance.take(rows).clearances(X[rows]) for rows in starts), strict=True)
     return torch.cat(at_knots), torch.cat(between)
 
 
@@ -293,5 +293,5 @@ def columns(problem: Problem, U: Tensor, start: Tensor | None = None, times: Ten
     if not names and not has_gates(problem):
         return {}
     verdict = judge(problem, U, start=start, times=times)
-    found = {name: getattr(verdict, name).cpu().numpy() for name in names}
-    return found | gates_passed(problem, verdict)
+    values = {name: getattr(verdict, name).cpu().numpy() for name in names}
+    return values | gates_passed(problem, verdict)

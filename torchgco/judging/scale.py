@@ -33,7 +33,7 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Args:
         X, U: trajectories, (B, N+1, n) and (B, N, m).
     """
-    place = torch.full((problem.B,), NO_PLACE, device=problem.x0.device)
+    where = torch.full((problem.B,), NO_PLACE, device=problem.x0.device)
     free = torch.zeros_like(X[:, :1, :1]) if problem.free_start is None else _of_start(problem, X, U)
     problem = within_horizons(problem.held_at(X[:, 0]))
     moved = tuple(_moved(z, problem.N) for z in (X, U))
@@ -50,8 +50,8 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         unknown = torch.inf if constraint.joins_knots else LARGE_VIOLATION
         admitted = torch.where(known, torch.maximum(SHARE * size, least), unknown)
         large = (constraint.violation(X, U) > admitted) & (now != before)
-        place[large.flatten(1).any(-1)] = number
-    return place
+        where[large.flatten(1).any(-1)] = number
+    return where
 
 
 def _moved(z: Tensor, N: int) -> Tensor:

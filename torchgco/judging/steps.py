@@ -79,30 +79,30 @@ def step_errors(
             all stages together to be large, or no error is above `HARMLESS_ERROR`.
     """
     lost = X.new_full((problem.B,), torch.nan)
-    at = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
-    found = StepErrors(lost, lost.clone(), at, at.clone(), torch.zeros_like(at, dtype=torch.bool))
+    zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
+    error = StepErrors(lost, lost.clone(), zeros, zeros.clone(), torch.zeros_like(zeros, dtype=torch.bool))
     if not _halves(problem):
-        return found
+        return error
     with computing_on(X.device), torch.no_grad():
         for rows in _in_parts(problem.B, problem.N * problem.n**2):
             e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
-            worst, place = share.flatten(1).max(-1)
-            found.step_error[rows], found.stage[rows], found.state[rows] = worst, place // problem.n, place % problem.n
+            worst, index = share.flatten(1).max(-1)
+            error.step_error[rows], error.stage[rows], error.state[rows] = worst, index // problem.n, index % problem.n
             asked = torch.isfinite(worst)
             if doubted:
                 asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
                 asked &= worst > HARMLESS_ERROR[problem.dynamics.integrator]
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
-            some = asked.nonzero().flatten()
-            if some.numel() > 0:
-                own = some + rows.start
-                parts = X[own], U[own], e[some], None if times is None else times[own]
-                costs[some] = _cost_of(problem.take(own), *parts, [lam[own] for lam in multipliers or ()])
-            found.step_cost[rows] = costs
+            chosen = asked.nonzero().flatten()
+            if chosen.numel() > 0:
+                numbers = chosen + rows.start
+                parts = X[numbers], U[numbers], e[chosen], None if times is None else times[numbers]
+                costs[chosen] = _cost_of(problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()])
+            error.step_cost[rows] = costs
         method, stages = problem.dynamics.integrator, problem.stages.to(X.dtype)
         too_much = (COARSE / stages ** ORDER_OF[method]).clamp(min=LARGE_COST)
-        found.large[:] = (found.step_error > LARGE_ERROR[method]) | (found.step_cost > too_much)
-    return found
+        error.large[:] = (error.step_error > LARGE_ERROR[method]) | (error.step_cost > too_much)
+    return error
 
 
 def _halves(problem: Problem) -> bool:
@@ -182,5 +182,5 @@ def _size(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         return torch.maximum(cost.total(X, U).abs(), least)
     k = torch.arange(U.shape[1], device=U.device)
     with cost.precision(X.dtype):
-        own = cost.stage(X[:, :-1], U, k).abs().sum(-1) + cost.terminal(X[:, -1]).abs()
-    return torch.maximum(own, least)
+        size = cost.stage(X[:, :-1], U, k).abs().sum(-1) + cost.terminal(X[:, -1]).abs()
+    return torch.maximum(size, least)

@@ -26,18 +26,18 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
     lost = ~torch.isfinite(X).all(-1)
     first = torch.where(lost.any(-1), lost.long().argmax(-1), NO_PLACE)
     largest = X.new_zeros(problem.B)
-    place = torch.full((3, problem.B), NO_PLACE, device=X.device)
+    worst = torch.full((3, problem.B), NO_PLACE, device=X.device)
     for number, constraint in enumerate(within_horizons(problem).constraints):
         rows = constraint.violation(X, U)
         if rows.shape[0] == 0 or rows[0].numel() == 0:
             continue
-        most, at = rows.nan_to_num(torch.inf, torch.inf).flatten(1).max(-1)
+        most, index = rows.nan_to_num(torch.inf, torch.inf).flatten(1).max(-1)
         knots = torch.arange(problem.N + 1, device=X.device)[constraint.knots]
         more = most > largest
-        found = torch.stack((torch.full_like(at, number), knots[at // rows.shape[-1]], at % rows.shape[-1]))
-        place, largest = torch.where(more, found, place), torch.where(more, most, largest)
-    where, knot, row = place.tolist()
-    kinds = [kind_of(part) for part in user.constraints]
+        entry = torch.stack((torch.full_like(index, number), knots[index // rows.shape[-1]], index % rows.shape[-1]))
+        worst, largest = torch.where(more, entry, worst), torch.where(more, most, largest)
+    where, knot, row = worst.tolist()
+    kinds = [kind_of(constraint) for constraint in user.constraints]
     names = ["" if i == NO_PLACE else kinds[i] if i < len(kinds) else "time" for i in where]
     return {
         "constraint": where, "name": names, "knot": knot, "row": row, "violation": largest.tolist(),
@@ -47,7 +47,7 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
 
 def kind_of(constraint: Constraint) -> str:
     """The user's name of a constraint, else its kind as a user writes it."""
-    given = getattr(constraint, "name", None)
-    if isinstance(given, str) and given != "constraint":
-        return given
+    name = getattr(constraint, "name", None)
+    if isinstance(name, str) and name != "constraint":
+        return name
     return type(constraint).__name__.removeprefix("Bound")

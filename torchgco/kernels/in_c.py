@@ -17,12 +17,12 @@ from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.line_search import Rollouts
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import keep_lifted
-from torchgco.kernels.in_pytorch import InteriorKernels, Kernels, clearance_of
+from torchgco.kernels.in_pytorch import Kernels, clearance_of
 from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.engine import Engine
-from torchgco.native.interior import InteriorEngine
+from torchgco.native.interior import InteriorEngine, InteriorKernels
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.native.sampler import Sampler
 from torchgco.native.structures import Options
@@ -72,7 +72,7 @@ class NativeKernels(Kernels):
     def scale(self, problem: Problem) -> None:
         if self.engine.cost is not None:
             slopes, H = self.expand(problem, *problem.at_rest)
-            object.__setattr__(problem, "cost_scale", problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1)))
+            problem.derived["cost_scale"] = problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1))
 
     def expand(
         self, problem: Problem, X: Tensor, U: Tensor, lagrangian: Lagrangian | None = None
@@ -101,7 +101,7 @@ class NativeKernels(Kernels):
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
         parts = [c.bare for c in problem.constraints]
-        others = [part for part in parts if type(part) is not BoundSpheres]
+        others = [row for row in parts if type(row) is not BoundSpheres]
         if len(others) == len(parts):
             return clearance_of(others, X, share)
         U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
@@ -111,10 +111,10 @@ class NativeKernels(Kernels):
         return clearance_of(others, X, share, least)
 
     def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
-        B, found = lagrangian.problem.B, X.new_zeros(lagrangian.problem.B)
-        packed = self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=found, merit=found)
+        B, slack = lagrangian.problem.B, X.new_zeros(lagrangian.problem.B)
+        packed = self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=slack, merit=slack)
         self.engine.run("tgco_slack", B, packed)
-        return found
+        return slack
 
     def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
         B, problem = lagrangian.problem.B, lagrangian.problem
@@ -152,8 +152,8 @@ class NativeKernels(Kernels):
 
     def lifted(self, lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
         """`ilqr.lifted.lifted_search` in C."""
-        given = {"X": X, "U": U, "cost": merit, "merit": merit}
-        state = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in given.items()}
+        starts = {"X": X, "U": U, "cost": merit, "merit": merit}
+        state = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in starts.items()}
         accepted, mu_r = _flags(lagrangian.problem.B), torch.zeros_like(merit)
         packed = self.engine.terms(
             lagrangian, None, **state, converged=accepted, regularisation=mu_r, limit=lifted.LIFTED_STEPS,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +11,6 @@ from torch import Tensor
 from torchgco.constraints.base import Distance
 from torchgco.dynamics import rollout
 from torchgco.eager import sampling
-from torchgco.eager.kernels import EagerInterior
 from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.riccati import BackwardPass, backward
 from torchgco.ilqr.step import iterate
@@ -20,11 +19,10 @@ from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.state import InnerState, PassEnd, State
-from torchgco.native.interior import InteriorEngine
+from torchgco.native.called import CalledInterior
+from torchgco.native.interior import InteriorKernels
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.problem.problem import Problem
-
-InteriorKernels: TypeAlias = InteriorEngine | EagerInterior
 
 
 class Kernels:
@@ -90,14 +88,15 @@ class Kernels:
         return None
 
     def interior(self, problem: Problem) -> InteriorKernels:
-        """The interior point.
+        """The interior point, in C here, too.
 
         Raises:
             InputError: rows that join knots.
+            NativeError: no compiler.
         """
         known = problem.known
         if known.interior is None:
-            known.interior = EagerInterior.of(problem)
+            known.interior = CalledInterior(problem)
         return known.interior
 
     def sample(self, problem: Problem, U: Tensor, how: sampling.Sampling) -> Tensor:
@@ -112,8 +111,8 @@ class Kernels:
 def clearance_of(parts: list[Any], X: Tensor, share: float | None, least: Tensor | None = None) -> Tensor:
     """Smallest distance (B,) from the lines between knots to those of the parts that keep a distance; or `least`."""
     least = X.new_full(X.shape[:1], torch.inf) if least is None else least
-    for part in parts:
-        if isinstance(part, Distance):
-            away = part.chord_clearance(X) if share is None else part.chord_clearance(X, share)
+    for row in parts:
+        if isinstance(row, Distance):
+            away = row.chord_clearance(X) if share is None else row.chord_clearance(X, share)
             least = torch.minimum(least, away)
     return least

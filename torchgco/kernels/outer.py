@@ -63,7 +63,7 @@ class NativeOuter:
             last_cost=s.last_cost, last_violation=s.last_violation, mark=s.mark,
             best_X=best.X, best_U=best.U, best_mu=best.multipliers.mu, best_cost=best.cost,
             best_violation=best.violation, base=base.contiguous(),
-            **{name: part.contiguous() for name, part in goal.items()},
+            **{name: values.contiguous() for name, values in goal.items()},
             passes=1, lifted_steps=lifted.LIFTED_STEPS, lifted_gain=lifted.GAIN, **limits,
         )  # fmt: skip
 

@@ -12,8 +12,9 @@ from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.dynamics import rollout
 from torchgco.kernels.choice import kernels_of
-from torchgco.kernels.in_pytorch import InteriorKernels, clearance_of
+from torchgco.kernels.in_pytorch import clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.native.interior import InteriorKernels
 from torchgco.problem.between import bends, bulge, paths
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
@@ -70,7 +71,7 @@ def cost_unit(problem: Problem) -> Tensor:
 
 def cost_scale(problem: Problem) -> CostScale:
     """`problem.cost_scale`, computed without autodiff where compiled code can; the problem keeps it."""
-    if "cost_scale" not in vars(problem):
+    if "cost_scale" not in problem.derived:
         kernels_of(problem).scale(problem)
     return problem.cost_scale
 
@@ -78,7 +79,7 @@ def cost_scale(problem: Problem) -> CostScale:
 def is_convex(problem: Problem) -> bool:
     """Whether a problem is known to be convex: affine dynamics, a quadratic cost, and bounds."""
     cost = problem.cost.cost if isinstance(problem.cost, ShiftedCost) else problem.cost
-    bounded = all(isinstance(part, Bounds) for part in problem.constraints)
+    bounded = all(isinstance(constraint, Bounds) for constraint in problem.constraints)
     return bounded and cost.kernel == "quadratic" and kernels_of(problem).affine
 
 
@@ -96,18 +97,18 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     Exact where a path may touch; elsewhere that of its chords, which are then farther away than it leaves them.
     """
-    found = chord_clearance(problem, X)
+    clearance = chord_clearance(problem, X)
     if not bends(problem):
-        return found
+        return clearance
     off = bulge(problem, X, U)
-    near = (found < off).nonzero().flatten()
+    near = (clearance < off).nonzero().flatten()
     for path in paths(problem.take(near), X[near], U[near], off[near]):
         if path.pieces > 1:
             rows = near[path.rows]
             parts = (constraint.bare for constraint in problem.take(rows).constraints)
-            fine = [part.in_pieces(path.pieces) for part in parts if isinstance(part, Distance)]
-            found[rows] = clearance_of(fine, path.X, None)
-    return found
+            fine = [row.in_pieces(path.pieces) for row in parts if isinstance(row, Distance)]
+            clearance[rows] = clearance_of(fine, path.X, None)
+    return clearance
 
 
 def interior_of(problem: Problem) -> InteriorKernels:
@@ -115,5 +116,6 @@ def interior_of(problem: Problem) -> InteriorKernels:
 
     Raises:
         InputError: rows that join knots.
+        NativeError: no compiler.
     """
     return kernels_of(problem).interior(problem)

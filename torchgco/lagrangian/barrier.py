@@ -1,9 +1,20 @@
-"""Options and constants of the interior point, which its kernels in C and in PyTorch read alike."""
+"""Options and constants of the interior point, and which of them a precision can meet."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import torch
+
+NUDGE = 1e-3  # how far from the iterate a row's slope is looked at again: it may vanish in one point alone
+GOLDEN = 0.6180339887498949
+ROUNDINGS = 2.0**12  # units of the last bit of its terms, up to which a change may be rounding along the stages
+ORDINARY = 1e-2  # sizes of variables from here on are those of ordinary units
+LEAST_SIZE = 1e-6  # sizes below may be rounding of larger numbers
+FILTERED = 64  # entries of a filter; the oldest are forgotten
+LONGEST_FALL = 50  # reductions of the barrier parameter in one iteration
+LEAST_VIOLATION = 100.0  # units of the last bit of lengths of 1 m, below which a rollout doesn't meet rows
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,7 @@ class BarrierOptions:
     s_theta: float = 1.1
     s_phi: float = 2.3
     noise: float = 10.0  # rounding of phi, in units of its last bit
+    last_bit: float = 2.0**-52  # share of a number that is the last bit of what functions give
     alpha_min: float = 1e-10  # least step length
     max_soc: int = 1  # second-order corrections, 0 or 1
     watchdog_shortened_iter_trigger: int = 10  # short steps before the watchdog
@@ -82,3 +94,33 @@ class BarrierOptions:
     shift_recovery: float = 1e-3  # curvature that is added, at least
     forced_growth: float = 10.0  # factor by which it grows
     required_infeasibility_reduction: float = 0.9  # (kappa_resto)
+
+
+def fitted(options: BarrierOptions, dtype: torch.dtype) -> BarrierOptions:
+    """Options for functions that are evaluated in a precision: as they are in float64.
+
+    Shares of rounding grow with the last bit, by 2^29 in float32, and the dual regularisation, whose inverse is added
+    to curvatures, with its root. The end test asks for an error that grows with the third root (1e-8 becomes 8e-6), and
+    takes one that falls no further below the root (2.3e-4) for rounding. Rows are met to 100 units of the last bit at
+    least (1.2e-5).
+    """
+    coarser = torch.finfo(dtype).eps / options.last_bit
+    if coarser == 1.0:
+        return options
+    rounding = options.tol * coarser**0.5
+    return replace(
+        options,
+        last_bit=torch.finfo(dtype).eps,
+        pivot=options.pivot * coarser,
+        tau_max=1.0 - (1.0 - options.tau_max) * coarser,
+        jacobian_regularization_value=options.jacobian_regularization_value * coarser**0.5,
+        tol=options.tol * coarser ** (1.0 / 3.0),
+        rounding=rounding,
+        acceptable_tol=max(options.acceptable_tol, rounding),
+        constr_viol_tol=least_violation(options.constr_viol_tol, dtype),
+    )
+
+
+def least_violation(tolerance: float, dtype: torch.dtype) -> float:
+    """The violation up to which a trajectory counts as feasible, at least what its precision can meet."""
+    return max(tolerance, LEAST_VIOLATION * torch.finfo(dtype).eps)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -46,7 +46,7 @@ class Multipliers:
         """The multipliers and penalties of the same problems with their costs times `factor` (B,)."""
         return Multipliers(tuple(factor.view(-1, 1, 1) * lam for lam in self.lam), factor * self.mu)
 
-    def shifted(self, steps: int = 1, problem: Problem | None = None) -> Multipliers:
+    def shifted(self, steps: float = 1, problem: Problem | None = None) -> Multipliers:
         """Those of the same problems some stages later: every knot takes the values of a later one; see `shifted`.
 
         Args:
@@ -55,46 +55,52 @@ class Multipliers:
         if problem is None:
             return Multipliers(tuple(shifted(lam, steps) for lam in self.lam), self.mu)
         all_knots, lam = torch.arange(problem.N + 1, device=problem.x0.device), []
-        for own, part in zip(self.lam, problem.constraints, strict=True):
-            knots = all_knots[part.knots]
+        for values, constraint in zip(self.lam, problem.constraints, strict=True):
+            knots = all_knots[constraint.knots]
             last = None
             if problem.horizon is not None:
-                last = counted(part, problem.horizon, problem.N).long().cumprod(-1).sum(-1) - 1
-            lam.append(shifted(own, steps, knots.tolist(), last))
+                last = counted(constraint, problem.horizon, problem.N).long().cumprod(-1).sum(-1) - 1
+            lam.append(shifted(values, steps, knots.tolist(), last))
         return Multipliers(tuple(lam), self.mu)
 
     def check(self, problem: Problem) -> None:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
-        if not isinstance(self.lam, tuple) or not all(isinstance(part, Tensor) for part in (*self.lam, self.mu)):
+        if not isinstance(self.lam, tuple) or not all(isinstance(values, Tensor) for values in (*self.lam, self.mu)):
             raise InputError("warm", "multipliers that are tensors", type(self.lam).__name__)
         want = [(problem.B, *shape) for shape in problem.row_shapes]
         for mine, expected in ((self.lam, want), ((self.mu,), [(problem.B,)])):
-            got = [tuple(part.shape) for part in mine]
+            got = [tuple(values.shape) for values in mine]
             if got != expected:
                 raise InputError("warm", f"multipliers of shapes {expected}", got)
-        for part in (*self.lam, self.mu):
-            check_tensor(part, "warm", problem.x0)
+        for values in (*self.lam, self.mu):
+            check_tensor(values, "warm", problem.x0)
 
 
 def later(knots: Sequence[int], steps: int) -> list[int]:
     """The places of the knots `steps` stages later: the last one beyond the end, a knot's own where there is none."""
-    place, end = {knot: i for i, knot in enumerate(knots)}, len(knots) - 1
+    index, end = {knot: i for i, knot in enumerate(knots)}, len(knots) - 1
     last = max(knots, default=0)
-    return [place.get(knot + steps, end if knot + steps > last else i) for i, knot in enumerate(knots)]
+    return [index.get(knot + steps, end if knot + steps > last else i) for i, knot in enumerate(knots)]
 
 
-def shifted(values: Tensor, steps: int = 1, knots: Sequence[int] | None = None, last: Tensor | None = None) -> Tensor:
+def shifted(values: Tensor, steps: float = 1, knots: Sequence[int] | None = None, last: Tensor | None = None) -> Tensor:
     """Values (B, K, ...) of knots some stages later: those beyond the last one are its own.
 
     Args:
+        steps: at least 0; part of a stage takes the straight line between what whole stages give.
         knots: K of them, to which the values belong; where the later one isn't among them, a knot keeps its value.
             None: they follow each other.
         last: int64 (B,), the place of each problem's last knot; the values after it stay. None: K - 1.
     """
-    K = values.shape[1]
+    K, whole = values.shape[1], int(steps)
+    if whole != steps:
+        values = shifted(values, whole, knots, last)
+        return torch.lerp(values, shifted(values, 1, knots, last), steps - whole)
+    if steps == 0:
+        return values
     if knots is None and last is None and steps == 1:
         return torch.cat((values[:, 1:], values[:, -1:]), dim=1)
-    at = torch.tensor(later(range(K) if knots is None else knots, steps), dtype=torch.int64, device=values.device)
+    at = torch.tensor(later(range(K) if knots is None else knots, whole), dtype=torch.int64, device=values.device)
     if last is None:
         return values[:, at]
     own, last = torch.arange(K, device=values.device), last.unsqueeze(-1)
@@ -152,6 +158,7 @@ class Lagrangian:
     multipliers: Multipliers
     penalty: Penalty | None
     phr: bool
+    derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # of these very parts
 
     def take(self, index: Rows) -> Lagrangian:
         """The same for the problems in `index`."""

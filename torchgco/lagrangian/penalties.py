@@ -39,14 +39,14 @@ class GuideRegion:
 
     def accumulate(self, X: Tensor, H: Tensor) -> None:
         """Add gradient and Gauss-Newton Hessian to H (B, N+1, s, s)."""
-        n, at = X.shape[-1], self.position
+        n, position = X.shape[-1], self.position
         f = self._excess(X)
         rho = torch.where(f > 0, self.weight.unsqueeze(-1), 0.0).unsqueeze(-1)
-        fx = 2.0 * (X[..., at] - self.center)
+        fx = 2.0 * (X[..., position] - self.center)
         gradient = rho * f.clamp(min=0.0).unsqueeze(-1) * fx
-        H[..., at, n] += gradient
-        H[..., n, at] += gradient
-        H[..., at, at] += rho.unsqueeze(-1) * fx.unsqueeze(-1) * fx.unsqueeze(-2)
+        H[..., position, n] += gradient
+        H[..., n, position] += gradient
+        H[..., position, position] += rho.unsqueeze(-1) * fx.unsqueeze(-1) * fx.unsqueeze(-2)
 
     def _excess(self, X: Tensor) -> Tensor:
         return (X[..., self.position] - self.center).square().sum(-1) - self.radius.square()
@@ -71,11 +71,11 @@ class GuidePath:
 
     def accumulate(self, X: Tensor, H: Tensor) -> None:
         """Add gradient and Hessian to H (B, N+1, s, s)."""
-        n, at = X.shape[-1], self.position
-        gradient = self.weight.view(-1, 1, 1) * (X[..., at] - self.center)
-        H[..., at, n] += gradient
-        H[..., n, at] += gradient
-        H[..., at, at].diagonal(dim1=-2, dim2=-1).add_(self.weight.view(-1, 1, 1))
+        n, position = X.shape[-1], self.position
+        gradient = self.weight.view(-1, 1, 1) * (X[..., position] - self.center)
+        H[..., position, n] += gradient
+        H[..., n, position] += gradient
+        H[..., position, position].diagonal(dim1=-2, dim2=-1).add_(self.weight.view(-1, 1, 1))
 
 
 Penalty: TypeAlias = GuideRegion | GuidePath

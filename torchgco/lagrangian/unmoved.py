@@ -24,9 +24,9 @@ def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
     """
     problem = problem.held_at(X[:, 0])
     kept, broken, later = torch.ones(problem.B, dtype=torch.bool, device=X.device), False, False
-    rows = [(part, part.value(X, U), part.violation(X, U) > tolerance) for part in problem.constraints]
-    for part, _, bad in rows:
-        knots = torch.arange(problem.N + 1, device=X.device)[part.knots]
+    rows = [(row, row.value(X, U), row.violation(X, U) > tolerance) for row in problem.constraints]
+    for row, _, bad in rows:
+        knots = torch.arange(problem.N + 1, device=X.device)[row.knots]
         broken = broken | bad.flatten(1).any(-1)
         later = later or bool(bad[:, knots > 0].any())
     wave = scattered(U[0])
@@ -35,8 +35,8 @@ def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
             other = U + size * (1.0 + U.abs()) * way
             # Rows of the first knot ask for no rollout.
             there = open_loop(problem.dynamics, problem.x0, other) if later else X
-            for part, before, bad in rows:
-                now = part.value(there, other)
+            for row, before, bad in rows:
+                now = row.value(there, other)
                 kept &= ~((now != before) & torch.isfinite(now) & bad).flatten(1).any(-1)
     if problem.free_start is not None:
         kept &= ~problem.free_start.any(-1)
@@ -51,15 +51,15 @@ def without_slope(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> T
     s = problem.n + 1 + problem.m
     H = X.new_zeros(*X.shape[:2], s, s)
     broken = sloped = torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
-    for part in problem.constraints:
-        bad = part.violation(X, U) > tolerance
-        some = bad.flatten(1).any(-1)
-        if not bool(some.any()):
+    for constraint in problem.constraints:
+        bad = constraint.violation(X, U) > tolerance
+        violated = bad.flatten(1).any(-1)
+        if not bool(violated.any()):
             continue
-        broken, push = broken | some, bad.to(X.dtype) * part.value(X, U)
-        if part.joins_knots:  # no block of a knot has its slopes
-            along = gradients(lambda x, u, part=part, push=push: push * part.value(x, u), X, U)
+        broken, push = broken | violated, bad.to(X.dtype) * constraint.value(X, U)
+        if constraint.joins_knots:  # no block of a knot has its slopes
+            along = gradients(lambda x, u, constraint=constraint, push=push: push * constraint.value(x, u), X, U)
             sloped = sloped | torch.cat([slope.flatten(1) for slope in along], dim=-1).ne(0).any(-1)
         else:
-            part.accumulate(X, U, push, bad.to(X.dtype), H)
+            constraint.accumulate(X, U, push, bad.to(X.dtype), H)
     return broken & ~sloped & (H == 0).flatten(1).all(-1)

@@ -155,8 +155,8 @@ class DistanceField:
         Raises:
             InputError: points of another space, or another number of maps.
         """
-        place = points.device if isinstance(points, Tensor) else torch.device("cpu")
-        p = torch.as_tensor(points, dtype=torch.float64, device=place)
+        device = points.device if isinstance(points, Tensor) else torch.device("cpu")
+        p = torch.as_tensor(points, dtype=torch.float64, device=device)
         G = len(self.values)
         if p.dim() < 1 or p.shape[-1] != self.d or (G > 1 and p.shape[0] != G):
             expected = f"({'' if G == 1 else f'{G}, '}..., {self.d})"
@@ -178,7 +178,7 @@ def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> Dista
         raise InputError("field.refine", "1 to 8 steps per cell", refine)
     _check_count([refine * size + 1 for size in grid.shape])
     spacing = grid.resolution / refine
-    values = np.stack([_signed_distances(one, refine, spacing) for one in grid.held(unknown)])
+    values = np.stack([_signed_distances(cells, refine, spacing) for cells in grid.held(unknown)])
     origin = np.broadcast_to(grid.origin, (len(values), grid.d)).copy()
     return DistanceField(values, origin, spacing, grid, unknown)
 
@@ -206,7 +206,7 @@ def _touched(cells: np.ndarray, outside: bool) -> np.ndarray:
     """Which nodes, corners of cells, belong to a marked cell; `outside`: those outside of the grid are marked."""
     nodes = np.zeros([size + 1 for size in cells.shape], bool)
     for corner in np.ndindex(*([2] * cells.ndim)):
-        nodes[tuple(slice(at, at + size) for at, size in zip(corner, cells.shape, strict=True))] |= cells
+        nodes[tuple(slice(i, i + size) for i, size in zip(corner, cells.shape, strict=True))] |= cells
     for axis in range(cells.ndim) if outside else ():
         edges = np.moveaxis(nodes, axis, 0)
         edges[0] = edges[-1] = True
@@ -242,11 +242,11 @@ def _write_distances(points: np.ndarray, values: np.ndarray, origin: np.ndarray,
     tree = cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
     first, *others = (o + spacing * np.arange(size) for o, size in zip(origin, values.shape, strict=True))
     plane = np.stack(np.meshgrid(*others, indexing="ij"), axis=-1).reshape(-1, len(others))
-    slabs = [(i, part) for i in range(len(first)) for part in range(0, len(plane), NODES_AT_ONCE)]
-    for i, part in tqdm(slabs, "distances from points", delay=AFTER, leave=False, dynamic_ncols=True, disable=None):
-        some = plane[part : part + NODES_AT_ONCE]
-        places = np.column_stack([np.full(len(some), first[i]), some])
-        values[i].reshape(-1)[part : part + NODES_AT_ONCE] = tree.query(places, workers=torch.get_num_threads())[0]
+    slabs = [(i, start) for i in range(len(first)) for start in range(0, len(plane), NODES_AT_ONCE)]
+    for i, start in tqdm(slabs, "distances from points", delay=AFTER, leave=False, dynamic_ncols=True, disable=None):
+        slab = plane[start : start + NODES_AT_ONCE]
+        places = np.column_stack([np.full(len(slab), first[i]), slab])
+        values[i].reshape(-1)[start : start + NODES_AT_ONCE] = tree.query(places, workers=torch.get_num_threads())[0]
 
 
 def _check_count(counts: list[float], most: int = FIELD_NODES, way: str = "cells that are larger, or `refine`") -> None:

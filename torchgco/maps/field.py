@@ -177,12 +177,12 @@ class BoundField(OwnKind):
     def measured(self, X: Tensor) -> Distances:
         p, radius = X[..., self.position], self.vehicle_radius.unsqueeze(-1)
         twice = torch.stack((p, p), dim=2).flatten(1, 2)
-        at = segment_distances(self.field, self.which, twice)[:, ::2] - radius
-        return at.unsqueeze(-1), (segment_distances(self.field, self.which, p) - radius).unsqueeze(-1)
+        at_knots = segment_distances(self.field, self.which, twice)[:, ::2] - radius
+        return at_knots.unsqueeze(-1), (segment_distances(self.field, self.which, p) - radius).unsqueeze(-1)
 
     def clearances(self, X: Tensor) -> Distances:
-        at, ways = (part.squeeze(-1) for part in self.measured(X))
-        nearest, between = (part + self.depths_along(at[:, 0], part.shape[1]) for part in (at, ways))
+        at_knots, ways = (gap.squeeze(-1) for gap in self.measured(X))
+        nearest, between = (gap + self.depths_along(at_knots[:, 0], gap.shape[1]) for gap in (at_knots, ways))
         nearest = nearest.amin(-1)
         return nearest, torch.minimum(nearest, least(between.unsqueeze(-1)))
 
@@ -215,8 +215,8 @@ class BoundField(OwnKind):
         near = ~self.absent & (bound < gap.amin(-1, keepdim=True) + self.field.spacing) if gap.numel() > 0 else gap > 0
         steps = (along / (SEGMENT_STEPS * self.field.spacing)).ceil()
         looked = near & (steps > 1) & torch.isfinite(steps)
-        for some in (looked & (steps <= PIECE), looked & (steps > PIECE)):
-            i, e = some.nonzero(as_tuple=True)
+        for group in (looked & (steps <= PIECE), looked & (steps > PIECE)):
+            i, e = group.nonzero(as_tuple=True)
             if len(i) == 0:
                 continue
             most = max(1, POINTS_AT_ONCE // (int(steps[i, e].amax().clamp(max=PIECE)) + 1))
@@ -246,8 +246,8 @@ class BoundField(OwnKind):
         count = torch.arange(int(steps.amax().clamp(max=PIECE)) + 1, dtype=a.dtype, device=a.device)
         first, left = torch.zeros_like(steps), torch.arange(len(rows), device=rows.device)
         while left.numel() > 0:
-            at = (first[left].unsqueeze(-1) + count) / steps[left].unsqueeze(-1)
-            p = a[left].unsqueeze(1) + at.clamp(max=1.0).unsqueeze(-1) * (b - a)[left].unsqueeze(1)
+            share = (first[left].unsqueeze(-1) + count) / steps[left].unsqueeze(-1)
+            p = a[left].unsqueeze(1) + share.clamp(max=1.0).unsqueeze(-1) * (b - a)[left].unsqueeze(1)
             distance = self.take(rows[left]).signed_distance(p, count)[..., 0]
             gap[left] = torch.minimum(gap[left], distance.amin(-1))
             skipped = ((distance[:, -1] - gap[left]) / length[left]).floor().clamp(min=0.0)
@@ -293,7 +293,7 @@ def distance_within(
         return np.inf
     near = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
     values = source.occupied[which][near] if source.batch is not None else source.occupied[near]
-    (held,) = OccupancyGrid(values, origin + h * first, h).held(unknown)
-    low = origin + h * (first + np.argwhere(held))
+    (cells,) = OccupancyGrid(values, origin + h * first, h).held(unknown)
+    low = origin + h * (first + np.argwhere(cells))
     least = np.linalg.norm(p - np.clip(p, low, low + h), axis=1).min(initial=np.inf)
     return float(least) if least <= within else np.inf

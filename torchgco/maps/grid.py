@@ -80,13 +80,13 @@ class OccupancyGrid:
         Raises:
             InputError: another shape, or costs out of range.
         """
-        held = np.asarray(costs)
-        if held.ndim != 2 or held.dtype.kind not in "iu":
-            got = f"{held.dtype} of shape {held.shape}"
+        values = np.asarray(costs)
+        if values.ndim != 2 or values.dtype.kind not in "iu":
+            got = f"{values.dtype} of shape {values.shape}"
             raise InputError("grid.costs", "whole numbers (height, width)", got)
-        if ((held < 0) | (held > NO_COST)).any():
-            raise InputError("grid.costs", f"0 to {NO_COST}", f"{held.min()} to {held.max()}")
-        cells = np.where(held == NO_COST, np.float32("nan"), (held >= occupied_from).astype(np.float32))
+        if ((values < 0) | (values > NO_COST)).any():
+            raise InputError("grid.costs", f"0 to {NO_COST}", f"{values.min()} to {values.max()}")
+        cells = np.where(values == NO_COST, np.float32("nan"), (values >= occupied_from).astype(np.float32))
         return cls(cells.T, origin, resolution)
 
     @classmethod
@@ -103,11 +103,11 @@ class OccupancyGrid:
         Raises:
             InputError: no floating numbers, or none that is positive.
         """
-        held = np.asarray(distances)
-        if held.dtype.kind != "f" or not (held > 0).any():
-            got = f"{held.dtype} of shape {held.shape}" if held.dtype.kind != "f" else "none above 0"
+        values = np.asarray(distances)
+        if values.dtype.kind != "f" or not (values > 0).any():
+            got = f"{values.dtype} of shape {values.shape}" if values.dtype.kind != "f" else "none above 0"
             raise InputError("grid.distances", "floating numbers, m, above 0 in free cells", got)
-        cells = np.where(np.isnan(held), np.float32("nan"), (held <= 0).astype(np.float32))
+        cells = np.where(np.isnan(values), np.float32("nan"), (values <= 0).astype(np.float32))
         return cls(cells, origin, resolution)
 
     @classmethod
@@ -119,7 +119,7 @@ class OccupancyGrid:
         """
         try:
             info, data = message.info, np.asarray(message.data)
-            place, turn = info.origin.position, info.origin.orientation
+            position, turn = info.origin.position, info.origin.orientation
             shape = int(info.height), int(info.width)
         except (AttributeError, TypeError, ValueError):
             raise InputError("grid.message", "a nav_msgs/OccupancyGrid, with info and data", shown(message)) from None
@@ -131,7 +131,7 @@ class OccupancyGrid:
             expected = f"{shape[0]} x {shape[1]} whole numbers from -1 to 100"
             raise InputError("grid.message", expected, f"{data.dtype} of shape {data.shape}")
         cells = np.where(data < 0, np.float32("nan"), data.astype(np.float32) / np.float32(100.0))
-        return cls(cells.reshape(shape).T, [place.x, place.y], info.resolution)
+        return cls(cells.reshape(shape).T, [position.x, position.y], info.resolution)
 
     @property
     def d(self) -> int:
@@ -207,18 +207,18 @@ class OccupancyGrid:
 
 def number(value: Any, field: str) -> float:
     """A number, also as an array or tensor of one; InputError for all else."""
-    held = coordinates(value, field)
-    if held.size != 1:
+    values = coordinates(value, field)
+    if values.size != 1:
         raise InputError(field, "a number", shown(value))
-    return float(held.reshape(()))
+    return float(values.reshape(()))
 
 
 def coordinates(value: Any, field: str) -> np.ndarray:
     """Numbers as a new array of float64; InputError for all else."""
-    held = _array(value, field, "numbers")
-    if held.dtype.kind not in "iuf":
+    values = _array(value, field, "numbers")
+    if values.dtype.kind not in "iuf":
         raise InputError(field, "numbers", shown(value))
-    return np.array(held, float)
+    return np.array(values, float)
 
 
 def _array(value: Any, field: str, expected: str) -> np.ndarray:

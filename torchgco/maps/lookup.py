@@ -49,14 +49,14 @@ class _Taps:
 
 def squares(lattice: Lattice, p: Tensor, cores: Tensor) -> Tensor:
     """G (B, K), m^2, at points p (B, K, d), m, with the core r (B,), m."""
-    return torch.cat([_contracted(lattice, _taps(lattice, part), cores, 0)[0] for part in _parts(p)], dim=1)
+    return torch.cat([_contracted(lattice, _taps(lattice, chunk), cores, 0)[0] for chunk in _parts(p)], dim=1)
 
 
 def squares_and_slopes(lattice: Lattice, p: Tensor, cores: Tensor) -> tuple[Tensor, Tensor]:
     """G (B, K), m^2, and its derivatives by p (B, K, d), m."""
-    found = [_contracted(lattice, _taps(lattice, part), cores, 1) for part in _parts(p)]
-    slopes = [torch.stack(some, dim=-1) for _, some in found]
-    return torch.cat([value for value, _ in found], dim=1), torch.cat(slopes, dim=1)
+    pairs = [_contracted(lattice, _taps(lattice, chunk), cores, 1) for chunk in _parts(p)]
+    slopes = [torch.stack(by_axis, dim=-1) for _, by_axis in pairs]
+    return torch.cat([value for value, _ in pairs], dim=1), torch.cat(slopes, dim=1)
 
 
 def _parts(p: Tensor) -> tuple[Tensor, ...]:
@@ -82,12 +82,12 @@ def _taps(lattice: Lattice, p: Tensor) -> _Taps:
         weights, slopes = [1.0 - f, f], [-torch.ones_like(f), torch.ones_like(f)]
         more, more_slope, first = -f * (1.0 - f), 2.0 * f - 1.0, 0
     weight, slope = torch.stack(weights, dim=-1), torch.stack(slopes, dim=-1)
-    place = base.unsqueeze(-1) + torch.arange(first, first + len(weights), dtype=p.dtype, device=p.device)
+    nodes = base.unsqueeze(-1) + torch.arange(first, first + len(weights), dtype=p.dtype, device=p.device)
     last = torch.tensor(lattice.nodes.shape[1:], dtype=p.dtype, device=p.device).unsqueeze(-1) - 1.0
-    held = torch.minimum(place.clamp(min=0.0), last)
-    beyond = (place - held).square()
+    clamped = torch.minimum(nodes.clamp(min=0.0), last)
+    beyond = (nodes - clamped).square()
     more, more_slope = more + _summed(weight * beyond), more_slope + _summed(slope * beyond)
-    return _Taps(held.nan_to_num(0.0).long(), weight, slope, more, more_slope)
+    return _Taps(clamped.nan_to_num(0.0).long(), weight, slope, more, more_slope)
 
 
 def _contracted(lattice: Lattice, taps: _Taps, cores: Tensor, order: int) -> tuple[Tensor, list[Tensor]]:
@@ -102,7 +102,7 @@ def _contracted(lattice: Lattice, taps: _Taps, cores: Tensor, order: int) -> tup
     for axis in reversed(range(d)):  # the last axis of `value` is summed over
         weight, slope = (t[..., axis, :].view(*t.shape[:2], *[1] * axis, -1) for t in (taps.weights, taps.slopes))
         if order == 1:
-            slopes = [_summed(slope * value), *(_summed(weight * one) for one in slopes)]
+            slopes = [_summed(slope * value), *(_summed(weight * s) for s in slopes)]
         value = _summed(weight * value)
     h = lattice.spacing
     for axis in range(d):

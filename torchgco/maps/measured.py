@@ -45,11 +45,11 @@ class Solid:
         if self.cells is None or self.origin is None:
             return np.zeros(len(points), bool)
         with np.errstate(invalid="ignore"):
-            place = np.floor((points - self.origin) / (2 * self.half))
-        within: np.ndarray = np.all((place >= 0) & (place < self.cells.shape), axis=-1)
-        index = np.where(within[:, None], place, 0).astype(int)
-        held: np.ndarray = self.cells[tuple(index.T)]
-        return np.logical_and(within, held)
+            cell = np.floor((points - self.origin) / (2 * self.half))
+        within: np.ndarray = np.all((cell >= 0) & (cell < self.cells.shape), axis=-1)
+        index = np.where(within[:, None], cell, 0).astype(int)
+        occupied: np.ndarray = self.cells[tuple(index.T)]
+        return np.logical_and(within, occupied)
 
 
 def segment_distances(field: DistanceField, which: Tensor, p: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ def segment_distances(field: DistanceField, which: Tensor, p: Tensor) -> Tensor:
     """
     paths = zip(which.tolist(), p.detach().cpu().double(), strict=True)
     with computing_on(torch.device("cpu")):  # as the trees of solids do, wherever the problem lies
-        rows = [path_distances(field, one, path) for one, path in paths]
+        rows = [path_distances(field, i, path) for i, path in paths]
     return torch.stack(rows).to(p)
 
 
@@ -69,10 +69,10 @@ def path_distances(field: DistanceField, which: int, p: Tensor) -> Tensor:
     """The same for points p (K, d), float64, and one of a field's maps, (K-1,)."""
     solid, a, along = solids_of(field)[which], p[:-1], p.diff(dim=0)
     finite = torch.isfinite(a).all(-1) & torch.isfinite(along).all(-1)
-    found = torch.where(finite, torch.inf, torch.nan).double()
+    distances = torch.where(finite, torch.inf, torch.nan).double()
     rows = finite.nonzero().flatten().numpy()
     if solid.tree is None or len(rows) == 0:
-        return found
+        return distances
     middle, half = (a + 0.5 * along)[rows].numpy(), 0.5 * along[rows].norm(dim=-1).numpy()
     nearest, _ = solid.tree.query(middle)
     # The distance changes no faster than the point moves, and a solid reaches no farther than `reach`.
@@ -82,19 +82,19 @@ def path_distances(field: DistanceField, which: int, p: Tensor) -> Tensor:
     distance[close] = np.inf
     distance[close] = _measured(solid, a[rows[close]], along[rows[close]], middle[close], (nearest + half)[close])
     inside = solid.holds(a[rows].numpy()) | solid.holds((a + along)[rows].numpy())
-    found[rows] = torch.from_numpy(np.where(inside, np.minimum(distance, -solid.half), distance))
-    return found
+    distances[rows] = torch.from_numpy(np.where(inside, np.minimum(distance, -solid.half), distance))
+    return distances
 
 
 def _measured(solid: Solid, a: Tensor, along: Tensor, middle: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Distances (E,) of the solids from segments from a to a + along (E, d), with one at `least` (E,) at most."""
     lists = solid.tree.query_ball_point(middle, least + solid.reach + BOUND_ROUNDING) if len(middle) else []
-    near = np.concatenate([np.asarray(some, int) for some in lists]) if len(lists) else np.zeros(0, int)
-    segment = np.repeat(np.arange(len(lists)), [len(some) for some in lists])
+    near = np.concatenate([np.asarray(ball, int) for ball in lists]) if len(lists) else np.zeros(0, int)
+    segment = np.repeat(np.arange(len(lists)), [len(ball) for ball in lists])
     distance = np.full(len(middle), np.inf)
     for first in range(0, len(near), PAIRS_AT_ONCE):
-        part = slice(first, first + PAIRS_AT_ONCE)
-        which, center = segment[part], torch.from_numpy(solid.centers[near[part]])
+        pairs = slice(first, first + PAIRS_AT_ONCE)
+        which, center = segment[pairs], torch.from_numpy(solid.centers[near[pairs]])
         axes = torch.eye(center.shape[1], dtype=center.dtype).expand(len(center), -1, -1)
         away = closest(axes, center, torch.full_like(center, solid.half), a[which], along[which])
         np.minimum.at(distance, which, away.numpy() - solid.radius)
@@ -119,13 +119,13 @@ def _solids(field: DistanceField) -> list[Solid]:
     each = source.held(field.unknown)
     origins = np.broadcast_to(source.origin, (len(each), source.d))
     solids = []
-    for one, origin in zip(each, origins, strict=True):
-        inner = padded = np.pad(one, 1)
-        for axis in range(one.ndim):
+    for cells, origin in zip(each, origins, strict=True):
+        inner = padded = np.pad(cells, 1)
+        for axis in range(cells.ndim):
             inner = inner & np.roll(padded, 1, axis) & np.roll(padded, -1, axis)
-        surface = np.argwhere(one & ~inner[tuple([slice(1, -1)] * one.ndim)])
+        surface = np.argwhere(cells & ~inner[tuple([slice(1, -1)] * cells.ndim)])
         centers = origin + source.resolution * (surface + 0.5)
-        solids.append(Solid(centers, 0.5 * source.resolution, 0.0, _tree(centers), one, origin))
+        solids.append(Solid(centers, 0.5 * source.resolution, 0.0, _tree(centers), cells, origin))
     return solids
 
 

@@ -48,14 +48,14 @@ def widest_passage(
     return float(levels[low - 1]) if low > 0 else 0.0
 
 
-def _near(shape: tuple[int, ...], at: np.ndarray, reach: float) -> tuple[NDArray[np.int64], ...]:
+def _near(shape: tuple[int, ...], center: np.ndarray, reach: float) -> tuple[NDArray[np.int64], ...]:
     """Indices of the nodes within `reach` of a place, in nodes; of a place outside, the nearest node."""
     reach += NODE_ROUNDING
-    nearest = np.clip(np.rint(at), 0, np.array(shape) - 1).astype(np.int64)
+    nearest = np.clip(np.rint(center), 0, np.array(shape) - 1).astype(np.int64)
     axes = [np.arange(max(0, int(np.ceil(x - reach))), min(n - 1, int(np.floor(x + reach))) + 1)
-            for x, n in zip(at, shape, strict=True)]  # fmt: skip
+            for x, n in zip(center, shape, strict=True)]  # fmt: skip
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(shape))
-    near = nodes[np.linalg.norm(nodes - at, axis=1) <= reach]
+    near = nodes[np.linalg.norm(nodes - center, axis=1) <= reach]
     return tuple(np.concatenate((near, nearest[None])).T)
 
 

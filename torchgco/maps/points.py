@@ -86,9 +86,9 @@ class PointCloud:
         if np.prod(count) > LARGEST_GRID:
             raise InputError("resolution", f"cells of which the cloud takes at most {LARGEST_GRID:,}", resolution)
         occupied = np.zeros(count.astype(int), bool)
-        own, reach = np.floor((points - low) / side).astype(int), int(np.ceil(self.radius / side))
+        cells, reach = np.floor((points - low) / side).astype(int), int(np.ceil(self.radius / side))
         for offset in np.ndindex(*[2 * reach + 1] * self.d):
-            cell = own + np.array(offset) - reach
+            cell = cells + np.array(offset) - reach
             corner = low + side * cell
             away = np.linalg.norm(points - np.clip(points, corner, corner + side), axis=1)
             occupied[tuple(cell[away <= self.radius].T)] = True

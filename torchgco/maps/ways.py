@@ -52,16 +52,16 @@ class Ways:
         """
         values = field.values[which]
         stride = max(1, int(WAY_STEP * radius / field.spacing), int(np.ceil((values.size / SPOTS) ** (1.0 / field.d))))
-        some = values[(slice(None, None, stride),) * field.d].astype(np.float64)
-        return cls(some, field.origin[which], stride * field.spacing, radius)
+        coarse = values[(slice(None, None, stride),) * field.d].astype(np.float64)
+        return cls(coarse, field.origin[which], stride * field.spacing, radius)
 
     def node(self, point: Any) -> int:
         """The number of the node nearest to a point (d,), m, among those that the vehicle may be at, within two steps.
 
         The nearest of all where none of these is free.
         """
-        at = np.rint((np.asarray(point, float) - self.origin) / self.spacing).astype(int)
-        low, high = (np.clip(at + by, 0, np.array(self.distance.shape) - 1) for by in (-2, 2))
+        nearest = np.rint((np.asarray(point, float) - self.origin) / self.spacing).astype(int)
+        low, high = (np.clip(nearest + by, 0, np.array(self.distance.shape) - 1) for by in (-2, 2))
         near = np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), -1).reshape(-1, len(low))
         apart = np.linalg.norm(self.origin + self.spacing * near - point, axis=1)
         free = self.distance[tuple(near.T)] > self.radius
@@ -79,8 +79,8 @@ class Ways:
         """
         from scipy.sparse.csgraph import dijkstra
 
-        found = dijkstra(self.edges, directed=False, indices=self.node(start), return_predecessors=True)
-        return found[0], found[1]
+        paths = dijkstra(self.edges, directed=False, indices=self.node(start), return_predecessors=True)
+        return paths[0], paths[1]
 
     def way(self, start: Any, goal: Any) -> Array | None:
         """The cheapest way (P, d), m, from start to goal (d,), both included; None where there is none."""
@@ -116,8 +116,8 @@ def neighbours(shape: Sequence[int]) -> Iterator[tuple[tuple[int, ...], tuple[sl
     for step in product((-1, 0, 1), repeat=len(shape)):
         if step > (0,) * len(shape):
             begin, end = ([max(0, sign * s) for s in step] for sign in (-1, 1))
-            at = lambda low, high: tuple(slice(i, n - j) for i, j, n in zip(low, high, shape, strict=True))
-            yield step, at(begin, end), at(end, begin)
+            slices = lambda low, high: tuple(slice(i, n - j) for i, j, n in zip(low, high, shape, strict=True))
+            yield step, slices(begin, end), slices(end, begin)
 
 
 def length(way: Array) -> float:

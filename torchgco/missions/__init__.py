@@ -13,6 +13,7 @@ from torchgco.missions.mission import Mission as Mission
 from torchgco.missions.outcome import Ending as Ending
 from torchgco.missions.outcome import Outcome as Outcome
 from torchgco.missions.pilot import Pilot as Pilot
+from torchgco.missions.planner import MissionPlan as MissionPlan
 from torchgco.missions.planner import Planner as Planner
 from torchgco.missions.plant import Plant as Plant
 from torchgco.missions.plant import RotorPlant as RotorPlant

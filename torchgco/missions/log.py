@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.missions.planner import Plan
+from torchgco.missions.planner import MissionPlan
 from torchgco.missions.tracker import Tracking
 
 TIMED_PARTS = ("map_seconds", "field_seconds", "search_seconds")
@@ -77,10 +77,10 @@ class MissionLog:
         log.x[:, 0, 0] = x  # of missions, too, that end at their start
         return log
 
-    def add_plan(self, rows: Tensor, step: int, x: Tensor, plan: Plan, seconds: float) -> None:
+    def add_plan(self, rows: Tensor, step: int, x: Tensor, plan: MissionPlan, seconds: float) -> None:
         """The start of a control period: states x (b, 17) of the missions `rows`, and their plans."""
         self.x[rows, step, 0] = x
-        every = 1 if plan.spacing is None else round(self.period / plan.spacing)  # of the knots are logged
+        every = round(self.period / plan.dt)  # of the knots are logged
         knots = (every * torch.arange(self.plan.shape[2])).clamp(max=plan.X.shape[1] - 1)  # or of another pilot's plan
         self.plan[rows, step] = plan.X[:, knots, :3]
         for name in ("cost", "violation", "shifted", "guided", "iterations"):

@@ -28,7 +28,7 @@ from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import FARTHEST
 from torchgco.missions.passing import Passing
 from torchgco.missions.pilot import KnownMap, Pilot
-from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planner import MissionPlan, Planner
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.plant import Plant, RotorPlant, flown, hovering
 from torchgco.missions.tracker import Reference, Tracker, Tracking
@@ -194,7 +194,7 @@ class Frame:
     t: float
     rows: Tensor
     measured: Tensor
-    plan: Plan
+    plan: MissionPlan
     x: Tensor
     ended: Tensor
     seconds: float
@@ -246,7 +246,7 @@ class Flight:
         self.pilot = begin(problem, x, self.seed, ids)
         self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, self.pilot.knots)
         self.log.seen.extend(self.pilot.seen)
-        self._plan: Plan | None = None  # to continue, or with a latency to fly
+        self._plan: MissionPlan | None = None  # to continue, or with a latency to fly
         self._tracking: Tracking | None = None
         self._leave(~self.contact.clear(problem, x))
 
@@ -262,7 +262,7 @@ class Flight:
             report(frame.step, self.rows.numel())
         return self.log
 
-    def step(self, plan: Plan | Tensor | None = None) -> Frame:
+    def step(self, plan: MissionPlan | Tensor | None = None) -> Frame:
         """Fly one control period.
 
         Args:
@@ -291,9 +291,9 @@ class Flight:
             self._step += 1
             return frame
 
-    def _chosen(self, step: int, seen: Tensor, given: Plan | Tensor | None) -> tuple[Plan, float]:
+    def _chosen(self, step: int, seen: Tensor, given: MissionPlan | Tensor | None) -> tuple[MissionPlan, float]:
         """The plan of a control step, from measured states `seen` (b, 17), and the seconds that it took."""
-        if given is not None and not isinstance(given, Plan):
+        if given is not None and not isinstance(given, MissionPlan):
             given = self._of_states(given, seen, step)
         self.pilot.sense(step, self.x, seen)
         if given is not None:
@@ -309,19 +309,19 @@ class Flight:
             seconds += more
         return plan, seconds
 
-    def _of_states(self, X: Any, seen: Tensor, step: int) -> Plan:
+    def _of_states(self, X: Any, seen: Tensor, step: int) -> MissionPlan:
         b = len(seen)
-        wanted = f"states ({b}, K, 14) of the vehicles that fly, K at least 2, or a Plan"
+        wanted = f"states ({b}, K, 14) of the vehicles that fly, K at least 2, or a MissionPlan"
         if not isinstance(X, Tensor) or X.dim() != 3 or (X.shape[0], X.shape[2]) != (b, 14) or X.shape[1] < 2:
             raise InputError("plan", wanted, tuple(X.shape) if isinstance(X, Tensor) else type(X).__name__)
         check_tensor(X, "plan", seen)
         if not bool(torch.isfinite(X).all()):
             raise InputError("plan", "finite states", "NaN or infinity")
-        return Plan.of_states(X, seen, self.model, step)
+        return MissionPlan.of_states(X, seen, self.model, step * self.period, self.period)
 
-    def _fly_period(self, step: int, plan: Plan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
+    def _fly_period(self, step: int, plan: MissionPlan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
         """One control period along a plan; and which vehicles have ended in it, (B,) bool."""
-        reference = Reference(plan.X, plan.spacing or self.period, self.airframe)
+        reference = Reference(plan.X, plan.dt, self.airframe)
         ended = torch.zeros_like(self.rows, dtype=torch.bool)
         for j in range(self.substeps):
             seen = measured(self.x, self.noise[self.rows, step])

@@ -8,7 +8,7 @@ from typing import Protocol
 from torch import Tensor
 
 from torchgco.missions.log import SeenLog
-from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planner import MissionPlan, Planner
 from torchgco.missions.planning_problem import settled
 from torchgco.problem.problem import Problem
 
@@ -36,7 +36,9 @@ class Pilot(Protocol):
         """Look around at a control step, from true states x (b, 17) that are measured as `measured`."""
         ...
 
-    def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
+    def plan(
+        self, step: int, x: Tensor, before: MissionPlan | None, measured: Tensor | None = None
+    ) -> tuple[MissionPlan, float]:
         """Plans from states x (b, 17), measured or predicted from those `measured`, and the seconds they took.
 
         `before` are the plans of the period before; None: there are none to continue.
@@ -63,7 +65,9 @@ class KnownMap:
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
         """Nothing: see `Pilot`."""
 
-    def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
+    def plan(
+        self, step: int, x: Tensor, before: MissionPlan | None, measured: Tensor | None = None
+    ) -> tuple[MissionPlan, float]:
         """See `Pilot`."""
         seed = self.seed + SEED_STEP * step
         plan, self._posed, seconds = self.planner.plan(

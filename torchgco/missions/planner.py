@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from torchgco.base import clock
 from torchgco.base.options import Checked, NonNegative, PositiveOrInfinite, Seconds, Share
-from torchgco.base.tree import Rows, put, take
+from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
 from torchgco.kernels import followed, measured, open_loop, value
@@ -31,30 +31,42 @@ from torchgco.missions.planning_problem import (
 )
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
+from torchgco.receding.plan import Plan
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Trajectories from the states that were measured at the control step `step`, (B, ...)."""
+@dataclass(frozen=True, kw_only=True)
+class MissionPlan(Plan):
+    """Plans (B, ...) of a control step with what their solves say, for those that continue them.
 
-    X: Tensor  # (B, N+1, 14)
-    U: Tensor  # (B, N, 4)
-    K: Tensor  # (B, N, 4, 14): feedback gains
+    Args:
+        multipliers: of the constraints at `problem`'s knots.
+        penalty: mu (B,) from which plans that continue this one start.
+        cost, violation: (B,).
+        shifted: (B,) bool: the previous plan one stage later, as the new one was infeasible.
+        guided: (B,) int64: outer iterations with guidance on.
+        iterations: (B,) int64: of all solves for this plan.
+        measured: (B, 17): the plants' states.
+        bias: (B, 3): estimated acceleration that the model lacks, m/s^2.
+        arrived: (B,) bool: whether this plan or one before it ends at the goal.
+    """
+
     multipliers: Multipliers
-    penalty: Tensor  # (B,): mu from which plans that continue this one start
+    penalty: Tensor
     cost: Tensor
     violation: Tensor
-    shifted: Tensor  # bool: the previous plan one stage later, as the new one was infeasible
-    guided: Tensor  # int64: outer iterations with guidance on
-    iterations: Tensor  # int64: of all solves for this plan
-    measured: Tensor  # (B, 17): the plants' states
-    bias: Tensor  # (B, 3): estimated acceleration that the model lacks, m/s^2
-    model: Dynamics  # that was planned with
-    step: int
-    arrived: Tensor  # (B,) bool: whether this plan or one before it ends at the goal
-    spacing: float | None = None  # s between the knots of X, where that isn't the control period
+    shifted: Tensor
+    guided: Tensor
+    iterations: Tensor
+    measured: Tensor
+    bias: Tensor
+    arrived: Tensor
+
+    beside: ClassVar[tuple[str, ...]] = ("guided", "iterations", "measured", "bias", "arrived")  # of each vehicle, too
+    trajectory: ClassVar[tuple[str, ...]] = (
+        *Plan.trajectory, "multipliers", "penalty", "cost", "violation", "shifted"
+    )  # fmt: skip
 
     def continued(self, problem: Problem) -> Multipliers:
         """The multipliers one stage later; where a group of obstacles ends, a knot takes those of the next group.
@@ -68,25 +80,35 @@ class Plan:
                 lam[i] = torch.cat((held[i][:, 1:], held[i + 1][:, :1]), dim=1)
         return Multipliers(tuple(lam), self.penalty)
 
-    def take(self, index: Rows) -> Plan:
-        """The plans in `index`."""
-        parts = {name: take(getattr(self, name), index) for name in (*TRAJECTORY, *OTHERS)}
-        return replace(self, **parts, model=self.model.take(index))
+    @classmethod
+    def of_solution(cls, solution: Solution, problem: Problem, t: float) -> MissionPlan:
+        """What a solve at a time t, s, has found; `measured` and `bias` are still to be said."""
+        none, x = torch.zeros_like(solution.cost, dtype=torch.bool), solution.X[:, 0]
+        return cls(
+            X=solution.X, U=solution.U, K=solution.K, start=torch.full_like(solution.cost, t),
+            dt=float(problem.dynamics.dt), dynamics=problem.dynamics, multipliers=solution.multipliers,
+            penalty=solution.multipliers.mu, cost=solution.cost, violation=solution.violation, shifted=none,
+            guided=solution.guided, iterations=solution.iterations, measured=x, bias=x[:, :3], arrived=none,
+        )  # fmt: skip
 
     @classmethod
-    def of_states(cls, X: Tensor, measured: Tensor, model: Dynamics, step: int) -> Plan:
-        """A plan that somebody else has made: states X (B, N+1, 14) alone, from plants measured at (B, 17)."""
-        B, n, like = len(X), X.shape[-1], X[:, 0, 0]
-        none, U = torch.zeros_like(like, dtype=torch.int64), X.new_zeros(B, X.shape[1] - 1, 4)
-        unknown = torch.full_like(like, torch.nan)
+    def of_states(cls, X: Tensor, measured: Tensor, model: Dynamics, start: float, spacing: float) -> MissionPlan:
+        """A plan that somebody else has made, from plants measured at (B, 17).
+
+        Args:
+            X: states (B, K, 14), `spacing` apart, s.
+            start: time of the first, s.
+        """
+        B, like, U = len(X), X[:, 0, 0], X.new_zeros(len(X), X.shape[1] - 1, 4)
+        none, unknown = torch.zeros_like(like, dtype=torch.int64), torch.full_like(like, torch.nan)
         return cls(
-            X, U, X.new_zeros(*U.shape, n), Multipliers((), unknown), unknown, unknown, unknown, none.bool(), none,
-            none, measured, X.new_zeros(B, 3), model, step, none.bool(),
+            X=X, U=U, K=X.new_zeros(*U.shape, X.shape[-1]), start=torch.full_like(like, start), dt=spacing,
+            dynamics=model, multipliers=Multipliers((), unknown), penalty=unknown, cost=unknown, violation=unknown,
+            shifted=none.bool(), guided=none, iterations=none, measured=measured, bias=X.new_zeros(B, 3),
+            arrived=none.bool(),
         )  # fmt: skip
 
 
-TRAJECTORY = ("X", "U", "K", "multipliers", "penalty", "cost", "violation", "shifted")
-OTHERS = ("guided", "iterations", "measured", "bias", "arrived")
 AGAIN = 10  # control periods after which a plan that only waits, where one before it arrived, is sought again
 CONTINUED = 4  # outer iterations at most that continue a previous plan
 MIN_SECONDS = 1e-4  # s, of a time limit
@@ -155,11 +177,11 @@ class Planner(Checked, named="planner"):
         now: Problem,
         x: Tensor,
         step: int,
-        before: Plan | None,
+        before: MissionPlan | None,
         seed: int,
         ids: Tensor,
         measured: Tensor | None = None,
-    ) -> tuple[Plan, Problem, float]:
+    ) -> tuple[MissionPlan, Problem, float]:
         """Plans from plants x (B, 17) at a control step, their problems, and the seconds that it took to solve them.
 
         Args:
@@ -168,27 +190,40 @@ class Planner(Checked, named="planner"):
         """
         measured = x if measured is None else measured
         began = clock.seconds()
-        now, margin, bias, U0 = self._posed(whole, now, x, step, before, measured)
-        solve = _Solve(self, now, seed, ids, began, self.tolerance + margin.between(whole))
-        if before is None:
+        t = step * float(whole.dynamics.dt)
+        former = None if before is None else before.moved_to(t)
+        now, margin, bias, U0 = self._posed(whole, now, x, t, before, former, measured)
+        solve = _Solve(self, now, t, seed, ids, began, self.tolerance + margin.between(whole))
+        if former is None or before is None:
             plan = solve.first(U0)
         else:
-            multipliers = before.continued(now)
-            U0 = _brought_back(now, before, multipliers) if self.feedback else U0
-            plan = solve.next(U0, before, multipliers)
-        return replace(plan, measured=measured, bias=bias, step=step), now, clock.seconds() - began
+            former = replace(former, multipliers=before.continued(now))
+            U0 = _brought_back(now, former) if self.feedback else U0
+            plan = solve.next(U0, former, step % AGAIN == 0)
+        return replace(plan, measured=measured, bias=bias), now, clock.seconds() - began
 
     def first(self, whole: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
         """The problems of the first plans from plants x (B, 17), and the solver's solutions, as `plan` makes them."""
-        now, _, _, U0 = self._posed(whole, self.problem(whole, x), x, 0, None, x)
+        now, _, _, U0 = self._posed(whole, self.problem(whole, x), x, 0.0, None, None, x)
         return now, self.solvers[0].solve(now, U0, seed=seed, ids=ids, max_seconds=self.max_seconds)
 
     def _posed(
-        self, whole: Problem, now: Problem, x: Tensor, step: int, before: Plan | None, measured: Tensor
+        self,
+        whole: Problem,
+        now: Problem,
+        x: Tensor,
+        t: float,
+        before: MissionPlan | None,
+        former: MissionPlan | None,
+        measured: Tensor,
     ) -> tuple[Problem, Margin, Tensor, Tensor]:
-        """The problems of a control step, their margin, the estimated acceleration (B, 3), controls to begin with."""
-        t, x0 = step * float(whole.dynamics.dt), planning_state(x, airframe_of(whole.dynamics))
-        U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
+        """The problems at a time t, s, their margin, the estimated acceleration (B, 3), controls to begin with.
+
+        Args:
+            former: the plans before, moved on to that time.
+        """
+        x0 = planning_state(x, airframe_of(whole.dynamics))
+        U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if former is None else former.U
         bias = self.estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
         margin = self._margin(x, before)
@@ -196,17 +231,17 @@ class Planner(Checked, named="planner"):
         constraints = self._constraints(whole, t, x, margin, depth)
         return continued(now, x0, constraints, dynamics), margin, bias, U0
 
-    def predicted(self, x: Tensor, plan: Plan) -> Tensor:
+    def predicted(self, x: Tensor, plan: MissionPlan) -> Tensor:
         """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""
-        airframe = airframe_of(plan.model)
+        airframe = airframe_of(plan.dynamics)
         now = planning_state(x, airframe)
-        later = plan.model.at(0).step(now, plan.U[:, 0])
+        later = plan.dynamics.at(0).step(now, plan.U[:, 0])
         q = later[:, 6:10] / later[:, 6:10].square().sum(-1, keepdim=True).sqrt()
         more = (later[:, 13:] - now[:, 13:]) * airframe.mass / 4.0
         F = (x[:, 13:] + more).clamp(airframe.thrust_min, airframe.thrust_max)
         return torch.cat((later[:, :6], q, later[:, 10:13], F), dim=-1)
 
-    def _margin(self, x: Tensor, before: Plan | None) -> Margin:
+    def _margin(self, x: Tensor, before: MissionPlan | None) -> Margin:
         """The margin of plans from plants x (B, 17); of a first plan the whole solver looks between the knots."""
         step = torch.zeros_like(x[:, 0])
         if before is not None:
@@ -224,84 +259,84 @@ class Planner(Checked, named="planner"):
                 parts.append(later)
         return [*parts, *([first_step(whole, x)] if self.first_step else [])]
 
-    def estimated(self, x: Tensor, before: Plan | None, dt: float) -> Tensor:
+    def estimated(self, x: Tensor, before: MissionPlan | None, dt: float) -> Tensor:
         """The acceleration (B, 3) that the planning model lacks: a low-pass of what the last period has shown."""
         if before is None or self.estimation == 0:
             return torch.zeros_like(x[:, :3])
         shown = (x[:, 3:6] - before.measured[:, 3:6]) / dt
-        airframe = airframe_of(before.model)
+        airframe = airframe_of(before.dynamics)
         expected = 0.5 * (acceleration(x, airframe) + acceleration(before.measured, airframe))
         return before.bias + self.estimation * (shown - expected - before.bias)
 
 
-def _brought_back(problem: Problem, before: Plan, multipliers: Multipliers) -> Tensor:
-    """The controls (B, N, 4) of previous plans one stage later, with feedback where that has the better Lagrangian.
+def _brought_back(problem: Problem, former: MissionPlan) -> Tensor:
+    """The controls (B, N, 4) of previous plans moved on, with feedback where that has the better Lagrangian.
 
     Gains along a plan that is far from stationary may lead away.
     """
-    X, U = shifted(before.X), shifted(before.U)
-    lagrangian = Lagrangian(problem, multipliers, None, True)
-    rollouts = followed(problem, X, U, shifted(before.K)), (open_loop(problem, U), U)
+    lagrangian = Lagrangian(problem, former.multipliers, None, True)
+    rollouts = followed(problem, former.X, former.U, former.K), (open_loop(problem, former.U), former.U)
     fed, plain = (value(lagrangian, *rollout)[1].nan_to_num(torch.inf) for rollout in rollouts)
-    return torch.where((fed <= plain).view(-1, 1, 1), rollouts[0][1].nan_to_num(), U)
+    return torch.where((fed <= plain).view(-1, 1, 1), rollouts[0][1].nan_to_num(), former.U)
 
 
 class _Solve:
     """The solves of one control step."""
 
     def __init__(
-        self, planner: Planner, problem: Problem, seed: int, ids: Tensor, began: float, allowed: Tensor
+        self, planner: Planner, problem: Problem, t: float, seed: int, ids: Tensor, began: float, allowed: Tensor
     ) -> None:
-        self.planner, self.problem, self.seed, self.ids, self.began = planner, problem, seed, ids, began
+        self.planner, self.problem, self.t, self.seed, self.ids, self.began = planner, problem, t, seed, ids, began
         self.allowed = allowed  # violation (B,)
         self.solver, self.local = planner.solvers
 
-    def first(self, U0: Tensor) -> Plan:
+    def first(self, U0: Tensor) -> MissionPlan:
         """The solver's plans, from controls U0 (B, N, 4)."""
         plan = self._plan(self._solved(self.solver, self.problem, U0, None, self.ids), self.allowed)
         return replace(plan, arrived=self._arrives(plan))
 
-    def next(self, U0: Tensor, before: Plan, multipliers: Multipliers) -> Plan:
-        """Plans that continue previous ones, which are flown one stage later by U0 (B, N, 4), with `multipliers`."""
-        warm = multipliers if self.planner.multipliers == "shifted" else None
+    def next(self, U0: Tensor, former: MissionPlan, again: bool) -> MissionPlan:
+        """Plans that continue previous ones, which are moved on and flown by U0 (B, N, 4).
+
+        Args:
+            again: seek others where plans wait, see `_from_waiting`.
+        """
+        warm = former.multipliers if self.planner.multipliers == "shifted" else None
         plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids), self.allowed)
-        plan.penalty.copy_(before.penalty)
-        self._keep_former(plan, before, U0, multipliers)
+        plan.penalty.copy_(former.penalty)
+        self._keep_former(plan, former, U0)
         rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         left = self._time_left()
         if self.local is not self.solver and rows.numel() > 0 and (left is None or left > MIN_SECONDS):
-            again = self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows])
-            found = self._plan(again, self.allowed[rows])
+            searched = self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows])
+            found = self._plan(searched, self.allowed[rows])
             self._replace(plan, rows, found)
-            for name in ("guided", "iterations"):
-                getattr(plan, name)[rows] += getattr(found, name)
-        if (before.step + 1) % AGAIN == 0:
-            self._from_waiting(plan, before)
+            _count(plan, rows, found)
+        if again:
+            self._from_waiting(plan, former)
         return replace(
             plan,
-            arrived=before.arrived | self._arrives(plan),
-            penalty=torch.where(plan.violation <= self.allowed, plan.penalty, before.penalty),
+            arrived=former.arrived | self._arrives(plan),
+            penalty=torch.where(plan.violation <= self.allowed, plan.penalty, former.penalty),
         )
 
-    def _from_waiting(self, plan: Plan, before: Plan) -> None:
+    def _from_waiting(self, plan: MissionPlan, former: MissionPlan) -> None:
         """Search for plans that arrive where these don't, but one before did: they wait where a search found no way.
 
         Each is feasible, and nothing else would look for another one.
         """
-        rows = (before.arrived & ~self._arrives(plan)).nonzero().flatten()
+        rows = (former.arrived & ~self._arrives(plan)).nonzero().flatten()
         left = self._time_left()
         if self.local is self.solver or rows.numel() == 0 or (left is not None and left <= MIN_SECONDS):
             return
         part = self.problem.take(rows)
         rest = part.cost.rest_controls(part.x0.new_zeros(part.B, part.N, part.m))
         found = self._plan(self._solved(self.solver, part, rest, None, self.ids[rows]), self.allowed[rows])
-        arrives = (found.violation <= self.allowed[rows]) & has_arrived(part, found.X)
-        for name in TRAJECTORY:
-            put(getattr(plan, name), rows[arrives], take(getattr(found, name), arrives.nonzero().flatten()))
-        for name in ("guided", "iterations"):
-            getattr(plan, name)[rows] += getattr(found, name)
+        arrives = ((found.violation <= self.allowed[rows]) & has_arrived(part, found.X)).nonzero().flatten()
+        plan.put(rows[arrives], found.take(arrives))
+        _count(plan, rows, found)
 
-    def _arrives(self, plan: Plan) -> Tensor:
+    def _arrives(self, plan: MissionPlan) -> Tensor:
         return has_arrived(self.problem, plan.X)
 
     def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
@@ -312,35 +347,35 @@ class _Solve:
         limit = self.planner.max_seconds
         return None if limit is None else max(MIN_SECONDS, limit - (clock.seconds() - self.began))
 
-    def _keep_former(self, plan: Plan, before: Plan, U: Tensor, multipliers: Multipliers) -> None:
-        """Put previous plans, flown one stage later by U, in the place of new ones that are infeasible and worse."""
+    def _keep_former(self, plan: MissionPlan, former: MissionPlan, U: Tensor) -> None:
+        """Put previous plans, moved on and flown by U, in the place of new ones that are infeasible and worse."""
         rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         if rows.numel() == 0:
             return
         part = self.problem.take(rows)
         X = open_loop(part, U[rows])
-        former = replace(
-            plan.take(rows), X=X, U=U[rows], K=shifted(before.K[rows]), multipliers=take(multipliers, rows),
+        moved = replace(
+            plan.take(rows), X=X, U=U[rows], K=former.K[rows], multipliers=take(former.multipliers, rows),
             cost=part.cost.total(X, U[rows]), violation=measured(part, X, U[rows]),
             shifted=torch.ones_like(rows, dtype=torch.bool),
         )  # fmt: skip
-        self._replace(plan, rows, former)
+        self._replace(plan, rows, moved)
 
     @staticmethod
-    def _replace(plan: Plan, rows: Tensor, other: Plan) -> None:
+    def _replace(plan: MissionPlan, rows: Tensor, other: MissionPlan) -> None:
         """The less violated of two plans for `rows`, in place; NaN is worst."""
-        better = other.violation < plan.violation[rows].nan_to_num(nan=torch.inf)
-        chosen = better.nonzero().flatten()
-        for name in TRAJECTORY:
-            put(getattr(plan, name), rows[chosen], take(getattr(other, name), chosen))
+        better = (other.violation < plan.violation[rows].nan_to_num(nan=torch.inf)).nonzero().flatten()
+        plan.put(rows[better], other.take(better))
 
-    def _plan(self, solution: Solution, allowed: Tensor) -> Plan:
-        none = torch.zeros_like(solution.cost, dtype=torch.bool)
-        return Plan(
-            solution.X, solution.U, solution.K, solution.multipliers, _penalty(solution.multipliers, allowed),
-            solution.cost, solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0],
-            solution.X[:, 0, :3], self.problem.dynamics, 0, none,
-        )  # fmt: skip
+    def _plan(self, solution: Solution, allowed: Tensor) -> MissionPlan:
+        plan = MissionPlan.of_solution(solution, self.problem, self.t)
+        return replace(plan, penalty=_penalty(solution.multipliers, allowed))
+
+
+def _count(plan: MissionPlan, rows: Tensor, other: MissionPlan) -> None:
+    """Add the iterations of another solve for some vehicles (b,), in place."""
+    for name in ("guided", "iterations"):
+        getattr(plan, name)[rows] += getattr(other, name)
 
 
 def _penalty(multipliers: Multipliers, allowed: Tensor) -> Tensor:

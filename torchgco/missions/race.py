@@ -28,7 +28,7 @@ from torchgco.missions.log import SeenLog
 from torchgco.missions.mission import Duration, Mission
 from torchgco.missions.passing import Passing
 from torchgco.missions.pilot import SEED_STEP, Pilot
-from torchgco.missions.planner import Plan
+from torchgco.missions.planner import MissionPlan
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.free_time import FreeTime
@@ -167,7 +167,9 @@ class Racer:
         self.passing = replace(self.passing, passed=self.passing.after(self.before, p))
         self.before = p
 
-    def plan(self, step: int, x: Tensor, before: Plan | None, measured: Tensor | None = None) -> tuple[Plan, float]:
+    def plan(
+        self, step: int, x: Tensor, before: MissionPlan | None, measured: Tensor | None = None
+    ) -> tuple[MissionPlan, float]:
         """See `Pilot`."""
         began, now = clock.seconds(), step * self.period
         violation, kept = torch.zeros_like(x[:, 0]), torch.ones_like(x[:, 0], dtype=torch.bool)
@@ -182,11 +184,8 @@ class Racer:
                 flown = (found.violation <= FOLLOWED) | (self.t[some, -1] == -torch.inf)  # there is no other plan
                 self._keep(some[flown], passed, found.take(flown.nonzero().flatten()), now)
                 violation[some], iterations[some], kept[some] = found.violation, found.iterations, ~flown
-        plan = Plan.of_states(self._ahead(now), x, self.problem.dynamics, step)
-        plan = replace(
-            plan, cost=self.t[:, -1] - now, violation=violation, shifted=kept, iterations=iterations,
-            spacing=self.spacing,
-        )  # fmt: skip
+        plan = MissionPlan.of_states(self._ahead(now), x, self.problem.dynamics, now, self.spacing)
+        plan = replace(plan, cost=self.t[:, -1] - now, violation=violation, shifted=kept, iterations=iterations)
         return plan, clock.seconds() - began
 
     def first(self, x: Tensor) -> tuple[Problem, Solution]:

@@ -153,12 +153,10 @@ class Engine:
         """The same with the terms that the Lagrangian adds to the cost; `best` are those of an outer loop's best."""
         if best is not None:
             packed = self._summed(lagrangian, best)
-        elif "packed" in vars(lagrangian):
-            packed = vars(lagrangian)["packed"].copy()
-        else:
-            packed = self._summed(lagrangian)
-            object.__setattr__(lagrangian, "packed", packed)  # several calls of an inner solve read the same terms
-            packed = packed.copy()
+        else:  # several calls of an inner solve read the same terms
+            if "packed" not in lagrangian.derived:
+                lagrangian.derived["packed"] = self._summed(lagrangian)
+            packed = lagrangian.derived["packed"].copy()
         packed.fill(values)
         return packed
 
@@ -176,39 +174,35 @@ class Engine:
 
     def _fixed(self, problem: Problem) -> c.Problem:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
-        if "packed" not in vars(problem):
-            rows, one = self._rows(problem), problem.one
-            if one is not None and rows is self._rows(one):
-                packed = self._fixed(one)
-            else:
-                packed = rows[0].copy()
-                make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
-                if problem.B > 0:
-                    of_each = self.cost is not None
-                    packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, of_each, make)
-            object.__setattr__(problem, "packed", packed)
-        return vars(problem)["packed"]
+        return problem.derive("packed", lambda: self._fixed_made(problem))
+
+    def _fixed_made(self, problem: Problem) -> c.Problem:
+        rows, one = self._rows(problem), problem.one
+        if one is not None and rows is self._rows(one):
+            return self._fixed(one)
+        packed = rows[0].copy()
+        make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
+        if problem.B > 0:
+            of_each = self.cost is not None
+            packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, of_each, make)
+        return packed
 
     def _rows(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         """Model and constraints, and the latter alone."""
-        if "rows_packed" not in vars(problem):
-            made = None if problem.one is None else self._rows(problem.one)
-            if made is None or any(row.map_of for row in made[1]):  # which maps C reads is a number of each problem
-                made = self._made(problem)
-            object.__setattr__(problem, "rows_packed", made)
-        return vars(problem)["rows_packed"]
+        return problem.derive("rows packed", lambda: self._rows_made(problem))
+
+    def _rows_made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
+        made = None if problem.one is None else self._rows(problem.one)
+        if made is None or any(row.map_of for row in made[1]):  # which maps C reads is a number of each problem
+            made = self._made(problem)
+        return made
 
     def _model(self, problem: Problem) -> c.Problem:
         """The model's part of it."""
         if problem.one is not None:
             return self._model(problem.one)
-        if "model_packed" not in vars(problem):
-            packed = _of_last(problem, "dynamics", problem.dynamics, True, lambda: self._model_made(problem))
-            object.__setattr__(problem, "model_packed", packed)
-        return vars(problem)["model_packed"]
-
-    def _model_made(self, problem: Problem) -> c.Problem:
-        return c.Problem(N=problem.N, parameters=self.model_numbers(problem), **shared_fields(self.shared))
+        pack = lambda: c.Problem(N=problem.N, parameters=self.model_numbers(problem), **shared_fields(self.shared))
+        return problem.derive("model packed", lambda: _of_last(problem, "dynamics", problem.dynamics, True, pack))
 
     def model_numbers(self, problem: Problem) -> c.Array:
         """The model's numbers of each problem."""
@@ -232,8 +226,11 @@ class Engine:
 
     def _row(self, problem: Problem, i: int) -> c.Constraint:
         """Constraint i without multipliers."""
-        make = lambda: constraint_of(problem, i, self.row_numbers(problem, i))
-        return _of_last(problem, i, problem.constraints[i], i in self.functions, make)
+        part = problem.constraints[i]
+        place = part, problem.row_shapes[i], problem.N, kind_of(part)
+        return _of_last(
+            problem, i, part, i in self.functions, lambda: constraint_of(*place, self.row_numbers(problem, i))
+        )
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
         """The fields of a `Constraint` in C that hold the numbers of constraint i."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from contextlib import suppress
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,18 +23,15 @@ from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
 
 
-class InteriorEngine:
-    """The library of a form of problems, for as many as `engine` serves; compiled when it is made.
+class InteriorKernels:
+    """The interior point for the problems of a form.
 
-    Raises:
-        InputError: a part without a counterpart in C.
-        NativeError: no compiler, or it refuses the source.
+    Attributes:
+        library: that it is compiled to, with so many `lanes`.
     """
 
-    def __init__(self, engine: Engine) -> None:
-        self.engine, self.lanes = engine, lanes_for(engine.B)
-        units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
-        self.library: ctypes.CDLL = engine.further(("interior", self.lanes), units)
+    library: ctypes.CDLL
+    lanes: int
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor,
@@ -52,10 +50,9 @@ class InteriorEngine:
             status, iterations (B,); error of the end test, theta, the sum of residuals, and whether the cost falls to
             second order, 0 or 1, (B,); gains (B, N, m, n+1).
         """
-        B = problem.B
         packed, out = self._packed(problem, X, U, multipliers)
         how, ends = interior(problem, packed, barrier, scale, options)
-        run(self.library.tgco_interior, B, self.lanes, how)
+        self._run(self.library.tgco_interior, problem, how)
         return out | ends
 
     def kkt(
@@ -78,14 +75,12 @@ class InteriorEngine:
         sides = {"a": right.a, "b": right.b, "c": right.c}
         sides = {name: part.clone(memory_format=torch.contiguous_format) for name, part in sides.items()}
         costates, left = X.new_zeros(B, problem.N + 1, n), X.new_zeros(right.a.shape[0], B)
-        run(
-            self.library.tgco_kkt, B, self.lanes,
-            Kkt.complete(
-                of=packed, active=active.double().contiguous(), give=give, K=None if K is None else K.contiguous(),
-                y=costates, left=left, **sides, problems=B, free_start=free_components(problem), count=right.a.shape[0],
-                rounds=CLOSING_ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=LEAST_PIVOT,
-            ),
+        how = Kkt.complete(
+            of=packed, active=active.double().contiguous(), give=give, K=None if K is None else K.contiguous(),
+            y=costates, left=left, **sides, problems=B, free_start=free_components(problem), count=right.a.shape[0],
+            rounds=CLOSING_ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=LEAST_PIVOT, ask=None,
         )  # fmt: skip
+        self._run(self.library.tgco_kkt, problem, how)
         return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, out["status"] == Status.CONVERGED)
 
     def _packed(
@@ -95,10 +90,45 @@ class InteriorEngine:
         out = {"status": torch.zeros(problem.B, dtype=torch.int32)}
         out["iterations"] = torch.zeros(problem.B, dtype=torch.int64)
         out["gains"] = X.new_zeros(problem.B, problem.N, problem.m, problem.n + 1)
-        rows = [constraint.copy() for constraint in self.engine._rows(problem)[1]]
+        rows = [constraint.copy() for constraint in self._rows(problem)]
         for row, lam in zip(rows, multipliers, strict=True):
             row.lam = lam
-        return self.engine.packed(problem, X=X, U=U, constraint=rows, **out), out
+        return self._with(problem, X=X, U=U, constraint=rows, **out), out
+
+    def _rows(self, problem: Problem) -> list[structures.Constraint]:
+        """Constraints without multipliers."""
+        raise NotImplementedError
+
+    def _with(self, problem: Problem, **values: Any) -> structures.Problem:
+        """A problem with further fields."""
+        raise NotImplementedError
+
+    def _run(self, function: Any, problem: Problem, how: Interior | Kkt) -> None:
+        """Call a function of the library on all problems."""
+        raise NotImplementedError
+
+
+class InteriorEngine(InteriorKernels):
+    """That whose functions are compiled, for as many problems as `engine` serves; compiled when it is made.
+
+    Raises:
+        InputError: a part without a counterpart in C.
+        NativeError: no compiler, or it refuses the source.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine, self.lanes = engine, lanes_for(engine.B)
+        units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
+        self.library = engine.further(("interior", self.lanes), units)
+
+    def _rows(self, problem: Problem) -> list[structures.Constraint]:
+        return self.engine._rows(problem)[1]
+
+    def _with(self, problem: Problem, **values: Any) -> structures.Problem:
+        return self.engine.packed(problem, **values)
+
+    def _run(self, function: Any, problem: Problem, how: Interior | Kkt) -> None:
+        run(function, problem.B, self.lanes, how)
 
 
 def interior(
@@ -108,14 +138,14 @@ def interior(
     ends = {name: barrier.new_zeros(problem.B) for name in ("error", "theta", "falls")}
     how = Interior.complete(
         of=packed, barrier=barrier, free_start=free_components(problem), constant=scale.constant,
-        least_cost=scale.size, **ends, **vars(options),
+        least_cost=scale.size, ask=None, **ends, **vars(options),
     )  # fmt: skip
     return how, ends
 
 
 def free_components(problem: Problem) -> Tensor | None:
     """1 where a component of the start is free, else 0, (B, n); None where none is."""
-    return None if problem.free_start is None else problem.free_start.double().contiguous()
+    return None if problem.free_start is None else problem.free_start.to("cpu", torch.float64).contiguous()
 
 
 def begin_interior(engine: Engine) -> None:

@@ -36,7 +36,8 @@ class KeptProblem:
         self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
         self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
         self._numbers = [engine.row_numbers(problem, i) for i in range(len(problem.constraints))]
-        rows = [constraint_of(problem, i, numbers) for i, numbers in enumerate(self._numbers)]
+        parts = zip(problem.constraints, problem.row_shapes, self._numbers, strict=True)
+        rows = [constraint_of(part, shape, N, kind_of(part), numbers) for part, shape, numbers in parts]
         for row, lam in zip(rows, self.lam, strict=True):
             row.lam = lam
         self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(engine.shared))

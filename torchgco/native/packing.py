@@ -32,13 +32,12 @@ def shared_fields(shared: Shared) -> dict[str, Any]:
     return {"shared": shared.model, "stage_shared": stage, "last_shared": last}
 
 
-def constraint_of(problem: Problem, i: int, own: dict[str, Any]) -> c.Constraint:
-    """Constraint i without multipliers, with the fields that `numbers_of` gives."""
-    constraint, (knots, rows) = problem.constraints[i], problem.row_shapes[i]
-    place = torch.full((problem.N + 1,), NOWHERE, dtype=torch.int32)
+def constraint_of(constraint: Any, shape: tuple[int, int], N: int, kind: Kind, own: dict[str, Any]) -> c.Constraint:
+    """A constraint with rows of a shape (K, p) without multipliers, with the fields that `numbers_of` gives."""
+    knots, rows = shape
+    place = torch.full((N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
         place[constraint.knots] = torch.arange(knots, dtype=torch.int32)
-    kind = kind_of(constraint)
     equality, geometric = constraint.sense == "equality", constraint.geometric
     return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
 

@@ -8,9 +8,7 @@ from torch import Tensor
 
 from torchgco.base.draws import MURMUR_1, MURMUR_2, WEYL
 from torchgco.base.status import STALLED, STOPPED, Status
-from torchgco.eager.fixed import GOLDEN, NUDGE, ROUNDINGS
-from torchgco.eager.sizes import LEAST_SIZE, ORDINARY
-from torchgco.eager.state import FILTERED, LONGEST_FALL
+from torchgco.lagrangian.barrier import FILTERED, GOLDEN, LEAST_SIZE, LONGEST_FALL, NUDGE, ORDINARY, ROUNDINGS
 from torchgco.native.declarations import Header, Structure, defines, enumerations
 from torchgco.native.includes import C
 from torchgco.obstacles.base import ABSENT
@@ -31,7 +29,9 @@ QUADRATIC = {
 }  # fmt: skip
 Quadratic = IntEnum("Quadratic", list(QUADRATIC), start=0)
 TracedCost = IntEnum("TracedCost", "FACTOR STAGE LAST", start=0)
-ENUMERATIONS = Kind, Guide, Status, End, Quadratic, TracedCost
+# What the interior point asks Python where C can't call a problem's functions: see Request.
+Asked = IntEnum("Asked", "VALUES DERIVATIVES NEARBY", start=0)
+ENUMERATIONS = Kind, Guide, Status, End, Quadratic, TracedCost, Asked
 CONSTANTS = {
     "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": FILTERED, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
     "COST_ARRAYS": len(Quadratic),
@@ -50,13 +50,14 @@ class Options(Structure): ...
 class Problem(Structure): ...
 class Outer(Structure): ...
 class Sampling(Structure): ...
+class Request(Structure): ...
 class Interior(Structure): ...
 class Kkt(Structure): ...
 # fmt: on
 
 
 HEADER = Header((C / "structures.h").read_text(), CONSTANTS)
-HEADER.declare(Array, Constraint, Options, Problem, Outer, Sampling, Interior, Kkt)
+HEADER.declare(Array, Constraint, Options, Problem, Outer, Sampling, Request, Interior, Kkt)
 
 
 def constants() -> str:

@@ -1,4 +1,5 @@
-"""Obstacles: their common interface, spheres, boxes, capsules and ellipsoids, also boxes that move along sines.
+"""Obstacles: their common interface, spheres, boxes, capsules and ellipsoids, also such that move along sines or
+any known motion.
 
 `base.Obstacles` adds to a constraint what the search for paths, pictures and sensors ask; users give `Spheres`, and
 bound to a problem they become `BoundSpheres`. `measured` has the judge's distances, which share no code with the
@@ -12,5 +13,6 @@ from torchgco.obstacles.body import Body as Body
 from torchgco.obstacles.boxes import Boxes as Boxes
 from torchgco.obstacles.capsules import Capsules as Capsules
 from torchgco.obstacles.ellipsoids import Ellipsoids as Ellipsoids
+from torchgco.obstacles.moved import Moved as Moved
 from torchgco.obstacles.oscillating import OscillatingBoxes as OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres as Spheres

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgco.base.brief import brief
 from torchgco.base.errors import InputError, ScaleWarning, undefined
-from torchgco.base.numbers import Number
+from torchgco.base.numbers import Number, numbers_of_fields
 from torchgco.base.shapes import MISTAKES, Dimensions
 from torchgco.base.tree import field_names, is_users
 from torchgco.constraints.base import ADMITTED as ADMITTED
@@ -83,13 +83,15 @@ class Obstacles(Distance):
 
     A kind of obstacles is a subclass with the fields below. It must define
 
-        bind, value, at, accumulate           as any constraint; `grown` too, or its chords can't be repaired
+        bind                                  as any constraint; `grown` too, or its chords can't be repaired
         absent, margins                       which obstacles there are, and their lengths
         signed_distance, segment_clearance    distances of points and of segments
         measured                              the same by separate code, for the judge and the certificate
 
     and it may define
 
+        rows, accumulate                      c, where it isn't minus the distance, and its own derivatives
+        numbers_of                            what a compiled problem writes, where some of `batched` are derived
         inflated                              its form as spheres or boxes: without it no path is sought
         shapes                                how it looks, where `inflated` doesn't say
         moving, chord_clearance, later        where its obstacles move
@@ -190,9 +192,21 @@ class Obstacles(Distance):
     def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
         """The same where `others`, the same obstacles of other balls of a body, have the numbers, too; by default none.
 
-        Absent obstacles are padding: where there are any, which are there isn't a number, and none can be written.
+        Without others by default all of `batched`. Absent obstacles are padding: where there are any, which are there
+        isn't a number, and none can be written.
         """
-        return []
+        return [] if others or bool(self.absent.any()) else numbers_of_fields(self, where, place)
+
+    def rows(self, p: Tensor, t: Tensor) -> Tensor:
+        """c (B, K, M) at points p (B, K, d), m, at times t (K,) or (1,), s; `ABSENT` of what isn't there."""
+        return torch.where(self.absent.unsqueeze(1), ABSENT, -self.signed_distance(p, t))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.counted(self.rows(X[:, self.knots, self.position], self.times(X)), ABSENT, X.shape[1])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        rows = self.rows(x[..., self.position], x.new_full((1,), k * self.dt))
+        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return f"obstacle {row}"
@@ -251,7 +265,7 @@ class Obstacles(Distance):
 
     def stopping_at(self, knots: Tensor) -> Self:
         """The same obstacles, which don't count, and don't move, after each problem's knot (B,)."""
-        raise undefined(self, "stopping_at")
+        return replace(self, stops=knots.to(self.vehicle_radius.dtype))  # type: ignore[type-var]
 
     def with_step(self, dt: float) -> Self:
         """The same obstacles, which move from knot to knot by what they do in dt, s."""
@@ -286,9 +300,8 @@ class OwnKind(Obstacles):
     def bind(self, dims: Dimensions) -> Self:
         return self
 
-    def rows(self, p: Tensor, t: Tensor) -> Tensor:
-        """c (B, K, M) at points p (B, K, d), m, at times t (K,) or (1,), s; `ABSENT` of what isn't there."""
-        raise undefined(self, "rows")
+    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+        return []
 
     def slopes(self, p: Tensor, t: Tensor) -> Tensor:
         """The derivatives (B, K, M, d) of the rows by p."""
@@ -296,13 +309,6 @@ class OwnKind(Obstacles):
 
     def row_shape(self, N: int) -> tuple[int, int]:
         return count_of(self.knots, N + 1), self.absent.shape[1]
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.counted(self.rows(X[:, self.knots, self.position], self.times(X)), ABSENT, X.shape[1])
-
-    def at(self, x: Tensor, k: int) -> Tensor:
-        rows = self.rows(x[..., self.position], x.new_full((1,), k * self.dt))
-        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         g, h = (self.counted(part, 0.0, X.shape[1]) for part in (g, h))
@@ -313,9 +319,6 @@ class OwnKind(Obstacles):
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """Depth beneath the full surface, (B, K, M), m."""
         return self.counted((-self.distances(X)).clamp(min=0.0), 0.0, X.shape[1])
-
-    def stopping_at(self, knots: Tensor) -> Self:
-        return replace(self, stops=knots.to(self.vehicle_radius.dtype))  # type: ignore[type-var]
 
 
 def warn_of_small(obstacles: Obstacles, field: str) -> None:

@@ -134,14 +134,14 @@ class Body:
             got = f"{self.offsets.shape[1]}-D"
             raise InputError("body.offsets", f"{d}-D offsets, as the vehicle's position is {d}-D", got)
         if len(self.offsets) == 1 and not bool(self.offsets.any()):
-            return with_radius(obstacles, float(self.radii[0])).bind(dims)
+            return of_ball(obstacles, float(self.radii[0]), dims)
         attitude = attitude_of(self.attitude, d, dims)
         offsets = self.offsets.to(dims.like).expand(dims.B, -1, -1).contiguous()
         assert dims.position is not None  # as space has d dimensions
-        inner = with_radius(obstacles, self.inscribed_radius).bind(dims)
+        inner = of_ball(obstacles, self.inscribed_radius, dims)
         points = BodyPoints(offsets, attitude, dims.n, dims.position, inner.knots)
         own = replace(dims, n=d, position=slice(0, d))
-        balls = tuple(with_radius(obstacles, float(radius)).bind(own) for radius in self.radii)
+        balls = tuple(of_ball(obstacles, float(radius), own) for radius in self.radii)
         return BoundBody(balls, inner, points, self.box)
 
 
@@ -180,11 +180,12 @@ def check_no_body(problem: Any, field: str, expected: str) -> None:
         raise InputError(field, expected, "a Body of several balls")
 
 
-def with_radius(obstacles: Any, radius: float) -> Any:
-    """The same obstacles of a vehicle that is a ball."""
+def of_ball(obstacles: Any, radius: float, dims: Dimensions) -> Any:
+    """The same obstacles of a vehicle that is a ball, bound to a problem."""
+    radii = dims.like.new_full((dims.B,), radius)  # as users' kinds may read it
     if hasattr(obstacles, "vehicle_radius"):
-        return replace(obstacles, vehicle_radius=radius)
-    return replace(obstacles, boxes=replace(obstacles.boxes, vehicle_radius=radius))
+        return replace(obstacles, vehicle_radius=radii).bind(dims)
+    return replace(obstacles, boxes=replace(obstacles.boxes, vehicle_radius=radii)).bind(dims)
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,12 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_finite, per_row
-from torchgco.base.tree import passed_on
 from torchgco.constraints.base import Constraint
-from torchgco.obstacles.base import ABSENT, OwnKind, least, picked
-from torchgco.obstacles.box_geometry import Cuboids, segment_distance
+from torchgco.obstacles.base import picked
 from torchgco.obstacles.boxes import BoundBoxes, Boxes
 from torchgco.obstacles.inputs import is_body
 from torchgco.obstacles.measured import Distances, box_distances
+from torchgco.obstacles.moving_boxes import MovingBoxes
 from torchgco.obstacles.shapes import RoundedBoxes, array
 
 
@@ -63,7 +62,7 @@ class OscillatingBoxes(Constraint):
 
 
 @dataclass(frozen=True)
-class BoundOscillatingBoxes(OwnKind):
+class BoundOscillatingBoxes(MovingBoxes):
     """Oscillating boxes shaped for their problem."""
 
     boxes: BoundBoxes  # in the middle of their motion
@@ -75,36 +74,11 @@ class BoundOscillatingBoxes(OwnKind):
 
     batched: ClassVar[tuple[str, ...]] = ("boxes", "amplitudes", "rates", "phases")
 
-    absent, vehicle_radius, position = passed_on("boxes", "absent", "vehicle_radius", "position")
-    margins, sizes = passed_on("boxes", "margins", "sizes")
     moving = property(lambda self: bool((self.amplitudes != 0).any()))  # type: ignore[assignment]
 
-    def places(self, t: Tensor) -> Tensor:
-        """Centres (B, K, M, d), m, at times t (K,), s."""
+    def centers_at(self, t: Tensor) -> Tensor:
         angle = t.view(1, -1, 1, 1, 1) * self.rates.unsqueeze(1) + self.phases.unsqueeze(1)
         return self.boxes.centers.unsqueeze(1) + (self.amplitudes.unsqueeze(1) * angle.sin()).sum(-2)
-
-    def rows(self, p: Tensor, t: Tensor) -> Tensor:
-        c = -2.0 * self.boxes.depths.unsqueeze(1) * self._outside(p, t)
-        return torch.where(self.absent.unsqueeze(1), ABSENT, c)
-
-    def slopes(self, p: Tensor, t: Tensor) -> Tensor:
-        return -2.0 * self.boxes.depths[:, None, :, None] * self._solids.normals_at(self._local(p, t))
-
-    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
-        return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p, t))
-
-    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        now = self.places(a.new_zeros(1))[:, 0]
-        return replace(self.boxes, centers=now).segment_clearance(a, b)
-
-    def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
-        t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
-        local = torch.stack(self._local(X[..., self.position], t), dim=-1)
-        begin, along = local[:, :-1].unbind(-1), local.diff(dim=1).unbind(-1)
-        gap = segment_distance(begin, along, self._solids.halves()) - self.bulge.unsqueeze(1)
-        gap = gap + (self.beneath(share) - self.boxes.inflated_radii).unsqueeze(1)
-        return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
     def measured(self, X: Tensor) -> Distances:
         t = self.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1)
@@ -131,24 +105,9 @@ class BoundOscillatingBoxes(OwnKind):
         sines = np.stack([array(part[b]) for part in (self.amplitudes, self.rates, self.phases)])
         return RoundedBoxes.of(self._solids, self.vehicle_radius, b, sines=sines)
 
-    def grown(self, by: Tensor) -> Self:
-        return replace(self, boxes=self.boxes.grown(by))
-
     def later(self, t: float) -> Self:
         return replace(self, phases=self.phases + t * self.rates)
 
     def chosen(self, at: Tensor) -> Self:
         parts = {name: picked(getattr(self, name), at) for name in ("amplitudes", "rates", "phases")}
         return replace(self, boxes=self.boxes.chosen(at), **parts)
-
-    @property
-    def _solids(self) -> Cuboids:
-        return self.boxes.inflated()
-
-    def _local(self, p: Tensor, t: Tensor) -> list[Tensor]:
-        """Coordinates along the sides from where the centres are, d tensors (B, K, M), of points p (B, K, d)."""
-        return self._solids.local((p.unsqueeze(2) - self.places(t)).unbind(-1))
-
-    def _outside(self, p: Tensor, t: Tensor) -> Tensor:
-        """Distances (B, K, M) from the full surfaces, as if none were absent."""
-        return self._solids.distance_at(self._local(p, t))

@@ -20,6 +20,7 @@ class RoundedBoxes:
         radius: (M,) by which they are rounded.
         velocity: (M, d), m/s; None: none moves evenly.
         sines: amplitudes, rates and phases (3, M, S, d) of sines along which centres move; None: none swings.
+        track: (T, M, d), where centres are every `step` seconds, between which they move evenly; None: none has one.
     """
 
     center: np.ndarray
@@ -28,10 +29,22 @@ class RoundedBoxes:
     radius: np.ndarray
     velocity: np.ndarray | None = None
     sines: np.ndarray | None = None
+    track: np.ndarray | None = None
+    step: float = 0.0
 
     @classmethod
-    def of(cls, solids: Any, vehicle_radius: Tensor, b: int, velocity: Any = None, sines: Any = None) -> Self:
-        """Problem b's of `Solids`, those that are there; velocities (M, d) and sines (3, M, S, d) are those of all."""
+    def of(
+        cls,
+        solids: Any,
+        vehicle_radius: Tensor,
+        b: int,
+        velocity: Any = None,
+        sines: Any = None,
+        track: Any = None,
+        step: float = 0.0,
+    ) -> Self:
+        """Problem b's of `Solids`, those that are there; velocities (M, d), sines (3, M, S, d) and tracks (T, M, d) are
+        those of all, and tracks have the centres."""
         here = ~solids.absent[b].cpu().numpy()
         center, radius = (array(part[b])[here] for part in (solids.centers, solids.radii))
         M, d = center.shape
@@ -40,7 +53,10 @@ class RoundedBoxes:
             half, sides = array(solids.half_sizes[b])[here], array(solids.axes[b])[here]
         radius = (radius - float(vehicle_radius[b])).clip(min=0.0)
         velocity, sines = (None if velocity is None else velocity[here]), (None if sines is None else sines[:, here])
-        return cls(center, half, sides, radius, velocity, sines)
+        if track is not None:
+            track = track[:, here]
+            center = track[0]
+        return cls(center, half, sides, radius, velocity, sines, track, step)
 
 
 def array(values: Tensor) -> np.ndarray:

@@ -23,19 +23,33 @@ LEVELS = np.sin(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 33))  # at which a rounde
 
 
 @dataclass(frozen=True, eq=False)
+class Track:
+    """Places (T, d), m, `step` seconds apart, between which a centre moves evenly, and after which it rests."""
+
+    places: np.ndarray
+    step: float
+
+    def at(self, t: np.ndarray | float) -> np.ndarray:
+        """Where it is, (..., d), at times t (...), s."""
+        times = self.step * np.arange(len(self.places))
+        return np.stack([np.interp(t, times, axis) for axis in self.places.T], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
 class Ball:
     """A sphere, or a disc in the plane; lengths in metres.
 
-    center (d,) at t = 0; velocity (d,), m/s
+    center (d,) at t = 0; velocity (d,), m/s; track: along which it moves instead
     """
 
     center: np.ndarray
     radius: float
     velocity: np.ndarray
+    track: Track | None = None
 
     @property
     def moving(self) -> bool:
-        return bool(self.velocity.any())
+        return self.track is not None or bool(self.velocity.any())
 
     @property
     def corners(self) -> np.ndarray:
@@ -44,7 +58,7 @@ class Ball:
 
     def at(self, t: np.ndarray | float) -> np.ndarray:
         """Centres (..., d) at times t (...), s."""
-        return self.center + np.asarray(t)[..., None] * self.velocity
+        return self.center + np.asarray(t)[..., None] * self.velocity if self.track is None else self.track.at(t)
 
     def distance(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (K,) of points (K, d) at times t (K,) from the centre."""
@@ -71,7 +85,9 @@ class Box:
     """A box, rounded outwards by `radius`; lengths in metres.
 
     center, half (d,): half the sides' lengths; sides (d, d): their directions, as rows
-    swing: amplitudes, rates and phases (3, S, d) of the sines along which the centre moves; None: it rests
+    swing: amplitudes, rates and phases (3, S, d) of the sines along which the centre moves; None: it has none
+    velocity: (d,), m/s, with which it moves beside; None: 0
+    track: along which it moves instead
     """
 
     center: np.ndarray
@@ -79,10 +95,13 @@ class Box:
     sides: np.ndarray
     radius: float = 0.0
     swing: np.ndarray | None = None
+    velocity: np.ndarray | None = None
+    track: Track | None = None
 
     @property
     def moving(self) -> bool:
-        return self.swing is not None and bool(self.swing[0].any())
+        parts = self.velocity, None if self.swing is None else self.swing[0]
+        return self.track is not None or any(part is not None and bool(part.any()) for part in parts)
 
     @property
     def corners(self) -> np.ndarray:
@@ -95,10 +114,15 @@ class Box:
 
     def at(self, t: np.ndarray | float) -> np.ndarray:
         """Centres (..., d) at times t (...), s."""
+        if self.track is not None:
+            return self.track.at(t)
+        t, center = np.asarray(t), np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+        if self.velocity is not None:
+            center = center + t[..., None] * self.velocity
         if self.swing is None:
-            return np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+            return center
         amplitudes, rates, phases = self.swing
-        return self.center + (amplitudes * np.sin(np.asarray(t)[..., None, None] * rates + phases)).sum(axis=-2)
+        return center + (amplitudes * np.sin(t[..., None, None] * rates + phases)).sum(axis=-2)
 
     def distance(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Signed distances (K,) of points (K, d) from the box before rounding."""

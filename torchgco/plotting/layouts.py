@@ -39,7 +39,7 @@ MARKED = {
 
 
 @dataclass(frozen=True)
-class Flight:
+class DrawnFlight:
     """One solver's trajectory through one layout."""
 
     path: np.ndarray  # (N+1, d) m
@@ -99,7 +99,7 @@ def layout_grid(
     return figure
 
 
-def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mapping[str, list[Flight]]) -> set[str]:
+def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mapping[str, list[DrawnFlight]]) -> set[str]:
     """Draw layout i from one side or several; returns the kinds of drawn shapes and marks, for the legend."""
     here, drawn = {solver: row[i] for solver, row in flights.items()}, set()
     path = _leading(scene, i, [flight.path for flight in here.values()])
@@ -113,10 +113,10 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     return drawn
 
 
-def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFrame) -> dict[str, list[Flight]]:
+def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFrame) -> dict[str, list[DrawnFlight]]:
     table = trials.drop_duplicates(["solver", "layout"]).set_index(["solver", "layout"])
     verdicts = table[["feasible", "reached"]].astype("boolean").fillna(False)
-    found: dict[str, list[Flight]] = {}
+    found: dict[str, list[DrawnFlight]] = {}
     for solver, states in paths.items():
         found[solver] = []
         for i, X in enumerate(states):
@@ -129,7 +129,7 @@ def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFra
             still = len(flown(path)) > 1 and bool(moved < STILL * _way(scene, i))
             # By the judge, who follows the path between the knots: a straight line may touch what it doesn't.
             touched = path[:0] if row["feasible"] else contacts(scene, i, path, X)
-            found[solver].append(Flight(path, end, touched, still, X[: len(flown(path))]))
+            found[solver].append(DrawnFlight(path, end, touched, still, X[: len(flown(path))]))
     return found
 
 
@@ -138,7 +138,7 @@ def _way(scene: Scene, i: int) -> float:
     return float(np.linalg.norm(scene.goal[i] - scene.start[i]))
 
 
-def views(scene: Scene, flights: Mapping[str, list[Flight]], count: int, columns: int) -> list[np.ndarray]:
+def views(scene: Scene, flights: Mapping[str, list[DrawnFlight]], count: int, columns: int) -> list[np.ndarray]:
     """Lower and upper corners (2, d), m, of the maps in each row of panels; x is the same in all rows."""
     boxes = []
     for first in range(0, count, columns):
@@ -249,7 +249,7 @@ def moving_handles(whose: str, colour: str) -> list[Artist]:
     return [passed, vehicle, Line2D([], [], color=colour, linewidth=0.9, label="the obstacle's last second")]
 
 
-def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane: Plane) -> set[str]:
+def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, DrawnFlight], plane: Plane) -> set[str]:
     """Draw the flights, the first over the others; returns the kinds of drawn marks, for the legend."""
     colours, drawn = solver_colours(flights), set()
     for level, (solver, flight) in enumerate(reversed(list(flights.items()))):
@@ -279,7 +279,7 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane:
     return drawn
 
 
-def ends(scene: Scene, flights: Mapping[str, list[Flight]], boxes: list[np.ndarray], columns: int) -> list[Artist]:
+def ends(scene: Scene, flights: Mapping[str, list[DrawnFlight]], boxes: list[np.ndarray], columns: int) -> list[Artist]:
     """Entries of a legend for the ways in which flights end short of the goal without contact.
 
     Args:
@@ -312,7 +312,7 @@ def ends_shown(scene: Scene) -> list[Line2D]:
     ]
 
 
-def _ended(flight: Flight, away: bool) -> set[str]:
+def _ended(flight: DrawnFlight, away: bool) -> set[str]:
     """The marks at the end of a flight that moves; `away`: it ends outside of the picture."""
     if away:
         return {"away"}
@@ -352,7 +352,7 @@ def _title(trials: pd.DataFrame) -> str:
     return ", ".join([*tasks[:1], *(f"seed {seed}" for seed in seeds[:1])]) if len(tasks) == 1 else ""
 
 
-def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str]) -> list[Artist]:
+def _handles(scene: Scene, flights: Mapping[str, list[DrawnFlight]], drawn: set[str]) -> list[Artist]:
     """Entries of the legend, for what is drawn alone."""
     handles: list[Artist] = []
     colours = solver_colours(flights)

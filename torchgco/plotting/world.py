@@ -10,7 +10,7 @@ import torch
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.obstacles.shapes import RoundedBoxes
-from torchgco.plotting.bodies import Ball, Box, Plane, Solid
+from torchgco.plotting.bodies import Ball, Box, Plane, Solid, Track
 from torchgco.plotting.scene import Scene
 from torchgco.plotting.silhouettes import body_of
 from torchgco.problem.problem import Problem
@@ -73,13 +73,16 @@ def world_of(problem: Problem, b: int) -> World:
 
 def _bodies(shapes: RoundedBoxes) -> list[Solid]:
     M, d = shapes.center.shape
-    moves = np.zeros((M, d)) if shapes.velocity is None else shapes.velocity
+    velocities = np.zeros((M, d)) if shapes.velocity is None else shapes.velocity
     found: list[Solid] = []
     for i in range(M):
-        center, half, radius = shapes.center[i], shapes.half[i], float(shapes.radius[i])
+        center, half, radius, velocity = shapes.center[i], shapes.half[i], float(shapes.radius[i]), velocities[i]
         swing = None if shapes.sines is None else shapes.sines[:, i]
-        is_box = half.any() or swing is not None
-        found.append(Box(center, half, shapes.sides[i], radius, swing) if is_box else Ball(center, radius, moves[i]))
+        track = None if shapes.track is None else Track(shapes.track[:, i], shapes.step)
+        if half.any() or swing is not None:
+            found.append(Box(center, half, shapes.sides[i], radius, swing, velocity, track))
+        else:
+            found.append(Ball(center, radius, velocity, track))
     return found
 
 

@@ -51,9 +51,9 @@ def row_by_row(problem: Problem, again: bool = False) -> Problem:
     if looks(problem.cost, first.cost.total, X, U):
         parts["cost"] = _made(problem.cost, _Cost if type(problem.cost).total is Cost.total else _Total)
     rows = list(problem.constraints)
-    for i, part in enumerate(first.constraints):
-        if looks(rows[i], part.value, X, U):
-            rows[i] = _made(rows[i], _Function if isinstance(part, FunctionConstraint) else _Constraint)
+    for i, constraint in enumerate(first.constraints):
+        if looks(rows[i], constraint.value, X, U):
+            rows[i] = _made(rows[i], _Function if isinstance(constraint, FunctionConstraint) else _Constraint)
             parts["constraints"] = tuple(rows)
     return problem._with(parts, problem.known) if parts else problem
 
@@ -73,16 +73,16 @@ def check_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
     rows = (torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)).nonzero().flatten()
     if apart is problem or rows.numel() == 0:
         return
-    some = X[rows], U[rows], None if times is None else times[rows]
+    trajectories = X[rows], U[rows], None if times is None else times[rows]
     with torch.no_grad(), whole_numbers_become(X.dtype):
-        whole, x, u = at_times(problem.take(rows), *some)
-        alone, _, _ = at_times(apart.take(rows), *some)
+        whole, x, u = at_times(problem.take(rows), *trajectories)
+        alone, _, _ = at_times(apart.take(rows), *trajectories)
         for field, wanted, values in _values(problem, apart):
-            own = called(field, wanted, values, alone, x, u, True)
+            by_row = called(field, wanted, values, alone, x, u, True)
             for at_once in (True, False):
-                found = called(field, wanted, values, whole, x, u, at_once)
-                if found.shape != own.shape or bool((wrong := unlike(found, own)).any()):
-                    raise InputError(field, wanted, _told(found, own, wrong, rows))
+                together = called(field, wanted, values, whole, x, u, at_once)
+                if together.shape != by_row.shape or bool((wrong := unlike(together, by_row)).any()):
+                    raise InputError(field, wanted, _told(together, by_row, wrong, rows))
 
 
 def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values]]:
@@ -95,10 +95,10 @@ def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values
         else:
             yield "cost.stage", OWN_ROW, _stages
             yield "cost.terminal", OWN_ROW, lambda p, X, U, _: p.cost.terminal(X[:, -1])
-    for i, (one, other) in enumerate(zip(problem.constraints, apart.constraints, strict=True)):
-        if one is not other:
-            is_function = isinstance(one, FunctionConstraint)
-            field = f"{one.name}.function" if isinstance(one, FunctionConstraint) else f"constraints[{i}].value"
+    for i, (bound, other) in enumerate(zip(problem.constraints, apart.constraints, strict=True)):
+        if bound is not other:
+            is_function = isinstance(bound, FunctionConstraint)
+            field = f"{bound.name}.function" if isinstance(bound, FunctionConstraint) else f"constraints[{i}].value"
             yield field, ONE_KNOT if is_function else OWN_ROW, lambda p, X, U, _, i=i: p.constraints[i].value(X, U)
 
 
@@ -114,25 +114,25 @@ def _stages(problem: Problem, X: Tensor, U: Tensor, at_once: bool) -> Tensor:
     return torch.stack([problem.cost.stage(X[:, k], U[:, k], k) for k in range(problem.N)], dim=1)
 
 
-def _told(found: Tensor, own: Tensor, wrong: Tensor, rows: Tensor) -> str:
-    """What an error says of values (b, ...) of problems `rows` (b,) that are `own` where each row is by itself."""
-    if found.shape != own.shape:
-        return f"values of shape {tuple(found.shape)} along the trajectories found, {tuple(own.shape)} row by row"
-    b, *at = wrong.nonzero()[0].tolist()
-    knot = f", row {at[0]} along the trajectory" if at else ""
-    numbers = f"{float(found[(b, *at)]):.6g} along the trajectories found, {float(own[(b, *at)]):.6g} by itself"
+def _told(whole: Tensor, alone: Tensor, wrong: Tensor, rows: Tensor) -> str:
+    """What an error says of values (b, ...) of problems `rows` (b,) that are `alone` where each row is by itself."""
+    if whole.shape != alone.shape:
+        return f"values of shape {tuple(whole.shape)} along the trajectories found, {tuple(alone.shape)} row by row"
+    b, *k = wrong.nonzero()[0].tolist()
+    knot = f", row {k[0]} along the trajectory" if k else ""
+    numbers = f"{float(whole[(b, *k)]):.6g} along the trajectories found, {float(alone[(b, *k)]):.6g} by itself"
     return f"other values among other knots and problems: {numbers} (problem {int(rows[b])}{knot})"
 
 
 def _looks(again: bool, part: Any, values: Callable[..., Tensor], *arguments: Tensor) -> bool:
     if not is_users(part):
         return False
-    found = None if again else _looking.get(part)
-    if found is None:
-        found = looks_at_values(values, *arguments)
+    looks = None if again else _looking.get(part)
+    if looks is None:
+        looks = looks_at_values(values, *arguments)
         with suppress(TypeError):  # no weak reference to it
-            _looking[part] = found
-    return found
+            _looking[part] = looks
+    return looks
 
 
 def _made(part: Any, mixin: type) -> Any:
@@ -152,19 +152,19 @@ def _each(row: Callable[[int, Any], Tensor], *arguments: Tensor) -> Tensor:
 
     NaN for rows that the user's code refuses and that aren't finite.
     """
-    x, found = arguments[0], dict[tuple[int, Any], Tensor | None]()
-    places = [(b, i) for i in (range(x.shape[1]) if x.dim() == 3 else [None]) for b in range(len(x))]
-    for place in places:
+    x, evaluated = arguments[0], dict[tuple[int, Any], Tensor | None]()
+    indices = [(b, i) for i in (range(x.shape[1]) if x.dim() == 3 else [None]) for b in range(len(x))]
+    for index in indices:
         try:
-            found[place] = row(*place)
+            evaluated[index] = row(*index)
         except MISTAKES:
-            if all(bool(torch.isfinite(_at(z, *place)).all()) for z in arguments):
+            if all(bool(torch.isfinite(_at(z, *index)).all()) for z in arguments):
                 raise
-            found[place] = None
-    known = next((value for value in found.values() if value is not None), None)
+            evaluated[index] = None
+    known = next((value for value in evaluated.values() if value is not None), None)
     if known is None:
-        return row(*places[0])  # which raises what it has to say
-    rows = torch.cat([torch.full_like(known, torch.nan) if value is None else value for value in found.values()])
+        return row(*indices[0])  # which raises what it has to say
+    rows = torch.cat([torch.full_like(known, torch.nan) if value is None else value for value in evaluated.values()])
     return rows if x.dim() == 2 else rows.unflatten(0, (-1, len(x))).transpose(0, 1)
 
 
@@ -181,16 +181,16 @@ class _Field(Dynamics):
     of_stages: tuple[Dynamics, Tensor] | None = None  # the model of any stage, and the stages (K,), set by `at`
 
     def at(self, k: int | Tensor) -> Self:
-        found = super().at(k)
-        if not isinstance(found, _Field):  # the user's code makes another object
-            found = _made(found, _Step if isinstance(self, _Step) else _Field)
-        return found if found is self or isinstance(k, int) else _for_stages(found, (self, k))
+        model = super().at(k)
+        if not isinstance(model, _Field):  # the user's code makes another object
+            model = _made(model, _Step if isinstance(self, _Step) else _Field)
+        return model if model is self or isinstance(k, int) else _for_stages(model, (self, k))
 
     def take(self, index: Rows) -> Self:
-        found = super().take(index)
+        model = super().take(index)
         if self.of_stages is None:
-            return found
-        return _for_stages(found, (self.of_stages[0].take(index), self.of_stages[1]))
+            return model
+        return _for_stages(model, (self.of_stages[0].take(index), self.of_stages[1]))
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         if x.shape[:-1] == (1,):

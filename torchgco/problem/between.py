@@ -52,12 +52,12 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Of a body that is where its balls are, of pairs that keep a distance the vector between them.
     """
     off = torch.zeros_like(X[:, 0, 0])
-    parts: list[Any] = [one.bare for one in problem.constraints if one.bare.on_the_way(X) is not None]
+    parts: list[Any] = [row.bare for row in problem.constraints if row.bare.on_the_way(X) is not None]
     if not parts or len(X) == 0:
         return off
     middle, even = _within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
-    for part in parts:
-        apart = part.on_the_way(middle) - part.on_the_way(even)
+    for row in parts:
+        apart = row.on_the_way(middle) - row.on_the_way(even)
         off = torch.maximum(off, apart.norm(dim=-1).flatten(1).amax(-1))
     return off
 
@@ -76,16 +76,16 @@ def paths(problem: Problem, X: Tensor, U: Tensor, off: Tensor | None = None) -> 
         return [Paths(every, 1, X)]
     off = bulge(problem, X, U) if off is None else off
     pieces = (off / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, PIECES_AT_MOST)
-    found = []
+    polylines = []
     for count in pieces.unique().int().tolist():
         rows = (pieces == count).nonzero().flatten()
         if count == 1:
-            found.append(Paths(rows, 1, X[rows]))
+            polylines.append(Paths(rows, 1, X[rows]))
             continue
-        part = problem.take(rows)
-        fine = torch.cat((X[rows, :-1].unsqueeze(2), _within(part, X[rows], U[rows], count)), dim=2).flatten(1, 2)
-        found.append(Paths(rows, count, torch.cat((fine, X[rows, -1:]), dim=1)))
-    return found
+        subset = problem.take(rows)
+        fine = torch.cat((X[rows, :-1].unsqueeze(2), _within(subset, X[rows], U[rows], count)), dim=2).flatten(1, 2)
+        polylines.append(Paths(rows, count, torch.cat((fine, X[rows, -1:]), dim=1)))
+    return polylines
 
 
 def _within(problem: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:

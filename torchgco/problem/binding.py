@@ -27,8 +27,8 @@ OF_FIELDS = {"bind", "batched", "per_element"}
 # Methods that say what a part is, and those that a class of ours computes beside them from its own fields alone.
 SAID = "stage", "terminal", "total", "value", "at", "signed_distance", "field", "step"
 COMPUTED = (
-    "expand", "scaled", "value", "accumulate", "violation", "worst", "at", "signed_distance", "segment_clearance",
-    "chord_clearance", "jacobians",
+    "expand", "scaled", "value", "rows", "accumulate", "violation", "worst", "at", "signed_distance",
+    "segment_clearance", "chord_clearance", "jacobians",
 )  # fmt: skip
 INTERFACES = Cost, Constraint, Obstacles, Dynamics  # what these compute, they compute by a part's own methods
 
@@ -41,28 +41,28 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
             user's class does: a subclass of `QuadraticCost`, say, whose `stage` would never be called. Or a user's
             class has one method of its own and inherits another that doesn't know it, such as `stage` and `expand`.
     """
-    found = part.bind(dims)
-    if not isinstance(found, kind):
-        raise InputError(f"{field}.bind", f"a method that returns a {kind.__name__}", describe(found))
-    if isinstance(found, Constraint) and is_users(found):
-        knots = getattr(found, "knots", None)
+    result = part.bind(dims)
+    if not isinstance(result, kind):
+        raise InputError(f"{field}.bind", f"a method that returns a {kind.__name__}", describe(result))
+    if isinstance(result, Constraint) and is_users(result):
+        knots = getattr(result, "knots", None)
         if not isinstance(knots, slice) and not (isinstance(knots, Tensor) and knots.dtype == torch.int64):
             raise InputError(f"{field}.knots", "a slice or an int64 tensor (K,), which `bind` sets", shown(knots))
-    for name in _lost(part, found):
-        expected = f"a class whose own methods are called: {type(found).__name__} takes its place"
+    for name in _lost(part, result):
+        expected = f"a class whose own methods are called: {type(result).__name__} takes its place"
         raise InputError(f"{field}.{name}", expected, f"one of {type(part).__name__}")
-    for own, name, heir in _torn(found):
-        expected = f"a method of {type(found).__name__}, which has a `{own}` of its own, or a class without {heir}'s"
-        raise InputError(f"{field}.{name}", expected, f"the one of {heir}, which doesn't call this `{own}`")
-    return found
+    for users, name, heir in _torn(result):
+        expected = f"a method of {type(result).__name__}, which has a `{users}` of its own, or a class without {heir}'s"
+        raise InputError(f"{field}.{name}", expected, f"the one of {heir}, which doesn't call this `{users}`")
+    return result
 
 
 def remember(pairs: Iterable[tuple[Any, Any]]) -> None:
     """Keep what was given with each bound part, for `as_given`."""
-    for part, found in pairs:
-        if found is not part:
+    for part, result in pairs:
+        if result is not part:
             with suppress(TypeError):  # no weak reference to it
-                _given[found] = part
+                _given[result] = part
 
 
 def as_given(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -83,9 +83,10 @@ def _origin(part: Any) -> Any:
     return part
 
 
-def _lost(part: Any, found: Any) -> Iterator[str]:
+def _lost(part: Any, result: Any) -> Iterator[str]:
     """Names that a user's class redefines and that are other ones in the class of what its `bind` returned."""
-    if isinstance(found, type(part)) or not _is_ours(type(found)):
+    inner = result.inscribed if isinstance(result, Obstacles) else result  # a body's balls meet obstacles of the class
+    if isinstance(inner, type(part)) or not _is_ours(type(result)):
         return
     values = {field.name for field in fields(part)} if is_dataclass(part) else set[str]()
     for cls in type(part).__mro__:
@@ -94,22 +95,23 @@ def _lost(part: Any, found: Any) -> Iterator[str]:
         for name, value in vars(cls).items():
             if name.startswith("__") or name in OF_FIELDS or name in values:
                 continue
-            if hasattr(type(found), name) and getattr(type(found), name) is not value:
+            if hasattr(type(result), name) and getattr(type(result), name) is not value:
                 yield name
 
 
-def _torn(found: Any) -> Iterator[tuple[str, str, str]]:
+def _torn(result: Any) -> Iterator[tuple[str, str, str]]:
     """A user's own method, one that is inherited from a class of ours and computes without it, and this class."""
-    line = type(found).__mro__
+    line = type(result).__mro__
     for name in COMPUTED:
-        at = next((i for i, cls in enumerate(line) if name in vars(cls)), None)
-        unused = name == "at" and isinstance(found, Constraint) and not found.geometric
-        if at is None or unused or line[at] in INTERFACES or not _is_ours(line[at]):
+        index = next((i for i, cls in enumerate(line) if name in vars(cls)), None)
+        unused = name == "at" and isinstance(result, Constraint) and not result.geometric
+        unused |= name == "rows" and getattr(type(result), "value", None) is not Obstacles.value
+        if index is None or unused or line[index] in INTERFACES or not _is_ours(line[index]):
             continue
-        users = [cls for cls in line[:at] if not _is_ours(cls)]
-        own = next((own for own in SAID if own != name and any(own in vars(cls) for cls in users)), None)
-        if own is not None:
-            yield own, name, line[at].__name__
+        users = [cls for cls in line[:index] if not _is_ours(cls)]
+        method = next((method for method in SAID if method != name and any(method in vars(cls) for cls in users)), None)
+        if method is not None:
+            yield method, name, line[index].__name__
 
 
 def _is_ours(cls: type) -> bool:

@@ -21,6 +21,7 @@ from torchgco.base.shapes import MISTAKES, check_tensor, describe
 from torchgco.base.tree import is_users
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost
 from torchgco.costs.function import FunctionCost
 from torchgco.dynamics.base import Dynamics
@@ -93,13 +94,13 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
     k = torch.arange(3, device=x0.device).clamp(max=N - 1)
-    several, one = dynamics.at(k), dynamics.at(0)
+    several, single = dynamics.at(k), dynamics.at(0)
     for name in ("field", "step") if dynamics.is_integrated else ("step",):
         method = lambda model, name=name: lambda i, x, u: getattr(model.take(i), name)(x, u)
         what = "derivatives" if name == "field" else "states"
         wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
-        _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
-        _check_among_all(f"dynamics.{name}", method(one), rows, len(x0), (x[:, 0], u[:, 0]))
+        _check_values(f"dynamics.{name}", method(single), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
+        _check_among_all(f"dynamics.{name}", method(single), rows, len(x0), (x[:, 0], u[:, 0]))
         of_stages = called(f"dynamics.{name}", wanted, method(several), rows, x, u)
         _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
     _check_stages(dynamics, rows, x0, N)
@@ -123,14 +124,14 @@ def _check_stages(dynamics: Dynamics, rows: Tensor, x0: Tensor, N: int) -> None:
 
     def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         if dynamics.at(k) is dynamics:  # the same at every stage: all states as problems of their own
-            ahead = dynamics.take(i.repeat_interleave(len(k))).step(*(part.flatten(0, 1) for part in z))
+            ahead = dynamics.take(i.repeat_interleave(len(k))).step(*(x.flatten(0, 1) for x in z))
             return ahead.unflatten(0, (-1, len(k)))
-        own = dynamics.take(i)  # once: numbers of all stages, at each of them, would be as many as the horizon squared
-        return torch.stack([own.at(int(j)).step(*(part[:, at] for part in z)) for at, j in enumerate(k)], dim=1)
+        f = dynamics.take(i)  # once: numbers of all stages, at each of them, would be as many as the horizon squared
+        return torch.stack([f.at(int(j)).step(*(x[:, knot] for x in z)) for knot, j in enumerate(k)], dim=1)
 
-    place = called("dynamics.step", STEP_OF_STAGE, joined_knots, together, alone, rows, k, arguments)
-    if place is not None:
-        got = f"others at stage {place} where K = {N}, or where other states lie beside"
+    stage = called("dynamics.step", STEP_OF_STAGE, joined_knots, together, alone, rows, k, arguments)
+    if stage is not None:
+        got = f"others at stage {stage} where K = {N}, or where other states lie beside"
         raise InputError("dynamics.step", STEP_OF_STAGE, got)
 
 
@@ -149,25 +150,25 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
-    part, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
+    row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
     if type(cost).total is Cost.total:
         _check_cost_of_stages(cost, takes_k, rows, k, X[:, :-1], U)
-    _check_axes("cost.stage", lambda k, x, u: part.stage(x, u, k), takes_k, k, X[:, :-1], U)
-    _check_axes("cost.terminal", lambda _, x: part.terminal(x), False, k[:1], X[:, -1:])
+    _check_axes("cost.stage", lambda k, x, u: row_cost.stage(x, u, k), takes_k, k, X[:, :-1], U)
+    _check_axes("cost.terminal", lambda _, x: row_cost.terminal(x), False, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
     _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
     _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
     if type(cost).expand is Cost.expand and type(cost).total is Cost.total:
-        _check_slope("cost.stage", lambda x, u: part.stage(x, u, k).sum(-1), X[:, :-1], U)
-        _check_slope("cost.terminal", lambda x, u: part.terminal(x), X[:, -1], U[:, -1])
+        _check_slope("cost.stage", lambda x, u: row_cost.stage(x, u, k).sum(-1), X[:, :-1], U)
+        _check_slope("cost.terminal", lambda x, u: row_cost.terminal(x), X[:, -1], U[:, -1])
         return
 
     def own(dX: Tensor, dU: Tensor) -> Tensor:
         H = _blocks(X, U)
-        part.expand(X, U, H)
+        row_cost.expand(X, U, H)
         return _along(H, dX, dU)
 
-    _check_slope("cost.expand", part.total, X, U, own)
+    _check_slope("cost.expand", row_cost.total, X, U, own)
 
 
 def _check_cost_of_stages(cost: Cost, takes_k: bool, rows: Tensor, k: Tensor, X: Tensor, U: Tensor) -> None:
@@ -175,14 +176,14 @@ def _check_cost_of_stages(cost: Cost, takes_k: bool, rows: Tensor, k: Tensor, X:
     together = lambda i, k, *z: cost.take(i).stage(*z, k).unsqueeze(-1)
 
     def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
-        found = together(i, k, *z).clone()
+        joint = together(i, k, *z).clone()
         for j in range(len(k)) if takes_k else (0, len(k) // 2, len(k) - 1):
-            found[:, [j]] = together(i, k[j : j + 1], *(part[:, [j]] for part in z))
-        return found
+            joint[:, [j]] = together(i, k[j : j + 1], *(arg[:, [j]] for arg in z))
+        return joint
 
-    place = called("cost.stage", ONE_STAGE, joined_knots, together, alone, rows, k, (X, U))
-    if place is not None:
-        raise InputError("cost.stage", ONE_STAGE, f"others at stage {place}, or where other states lie beside")
+    index = called("cost.stage", ONE_STAGE, joined_knots, together, alone, rows, k, (X, U))
+    if index is not None:
+        raise InputError("cost.stage", ONE_STAGE, f"others at stage {index}, or where other states lie beside")
 
 
 def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: int) -> None:
@@ -196,7 +197,7 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     K = len(torch.arange(N + 1)[constraint.knots])
     if K == 0:
         return
-    wanted = f"rows (2, {K}, p) in {x0.dtype}, the type of x0, of two problems"
+    wanted = f"rows (2, {K}, p) in {x0.dtype}, the type of x0, of two problems (numbers per problem are `batched`)"
     if isinstance(constraint, FunctionConstraint):
         wanted = f"a function of {' and '.join(constraint.of)} that gives {wanted}"
     shape = _check_values(field, value, rows, (X, U), (2, K, None), wanted)
@@ -215,7 +216,10 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
 
     weighted = lambda X, U: (weights * value(rows, X, U)).flatten(1).sum(-1)
     by_pytorch = type(constraint).accumulate in (Constraint.accumulate, FunctionConstraint.accumulate)
-    _check_slope(field, weighted, X, U, None if by_pytorch else own)
+    if by_pytorch:
+        _check_slope(field, weighted, X, U)
+    else:
+        _check_slope(f"{field.rpartition('.')[0]}.accumulate", weighted, X, U, own)
 
 
 def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int, X: Tensor, U: Tensor) -> None:
@@ -226,19 +230,19 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
 
     def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         if constraint.reads_knots:
-            own = constraint.take(i)
-            each = [own.rows_at(k[at : at + 1], *(part[:, at : at + 1] for part in z)) for at in range(len(k))]
+            taken = constraint.take(i)
+            each = [taken.rows_at(k[j : j + 1], *(x[:, j : j + 1] for x in z)) for j in range(len(k))]
             return torch.cat(each, dim=1)
-        K, single = len(k), (part.flatten(0, 1).unsqueeze(1) for part in z)
+        K, single = len(k), (x.flatten(0, 1).unsqueeze(1) for x in z)
         return together(i.repeat_interleave(K), k[:1], *single).squeeze(1).unflatten(0, (-1, K))
 
     knots = torch.arange(X.shape[1], device=X.device)[constraint.knots]
     arguments = tuple((X if a == "x" else U)[:, constraint.knots] for a in constraint.of)
     first = [z[:, :1] for z in arguments]
     _check_among_all(field, lambda i, *z: together(i, knots[:1], *z), rows, B, first)
-    place = called(field, ONE_KNOT, joined_knots, together, alone, rows, knots, arguments)
-    if place is not None:
-        got = f"rows of knot {int(knots[place])} that depend on other knots or problems, or on how many there are"
+    differing = called(field, ONE_KNOT, joined_knots, together, alone, rows, knots, arguments)
+    if differing is not None:
+        got = f"rows of knot {int(knots[differing])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
     _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
 
@@ -257,10 +261,10 @@ def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint
     if is_users(cost):
         called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
     for i, constraint in enumerate(constraints):
-        if is_users(constraint) and type(constraint.bare).accumulate is not Constraint.accumulate:
-            part = constraint.take(first)
-            zero = torch.zeros_like(called(f"constraints[{i}].value", wanted, part.value, X, U))
-            called(f"constraints[{i}].value", wanted, part.accumulate, X, U, zero, zero, _blocks(X, U)[first])
+        if is_users(constraint):
+            single = constraint.take(first)
+            zero = torch.zeros_like(called(f"constraints[{i}].value", wanted, single.value, X, U))
+            called(f"constraints[{i}].value", wanted, single.accumulate, X, U, zero, zero, _blocks(X, U)[first])
 
 
 def _check_values(
@@ -304,9 +308,9 @@ def _check_among_all(
     if B <= 2:
         return
     many = [torch.cat((z[:1].expand(B - 1, *z.shape[1:]), z[1:])) for z in arguments]
-    found = called(field, OWN_ROW, function, torch.arange(B, device=rows.device), *many)
+    among_all = called(field, OWN_ROW, function, torch.arange(B, device=rows.device), *many)
     two = called(field, OWN_ROW, function, rows, *arguments)
-    if found.shape != (B, *two.shape[1:]) or bool(unlike(found[[0, -1]], two).any()):
+    if among_all.shape != (B, *two.shape[1:]) or bool(unlike(among_all[[0, -1]], two).any()):
         raise InputError(field, OWN_ROW, f"other values among {B} problems than among two")
 
 
@@ -334,31 +338,31 @@ def _check_slope(
     function: Callable[[Tensor, Tensor], Tensor],
     x: Tensor,
     u: Tensor,
-    own: Callable[[Tensor, Tensor], Tensor] | None = None,
+    slope: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> None:
     """Compare derivatives of function(x, u) (2,) in two directions with differences, where two steps of these agree.
 
-    `own` (dx, du) is the derivative by the part's own code; None: by PyTorch, in reverse mode.
+    `slope` (dx, du) is the derivative by the part's own code; None: by PyTorch, in reverse mode.
     """
     eps, readers = torch.finfo(x.dtype).eps, WithoutReading()
     expected = "a function with derivatives by PyTorch, or the part's own, that agree with differences"
-    if own is None:
+    if slope is None:
         with readers, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PyTorch's, about numbers read from tensors with gradients
             gx, gu = called(field, expected, gradients_at_once, function, x, u)
-        own = lambda dx, du: (gx * dx).flatten(1).sum(-1) + (gu * du).flatten(1).sum(-1)
+        slope = lambda dx, du: (gx * dx).flatten(1).sum(-1) + (gu * du).flatten(1).sum(-1)
     # States and controls apart: the derivatives by one may be too large for a mistake in the others to be seen.
     for dx, du in ((_steps(x), torch.zeros_like(u)), (torch.zeros_like(x), _steps(u))):
-        given, h = called(field, expected, own, dx, du), eps ** (1.0 / 3.0)
+        slopes, h = called(field, expected, slope, dx, du), eps ** (1.0 / 3.0)
         along = lambda t, dx=dx, du=du: function(x + t * dx, u + t * du)
         wide, close = ((along(t) - along(-t)) / (2.0 * t) for t in (h, 0.25 * h))
         rounding = NOISE * eps * along(0.0).abs() / (0.25 * h)
-        unsure = NOISE * (wide - close).abs() + rounding + DERIVATIVE_SHARE * torch.maximum(given.abs(), close.abs())
-        wrong = ((given - close).abs() > unsure) & torch.isfinite(close)
+        unsure = NOISE * (wide - close).abs() + rounding + DERIVATIVE_SHARE * torch.maximum(slopes.abs(), close.abs())
+        wrong = ((slopes - close).abs() > unsure) & torch.isfinite(close)
         if bool(wrong.any()):
             b = wrong.nonzero()[0, 0]
             lost = "".join(f"; Tensor.{name} may lose them" for name in sorted(readers.seen))
-            got, due = float(given[b]), float(close[b])
+            got, due = float(slopes[b]), float(close[b])
             raise InputError(field, expected, f"{got:.4g} where differences give {due:.4g}{lost}")
 
 
@@ -406,3 +410,20 @@ def _along(H: Tensor, dX: Tensor, dU: Tensor) -> Tensor:
     n = dX.shape[-1]
     by_x, by_u = H[..., :n, n], H[:, :-1, n + 1 :, n]
     return (by_x * dX).flatten(1).sum(-1) + (by_u * dU).flatten(1).sum(-1)
+
+
+def check_constraints(constraints: Any) -> None:
+    """Raise InputError unless these are constraints in a list, one `RateBounds` at most."""
+    # A generator is refused, too: this first look would use it up.
+    if not isinstance(constraints, Sequence) or isinstance(constraints, str):
+        raise InputError("constraints", "a list of Constraint", kind_of(constraints))
+    for constraint in constraints:
+        if not isinstance(constraint, Constraint):
+            raise InputError("constraints", "a list of Constraint", kind_of(constraint))
+    if (rates := sum(isinstance(constraint, RateBounds) for constraint in constraints)) > 1:
+        raise InputError("constraints", "one RateBounds at most", rates)
+
+
+def kind_of(part: object) -> str:
+    """A part's class, as errors name it."""
+    return f"the class {part.__name__}" if isinstance(part, type) else type(part).__name__

@@ -42,18 +42,18 @@ def with_carried(problem: Problem) -> Problem:
 
 def carried_of(problem: Problem) -> Carried | None:
     """What all rows of two knots carry, those of one constraint after the other's; None where there are none."""
-    parts = [part.carries(problem.x0, problem.N) for part in problem.constraints if part.joins_knots]
+    parts = [constraint.carries(problem.x0, problem.N) for constraint in problem.constraints if constraint.joins_knots]
     return joined(parts, problem.B, problem.N) if parts else None
 
 
 def rows_of_one_knot(problem: Problem, first: int) -> list[Constraint]:
     """The constraints where the states from `first` on are those of `carried_of`."""
     rows = []
-    for part in problem.constraints:
-        if part.joins_knots:
-            count = len(part.carries(problem.x0, problem.N).taken)
-            part, first = part.with_carried(first), first + count
-        rows.append(part)
+    for constraint in problem.constraints:
+        if constraint.joins_knots:
+            count = len(constraint.carries(problem.x0, problem.N).taken)
+            constraint, first = constraint.with_carried(first), first + count
+        rows.append(constraint)
     return rows
 
 
@@ -75,9 +75,9 @@ class _Dynamics(WrappedDynamics):
         return self if model is self.model else replace(self, model=model)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
-        own, carried = x[..., : self.model.n], x[..., self.model.n :]
+        state, carried = x[..., : self.model.n], x[..., self.model.n :]
         self._check_stage()
-        return torch.cat((self.model.step(own, u), self.taken.after(own, u, carried, self.k)), dim=-1)
+        return torch.cat((self.model.step(state, u), self.taken.after(state, u, carried, self.k)), dim=-1)
 
     def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         self._check_stage()

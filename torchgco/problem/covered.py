@@ -17,10 +17,10 @@ def covered_goals(problem: Problem) -> Tensor:
     for last in problem.stages.unique().tolist():
         rows = (problem.stages == last).nonzero().flatten()
         center, radius = goal.position[rows].unsqueeze(1), goal.radius[rows].unsqueeze(-1)
-        for part in (each.inscribed for each in problem.obstacles):  # of a body, what it holds about the position
-            if part.holds_at(last) and part.absent.shape[1] > 0:
-                some = part if rows.numel() == problem.B else take(part, rows)
-                t = last * (some.dt or 0.0) * torch.ones_like(center[0, :, 0])
-                deep = some.signed_distance(center, t)[:, 0] <= -radius
-                covered[rows] |= (deep & ~some.absent).any(-1)
+        for obstacles in (each.inscribed for each in problem.obstacles):  # of a body, what it holds about the position
+            if obstacles.holds_at(last) and obstacles.absent.shape[1] > 0:
+                taken = obstacles if rows.numel() == problem.B else take(obstacles, rows)
+                t = last * (taken.dt or 0.0) * torch.ones_like(center[0, :, 0])
+                deep = taken.signed_distance(center, t)[:, 0] <= -radius
+                covered[rows] |= (deep & ~taken.absent).any(-1)
     return covered

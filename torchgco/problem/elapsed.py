@@ -45,10 +45,10 @@ class Elapsed:
         old, new = times_of(problem, factors), seconds + times_of(problem, left)
         k = (torch.searchsorted(old, new, right=True) - 1).clamp(0, N - 1)
         stage = old.diff(dim=1)
-        place = k + ((new - old.gather(1, k)) / stage.gather(1, k)).clamp(0.0, 1.0)
-        own = new.diff(dim=1)
-        lengths = torch.cat((own, own[:, -1:]), dim=1) / stage.gather(1, k)
-        return cls(left.clamp(time.least, time.most), place, lengths)
+        index = k + ((new - old.gather(1, k)) / stage.gather(1, k)).clamp(0.0, 1.0)
+        durations = new.diff(dim=1)
+        lengths = torch.cat((durations, durations[:, -1:]), dim=1) / stage.gather(1, k)
+        return cls(left.clamp(time.least, time.most), index, lengths)
 
     def states(self, X: Tensor) -> Tensor:
         """Those (B, N+1, n) at the knots of what is left, on straight lines between X (B, N+1, n)."""
@@ -67,19 +67,19 @@ class Elapsed:
     def multipliers(self, lam: Sequence[Tensor], knots: Sequence[Sequence[int]]) -> tuple[Tensor, ...]:
         """Multipliers (B, K, p) of rows at these knots: where the knots follow each other those of the same times, as
         they are of the lengths of the stages; elsewhere as before."""
-        return tuple(self._along(part, at) for part, at in zip(lam, knots, strict=True))
+        return tuple(self._along(values, indices) for values, indices in zip(lam, knots, strict=True))
 
-    def _along(self, lam: Tensor, at: Sequence[int]) -> Tensor:
-        if len(at) < 2 or lam.shape[2] == 0 or list(at) != list(range(at[0], at[0] + len(at))):
+    def _along(self, lam: Tensor, indices: Sequence[int]) -> Tensor:
+        if len(indices) < 2 or lam.shape[2] == 0 or list(indices) != list(range(indices[0], indices[0] + len(indices))):
             return lam
-        rows = slice(at[0], at[-1] + 1)
-        place = (self.place[:, rows] - at[0]).clamp(0.0, len(at) - 1.0)
-        return self.lengths[:, rows].unsqueeze(-1) * _between(lam, place)
+        rows = slice(indices[0], indices[-1] + 1)
+        index = (self.place[:, rows] - indices[0]).clamp(0.0, len(indices) - 1.0)
+        return self.lengths[:, rows].unsqueeze(-1) * _between(lam, index)
 
 
-def _between(values: Tensor, place: Tensor) -> Tensor:
+def _between(values: Tensor, index: Tensor) -> Tensor:
     """Values (B, K, ...) at places (B, L) within 0..K-1, on straight lines."""
-    k = place.floor().long().clamp(0, max(0, values.shape[1] - 2))
-    share = (place - k).unsqueeze(-1)
+    k = index.floor().long().clamp(0, max(0, values.shape[1] - 2))
+    share = (index - k).unsqueeze(-1)
     low, high = (values.gather(1, i.unsqueeze(-1).expand(-1, -1, values.shape[-1])) for i in (k, k + 1))
     return torch.lerp(low, high, share)

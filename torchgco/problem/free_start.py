@@ -14,19 +14,19 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import bounds_of
 
 
-def start_mask(given: Any, x0: Tensor) -> Tensor | None:
+def start_mask(value: Any, x0: Tensor) -> Tensor | None:
     """Which components of the starts x0 (B, n) are free, (B, n) bool; None where no mask is given.
 
     Raises:
         InputError: no mask (n,) or (B, n) of bool.
     """
-    if given is None:
+    if value is None:
         return None
     (B, n), expected = x0.shape, f"a mask ({x0.shape[1]},) or {tuple(x0.shape)} of bool"
     try:
-        mask = torch.as_tensor(given, device=x0.device)
+        mask = torch.as_tensor(value, device=x0.device)
     except (TypeError, ValueError, RuntimeError):
-        raise InputError("free_start", expected, shown(given)) from None
+        raise InputError("free_start", expected, shown(value)) from None
     if mask.dtype != torch.bool or tuple(mask.shape) not in ((n,), (B, n)):
         raise InputError("free_start", expected, f"{mask.dtype} of shape {tuple(mask.shape)}")
     return mask.expand(B, n).clone()

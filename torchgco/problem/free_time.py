@@ -87,7 +87,7 @@ class FreeTime(PerElement):
 def _firsts(segments: Any, dims: Dimensions) -> tuple[int, ...]:
     """The first stage of every segment."""
     field, N = "time.segments", dims.N
-    given: Any = segments
+    value: Any = segments
     if segments is None:
         return (0,)
     if isinstance(segments, int) and not isinstance(segments, bool):
@@ -96,24 +96,24 @@ def _firsts(segments: Any, dims: Dimensions) -> tuple[int, ...]:
         return tuple(round(s * N / segments) for s in range(segments))
     if isinstance(segments, tuple) and segments[:1] == (0,) and all(type(k) is int and k < N for k in segments):
         return segments  # bound before
-    knots = resolve_knots(given, N, field, dims.like.device)
-    found = [int(k) for k in torch.arange(N + 1)[knots if isinstance(knots, slice) else knots.cpu()]]
-    if found != sorted(found) or found[0] < 1 or found[-1] > N - 1:
-        raise InputError(field, f"knots within 1..{N - 1}, in their order", found)
-    return 0, *found
+    knots = resolve_knots(value, N, field, dims.like.device)
+    firsts = [int(k) for k in torch.arange(N + 1)[knots if isinstance(knots, slice) else knots.cpu()]]
+    if firsts != sorted(firsts) or firsts[0] < 1 or firsts[-1] > N - 1:
+        raise InputError(field, f"knots within 1..{N - 1}, in their order", firsts)
+    return 0, *firsts
 
 
 def _factors(value: Any, field: str, shape: tuple[int, ...], like: Tensor) -> Tensor:
     """Numbers of this shape, (B,) or (B, S), from one, from (B,) or from all."""
-    given = tensor(value, field, like)
-    whole = given.unsqueeze(-1) if given.dim() == 1 and len(shape) == 2 and given.shape[0] == shape[0] else given
+    raw = tensor(value, field, like)
+    whole = raw.unsqueeze(-1) if raw.dim() == 1 and len(shape) == 2 and raw.shape[0] == shape[0] else raw
     try:
-        found = whole.expand(shape)
+        expanded = whole.expand(shape)
     except RuntimeError:
-        raise InputError(field, f"a number, or shape {shape}", tuple(given.shape)) from None
-    if not bool(torch.isfinite(found).all()):
+        raise InputError(field, f"a number, or shape {shape}", tuple(raw.shape)) from None
+    if not bool(torch.isfinite(expanded).all()):
         raise InputError(field, "finite numbers", shown(value))
-    return found.contiguous()
+    return expanded.contiguous()
 
 
 def check_served(problem: Any) -> None:
@@ -138,12 +138,12 @@ def check_served(problem: Any) -> None:
         raise InputError("cost", f"the same cost at all stages where the time is free; {A_CLOCK}", "one per stage")
     if isinstance(cost, QuadraticInFreeTime) and problem.time.count > 1:
         raise InputError("time.segments", "None where x_ref follows the time", f"{problem.time.count} segments")
-    for i, part in enumerate(problem.constraints):
-        if getattr(part, "moving", False):
-            if part.in_free_time(problem.n, problem.m, 0) is part:
+    for i, constraint in enumerate(problem.constraints):
+        if getattr(constraint, "moving", False):
+            if constraint.in_free_time(problem.n, problem.m, 0) is constraint:
                 expected = "where the time is free, obstacles at rest, or Spheres that a ball is clear of"
                 raise InputError(
-                    f"constraints[{i}]", expected, f"{type(part).__name__.removeprefix('Bound')} that move"
+                    f"constraints[{i}]", expected, f"{type(constraint).__name__.removeprefix('Bound')} that move"
                 )
             if problem.time.count > 1:
                 raise InputError("time.segments", "None among obstacles that move", f"{problem.time.count} segments")

@@ -89,7 +89,7 @@ class Given:
             dims = whole._dimensions(x0)
             parts = {name: self.fields[name].bind(dims) for name in ("dynamics", "cost")}
             goal = self.fields["goal"]
-            rows = [part.bind(dims) for part in without_goal(goal, dims, self.fields["constraints"])]
+            rows = [constraint.bind(dims) for constraint in without_goal(goal, dims, self.fields["constraints"])]
             parts["constraints"] = with_goal(goal, rows, dims)
             if self.fields["time"] is not None:
                 parts["time"] = self.fields["time"].bind(dims)
@@ -117,7 +117,7 @@ def place(part: Any, parts: Sequence[Any]) -> int | None:
 def replaced(parts: Sequence[Any], old: Sequence[Any], new: Sequence[Any]) -> list[Any]:
     """Parts, with those among `old` replaced by those that stand at their places in `new`."""
     places = [place(part, old) for part in parts]
-    return [part if at is None else new[at] for part, at in zip(parts, places, strict=True)]
+    return [part if index is None else new[index] for part, index in zip(parts, places, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,21 +137,21 @@ def _facts(fields: Mapping[str, Any]) -> tuple[Hashable, ...]:
     """Parts and functions; numbers, how often tensors were written into, and sums over the bytes of tensors and arrays:
     `.data` and NumPy write unseen."""
     parts = fields["constraints"]
-    found: list[Hashable] = [_Itself(part) for part in (parts if isinstance(parts, (list, tuple)) else (parts,))]
-    found += [_Itself(fields[name]) for name in ("dynamics", "cost")]
+    facts: list[Hashable] = [_Itself(row) for row in (parts if isinstance(parts, (list, tuple)) else (parts,))]
+    facts += [_Itself(fields[name]) for name in ("dynamics", "cost")]
     for leaf in leaves(fields):
         if isinstance(leaf, Tensor):
-            found.append(0 if leaf.is_inference() else leaf._version)
+            facts.append(0 if leaf.is_inference() else leaf._version)
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
-                found.append(_sum(leaf.detach()))
+                facts.append(_sum(leaf.detach()))
         elif isinstance(leaf, (int, float, str, bytes, Number)) or leaf is None or type(leaf) in ALONE:
-            found.append(leaf)
+            facts.append(leaf)
         elif callable(leaf):
-            found.append(_Itself(leaf))
+            facts.append(_Itself(leaf))
         elif isinstance(leaf, np.ndarray) or hasattr(leaf, "__array__") or isinstance(leaf, (Collection, memoryview)):
-            found.append(_sum(leaf))
-    return tuple(found)
+            facts.append(_sum(leaf))
+    return tuple(facts)
 
 
 def _sum(numbers: Any) -> int | None:

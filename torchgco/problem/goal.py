@@ -101,8 +101,8 @@ class Goal(PerElement):
         if self.state is None:
             bound = self.bind(dims)
             assert bound is not None and dims.position is not None
-            at = list(range(dims.n))[dims.position]
-            return GoalBall(("x", at), upper=bound.radius, knots=[dims.N], center=bound.position).bind(dims)
+            components = list(range(dims.n))[dims.position]
+            return GoalBall(("x", components), upper=bound.radius, knots=[dims.N], center=bound.position).bind(dims)
         return GoalState(per_row(self.state, "goal.state", dims, dims.n)).bind(dims)
 
     @classmethod
@@ -179,11 +179,11 @@ class GoalState(Constraint):
         return X[:, self.knots][..., self.components] - self.state[:, self.components].unsqueeze(1)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        at, n = self.components, X.shape[-1]
-        assert at is not None
-        H[:, -1, at, n] += g[:, 0]
-        H[:, -1, n, at] += g[:, 0]
-        H[:, -1, at, at] += h[:, 0]
+        components, n = self.components, X.shape[-1]
+        assert components is not None
+        H[:, -1, components, n] += g[:, 0]
+        H[:, -1, n, components] += g[:, 0]
+        H[:, -1, components, components] += h[:, 0]
 
 
 def bound_goal(goal: Goal | None, cost: Cost, dims: Dimensions) -> tuple[Goal | None, Dimensions]:
@@ -204,7 +204,7 @@ def without_goal(goal: Goal | None, dims: Dimensions, constraints: Sequence[Cons
     """
     if dims.position is None and goal is None:
         return constraints
-    return [part for part in constraints if not part.is_goal]
+    return [constraint for constraint in constraints if not constraint.is_goal]
 
 
 def with_goal(goal: Goal | None, rows: Sequence[Constraint], dims: Dimensions) -> tuple[Constraint, ...]:

@@ -39,8 +39,8 @@ def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
     """
     if problem.time is not None:
         return in_time(problem)
-    held = within_horizons(problem)
-    return held if joins_knots else with_carried(held)
+    within = within_horizons(problem)
+    return within if joins_knots else with_carried(within)
 
 
 def within_horizons(problem: Problem) -> Problem:
@@ -73,17 +73,17 @@ def _resting(problem: Problem) -> Tensor:
     """Controls (B, N, m) at rest; the middle of their bounds where they aren't inside of these."""
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
     for bounds in bounds_of(problem.constraints, "u"):
-        held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
-        inside = (held > lower) & (held < upper)
+        controls, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+        inside = (controls > lower) & (controls < upper)
         rest = rest.clone()
-        rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
+        rest[:, bounds.knots] = torch.where(inside, controls, _between(controls, lower, upper))
     return rest
 
 
-def _between(held: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+def _between(controls: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """The middle of bounds; one inside of the bound where there is only one."""
-    one = torch.where(torch.isfinite(lower), lower + 1.0, torch.where(torch.isfinite(upper), upper - 1.0, held))
-    return torch.where(torch.isfinite(upper - lower), 0.5 * (lower + upper), one)
+    inside = torch.where(torch.isfinite(lower), lower + 1.0, torch.where(torch.isfinite(upper), upper - 1.0, controls))
+    return torch.where(torch.isfinite(upper - lower), 0.5 * (lower + upper), inside)
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ class _Dynamics(WrappedDynamics):
 
     def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         fx, fu = self.model.jacobians(x, u)
-        runs, one = self._runs(x).unsqueeze(-1), torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-        return torch.where(runs, fx, one), torch.where(runs, fu, 0.0)
+        runs, identity = self._runs(x).unsqueeze(-1), torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+        return torch.where(runs, fx, identity), torch.where(runs, fu, 0.0)
 
     def _runs(self, x: Tensor) -> Tensor:
         if self.k is None:
@@ -114,8 +114,8 @@ class _Dynamics(WrappedDynamics):
 
 def _of_stages(values: Tensor, k: int | Tensor, like: Tensor) -> Tensor:
     """Values (B, N) of stage k or stages k (K,), shaped to fit `like` (B,), (B, S) or (B, K)."""
-    found = values[:, k]
-    return lead(found, like) if isinstance(k, int) else found  # type: ignore[return-value]
+    at_k = values[:, k]
+    return lead(at_k, like) if isinstance(k, int) else at_k  # type: ignore[return-value]
 
 
 def _cost(problem: Problem, running: Tensor) -> Cost:
@@ -158,8 +158,8 @@ class _Stages(WrappedCost):
         if u.dim() == 3:
             weight = weight.unsqueeze(1)
             rest = rest.unsqueeze(1) if isinstance(k, int) else rest
-        held = 0.5 * (weight * (u - rest).square()).sum(-1)
-        return torch.where(_of_stages(self.running, k, value) > 0, value, held)
+        resting_cost = 0.5 * (weight * (u - rest).square()).sum(-1)
+        return torch.where(_of_stages(self.running, k, value) > 0, value, resting_cost)
 
 
 class _OwnExpansion(_Stages):
@@ -167,10 +167,10 @@ class _OwnExpansion(_Stages):
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         self.cost.expand(X, U, H)
-        held, weight = torch.zeros_like(H[:, :-1]), self.weight.unsqueeze(1)
+        blocks, weight = torch.zeros_like(H[:, :-1]), self.weight.unsqueeze(1)
         slope = weight * (U - self.resting)
-        add_blocks(held, X.shape[-1], None, slope, None, torch.diag_embed(weight.expand_as(slope)))
-        H[:, :-1] = torch.where(self.running[..., None, None] > 0, H[:, :-1], held)
+        add_blocks(blocks, X.shape[-1], None, slope, None, torch.diag_embed(weight.expand_as(slope)))
+        H[:, :-1] = torch.where(self.running[..., None, None] > 0, H[:, :-1], blocks)
 
 
 def counted(constraint: Constraint, horizon: Tensor, N: int) -> Tensor:
@@ -183,8 +183,8 @@ def counted(constraint: Constraint, horizon: Tensor, N: int) -> Tensor:
     of_controls = getattr(constraint, "of", "x" if constraint.holds_at(N) else "xu") != "x"
     last = horizon.unsqueeze(-1)
     within = knots < last if of_controls else knots <= last
-    own = (knots == last).any(-1, keepdim=True)
-    return within | ((knots == N) & ~own)
+    has_last = (knots == last).any(-1, keepdim=True)
+    return within | ((knots == N) & ~has_last)
 
 
 def _constraint(problem: Problem, i: int) -> Constraint:

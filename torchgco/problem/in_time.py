@@ -59,10 +59,10 @@ def in_time(problem: Problem, guess: Tensor | None = None) -> Problem:
         "free_start": pad(pad(free, (0, 1), value=True), (0, x0.shape[1] - problem.n - 1)),
         "time": None,
     }
-    whole = problem._with(parts, known=problem.known.of_lifted(f"{FREE_TIME_FORM} {time.segments}"))
+    known = problem.known.of_lifted(f"{FREE_TIME_FORM} {time.segments}")
     rows = [c.in_free_time(problem.n, problem.m, time.count - 1) for c in rows_of_one_knot(problem, problem.n + 1)]
-    object.__setattr__(whole, "constraints", (*rows, *_bounds(whole, time, problem.n)))
-    return whole
+    bounds = _bounds(problem._with(parts, known), time, problem.n)
+    return problem._with(parts | {"constraints": (*rows, *bounds)}, known)
 
 
 def states_in_time(problem: Problem, X: Tensor, U: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
@@ -140,9 +140,9 @@ def fitting_factors(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     rates = 0.5 * model.dt * (model.field(X[:, :-1], U) + model.field(X[:, 1:], U))
     size = X.amax(1, keepdim=True) - X.amin(1, keepdim=True)
     change, rates = ((z / torch.where(size > 0, size, 1.0)).flatten(2) for z in (X.diff(dim=1), rates))
-    none, at = X.new_zeros(problem.B, time.count), time.of_stages(problem.N)
+    none, segment = X.new_zeros(problem.B, time.count), time.of_stages(problem.N)
     squares = change * rates, rates.square(), change.square()
-    both, square, whole = (none.index_add(1, at, z.sum(-1)) for z in squares)
+    both, square, whole = (none.index_add(1, segment, z.sum(-1)) for z in squares)
     factors = both / square
     misses = whole - factors * both  # what is left of the squares
     return torch.where((misses <= MISFIT * whole) & (factors > 0), factors, torch.nan)
@@ -160,23 +160,23 @@ def paced(problem: Problem, times: Tensor | None) -> Problem:
 
     Itself where none moves, or the time isn't free.
     """
-    if problem.time is None or times is None or not any(part.moving for part in problem.obstacles):
+    if problem.time is None or times is None or not any(obstacle.moving for obstacle in problem.obstacles):
         return problem
     factor = factors_of(problem, times)[:, 0]
-    return problem._with({"constraints": tuple(part.paced(factor) for part in problem.constraints)})
+    return problem._with({"constraints": tuple(constraint.paced(factor) for constraint in problem.constraints)})
 
 
 def at_held_times(problem: Problem, n: int) -> Problem:
     """Problems `in_time` whose factor, their state n, is held at x0, and whose own starts stay as free as they are."""
     free = problem.free_start
     assert free is not None
-    own, known = free.clone(), problem.known
-    own[:, n] = False
-    parts = tuple(part.at_factor(problem.x0[:, n]) for part in problem.constraints)
+    others_free, known = free.clone(), problem.known
+    others_free[:, n] = False
+    parts = tuple(constraint.at_factor(problem.x0[:, n]) for constraint in problem.constraints)
     if any(a is not b for a, b in zip(parts, problem.constraints, strict=True)):
         known = known.of_lifted(HELD_FORM)
-    held = problem._with({"free_start": own, "constraints": parts}, known)
-    return held if bool(own.any()) else held.held_at(problem.x0)
+    fixed = problem._with({"free_start": others_free, "constraints": parts}, known)
+    return fixed if bool(others_free.any()) else fixed.held_at(problem.x0)
 
 
 def at_times(problem: Problem, X: Tensor, U: Tensor, times: Any) -> tuple[Problem, Tensor, Tensor]:
@@ -313,10 +313,10 @@ def _bounds(whole: Problem, time: FreeTime, n: int) -> list[Constraint]:
     first = [x0.new_full((len(x0), whole.n), free) for free in (-torch.inf, torch.inf)]
     for bound, factors in zip(first, (time.least, time.most), strict=True):
         bound[:, n] = factors[:, 0]
-    found: list[Constraint] = [StateBounds(*first, knots=[0]).bind(dims)]
+    bounds: list[Constraint] = [StateBounds(*first, knots=[0]).bind(dims)]
     if time.count > 1:
         later = [x0.new_full((len(x0), time.count - 1, whole.m), free) for free in (-torch.inf, torch.inf)]
         for bound, factors in zip(later, (time.least, time.most), strict=True):
             bound[..., -1] = factors[:, 1:]
-        found.append(ControlBounds(*later, knots=[k - 1 for k in time.segments[1:]]).bind(dims))
-    return found
+        bounds.append(ControlBounds(*later, knots=[k - 1 for k in time.segments[1:]]).bind(dims))
+    return bounds

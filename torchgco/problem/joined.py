@@ -29,13 +29,13 @@ Content = Callable[..., Iterator[list[Tensor]]]
 
 def mixes_problems(function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> bool:
     """Whether a third problem between two changes function(rows, *arguments) of these."""
-    found, three = function(rows, *arguments), rows[[0, 0, 1]]
+    of_two, three = function(rows, *arguments), rows[[0, 0, 1]]
     for content in (_foreign, _far):
         is_shown = True  # the function takes such content as any other
         for others in content(*arguments):
             strange = [torch.cat((z[:1], other, z[1:])) for z, other in zip(arguments, others, strict=True)]
             beside = _tried(function, three, *strange)
-            if beside is not None and not bool(unlike(beside[::2], found).any()):
+            if beside is not None and not bool(unlike(beside[::2], of_two).any()):
                 continue
             if beside is not None and take_same_branches((function, rows, *arguments), (function, three, *strange)):
                 return True
@@ -58,19 +58,19 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
     for sizes in (DRAWN_SIZES, DRAWN_SIZES[:2], DRAWN_SIZES[:1], ()):
         drawn = [torch.cat((z, *(size * scattered(z[:1]) for size in sizes))) for z in arguments]
         more = torch.cat((rows, rows[:1].expand(len(sizes))))
-        found, each = _tried(together, more, k, *drawn), _tried(alone, more, k, *drawn)
-        if found is not None and each is not None:
+        joint, each = _tried(together, more, k, *drawn), _tried(alone, more, k, *drawn)
+        if joint is not None and each is not None:
             break  # else it refuses such states
     else:
-        found, each = together(rows, k, *arguments), alone(rows, k, *arguments)
+        joint, each = together(rows, k, *arguments), alone(rows, k, *arguments)
     exempt, alike, few = False, (together, more, k, *drawn), (together, rows, k, *arguments)
-    for changed, other in (((alone, *alike[1:]), each), (few, _tried(*few))):
-        if other is None or (place := _place(other, found[: len(other)])) is None:
+    for changed, values in (((alone, *alike[1:]), each), (few, _tried(*few))):
+        if values is None or (index := _place(values, joint[: len(values)])) is None:
             continue
         if take_same_branches(changed, alike):
-            return place
+            return index
         exempt = True
-    one = rows[:1]
+    first = rows[:1]
     # Any two knots differ in a digit of their places, so that one of them is kept where the other is foreign. The last
     # two rows are kept as a whole, and foreign as a whole: another problem.
     K = len(k)
@@ -83,12 +83,12 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
                 torch.where(kept.view(*kept.shape, *[1] * (z.dim() - 2)), z[:1], other)
                 for z, other in zip(arguments, others, strict=True)
             ]
-            changed = together, one.expand(len(kept)), k, *strange
+            changed = together, first.expand(len(kept)), k, *strange
             other = _tried(*changed)
-            if other is not None and (place := _place(other, found[:1], kept)) is None:
+            if other is not None and (index := _place(other, joint[:1], kept)) is None:
                 continue
             if other is not None and take_same_branches(alike, changed):
-                return place
+                return index
             is_shown, exempt = False, exempt or other is not None
         if is_shown:
             break
@@ -112,21 +112,21 @@ def depends_on_axes(function: Rows, k: Tensor, arguments: Sequence[Tensor], take
         several = _tried(function, k, *arguments)
         if several is None or several.shape[:2] != arguments[0].shape[:2]:
             return False
-        some = [0, len(k) // 2, len(k) - 1]
-        each = range(len(k)) if takes_k else some
-        forms = [(at, _tried(function, int(k[at]), *(z[:, at] for z in arguments))) for at in each]
-        for at in some:
-            samples = [torch.stack((z, z, z), dim=1) for z in (z[:, at] for z in arguments)]
-            found = _tried(function, int(k[at]), *samples)
-            forms.append((at, None if found is None else found[:, 0]))
-        known = [(at, form) for at, form in forms if form is not None and form.shape == several[:, 0].shape]
+        probes = [0, len(k) // 2, len(k) - 1]
+        each = range(len(k)) if takes_k else probes
+        forms = [(j, _tried(function, int(k[j]), *(z[:, j] for z in arguments))) for j in each]
+        for j in probes:
+            samples = [torch.stack((z, z, z), dim=1) for z in (z[:, j] for z in arguments)]
+            sample_rows = _tried(function, int(k[j]), *samples)
+            forms.append((j, None if sample_rows is None else sample_rows[:, 0]))
+        known = [(j, form) for j, form in forms if form is not None and form.shape == several[:, 0].shape]
         if not known:
             return False
-        places = torch.tensor([at for at, _ in known], device=k.device)
+        places = torch.tensor([j for j, _ in known], device=k.device)
         due = several.transpose(0, 1)[places].flatten(0, 1)
         wrong = unlike(torch.cat([form for _, form in known]), due).reshape(len(known), -1).any(-1)
-        for at in places[wrong].tolist():
-            alone, of_all = _tried(function, k[at : at + 1], *(z[:, at : at + 1] for z in arguments)), several[:, at]
+        for j in places[wrong].tolist():
+            alone, of_all = _tried(function, k[j : j + 1], *(z[:, j : j + 1] for z in arguments)), several[:, j]
             if alone is not None and alone[:, 0].shape == of_all.shape and not bool(unlike(alone[:, 0], of_all).any()):
                 return True  # else it joins knots, which is another matter
     return False
@@ -137,7 +137,7 @@ def _foreign(*rows: Tensor) -> Iterator[list[Tensor]]:
     for value in FOREIGN:
         yield [torch.full_like(z[:1], value) for z in rows]
     for z in zip(*(z.split(1) for z in rows), strict=True):
-        yield [part + NEIGHBOUR_STEP * (1.0 + part.abs()) * scattered(part) for part in z]
+        yield [row + NEIGHBOUR_STEP * (1.0 + row.abs()) * scattered(row) for row in z]
 
 
 def _far(*rows: Tensor) -> Iterator[list[Tensor]]:
@@ -157,18 +157,18 @@ def _tried(function: Callable[..., Tensor], *arguments: Tensor | int) -> Tensor 
         return None
 
 
-def unlike(some: Tensor, others: Tensor) -> Tensor:
+def unlike(values: Tensor, others: Tensor) -> Tensor:
     """Where values (b, ...) differ by more than another order of sums explains; NaN is like infinity."""
     size = others.abs().nan_to_num(0.0, 0.0, 0.0).reshape(len(others), -1).amax(-1)
     near = torch.finfo(others.dtype).eps ** 0.5 * (1.0 + size.view(-1, *[1] * (others.dim() - 1)))
-    finite = torch.isfinite(some)
-    return ((some - others).abs() > near) & finite | (finite != torch.isfinite(others))
+    finite = torch.isfinite(values)
+    return ((values - others).abs() > near) & finite | (finite != torch.isfinite(others))
 
 
-def _place(some: Tensor, others: Tensor, kept: Tensor | None = None) -> int | None:
+def _place(values: Tensor, others: Tensor, kept: Tensor | None = None) -> int | None:
     """The first place of the second axis at which values (b, K, ...) differ, among those `kept` (b, K)."""
-    if some.dim() != others.dim() or some.shape[1:] != others.shape[1:]:
+    if values.dim() != others.dim() or values.shape[1:] != others.shape[1:]:
         return 0
-    wrong = unlike(some, others.expand_as(some)).flatten(2).any(-1)
-    found = (wrong if kept is None else wrong & kept).any(0).nonzero()
-    return int(found[0]) if found.numel() > 0 else None
+    wrong = unlike(values, others.expand_as(values)).flatten(2).any(-1)
+    indices = (wrong if kept is None else wrong & kept).any(0).nonzero()
+    return int(indices[0]) if indices.numel() > 0 else None

@@ -15,7 +15,7 @@ class Known:
         row_shapes: knots and rows of every constraint.
         paths: whether the roadmap can seek any.
         in_c, in_pytorch: kernels; `in_c` is False where those in C can't serve.
-        interior: of the interior point in PyTorch: it knows the shapes of rows.
+        interior: the interior point with functions that Python computes: it knows the shapes of rows.
         expects_interior: the interior point will be asked for.
         warned: reasons for PyTorch's kernels that a warning has named.
         packed: of "dynamics", "cost" and constraints by their place: the part that was packed for C last, of how many

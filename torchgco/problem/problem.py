@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import torch
@@ -13,15 +12,15 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
-from torchgco.base.tree import Rows, cast, field_names, is_users, take
+from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, take
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import Bounds, RateBounds, bounds_of, joined_bounds
+from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.binding import as_given, bound, remember
-from torchgco.problem.border import check_model
+from torchgco.problem.border import check_constraints, check_model, kind_of
 from torchgco.problem.free_start import checked_horizon, chooses_position, clear_starts, moved_inside, start_mask
 from torchgco.problem.free_time import FreeTime, check_served
 from torchgco.problem.given import Given, place, replaced
@@ -67,15 +66,17 @@ class Problem:
     free_start: Any = None
     time: FreeTime | None = None
 
-    known: ClassVar[Known]  # no field: what depends on the problems' form alone, shared by all subsets of a batch
+    # No fields. `known`: what depends on the problems' form alone, shared by all subsets of a batch. `derived`: what
+    # was computed from these very parts, by name; a problem made of others has what its maker hands on, else none.
+    known: ClassVar[Known]
+    derived: ClassVar[dict[str, Any]]
     given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
     one: ClassVar[Problem | None] = None  # the single problem that all of these are; None: they are no such copies
 
     def __post_init__(self) -> None:
         fields_given = as_given({f.name: getattr(self, f.name) for f in fields(self)})
         given = Given.of(fields_given)
-        for name, part in (fields_given | given.numbers | {"given": given}).items():
-            object.__setattr__(self, name, part)
+        self._set(**(fields_given | given.numbers), given=given, known=Known(), derived={})
         self._check_border()
         with computing_on(self.x0.device):
             self._bind(*(fields_given[name] for name in ("dynamics", "cost", "constraints")))
@@ -83,24 +84,27 @@ class Problem:
     def _bind(self, dynamics: Any, cost: Any, constraints: Any) -> None:
         """Bind the parts; the arguments are those that were given, by which checks of code know them again."""
         dims = self._dimensions(self.x0)
-        object.__setattr__(self, "dynamics", bound(self.dynamics, dims, "dynamics", Dynamics))
+        self._set(dynamics=bound(self.dynamics, dims, "dynamics", Dynamics))
         check_model(self.dynamics, self.x0)
-        object.__setattr__(self, "cost", bound(self.cost, dims, "cost", Cost))
+        self._set(cost=bound(self.cost, dims, "cost", Cost))
         goal, dims = bound_goal(self.goal, self.cost, dims)
-        object.__setattr__(self, "constraints", _all_bound(self.constraints, dims, self.goal))
-        object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
+        self._set(constraints=_all_bound(self.constraints, dims, self.goal))
+        self._set(x0=moved_inside(self.x0, self.free_start, self.constraints))
         stated = without_goal(self.goal, dims, constraints)
         rows = list(zip(stated, self.constraints, strict=False))  # the goal's row is last
         check_code(dims, self.x0, (dynamics, self.dynamics), (cost, self.cost), rows)
         remember([(dynamics, self.dynamics), (cost, self.cost), *rows])
-        for i, part in enumerate(self.constraints):
-            if isinstance(part, Obstacles):
-                warn_of_small(part, f"constraints[{i}]")
-        object.__setattr__(self, "goal", goal)
-        object.__setattr__(self, "known", Known())
+        for i, constraint in enumerate(self.constraints):
+            if isinstance(constraint, Obstacles):
+                warn_of_small(constraint, f"constraints[{i}]")
+        self._set(goal=goal)
         if self.time is not None:
-            object.__setattr__(self, "time", self.time.bind(dims))
+            self._set(time=self.time.bind(dims))
             check_served(self)
+
+    def _set(self, **parts: Any) -> None:
+        for name, part in parts.items():
+            object.__setattr__(self, name, part)
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
@@ -167,14 +171,24 @@ class Problem:
         """The bounds on controls, those of several parts as one; None where there are none."""
         return joined_bounds(bounds_of(self.constraints, "u"), self.N)
 
-    @cached_property
+    def derive(self, name: str, make: Callable[[], Any]) -> Any:
+        """What `make` computes from this problem's parts, once; kept in `derived` under the name."""
+        if name not in self.derived:
+            self.derived[name] = make()
+        return self.derived[name]
+
+    @property
     def start_is_clear(self) -> Tensor:
         """Whether each problem starts outside its obstacles, (B,) bool; see `free_start.clear_starts`."""
-        return clear_starts(self.constraints, self.x0, self.free_start, self.dynamics.position)
+        parts = self.constraints, self.x0, self.free_start, self.dynamics.position
+        return self.derive("start_is_clear", lambda: clear_starts(*parts))
 
-    @cached_property
+    @property
     def cost_scale(self) -> CostScale:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
+        return self.derive("cost_scale", self._cost_scale)
+
+    def _cost_scale(self) -> CostScale:
         X, U = self.at_rest
         stages = None if self.horizon is None else self.stages
         if isinstance(self.cost, BoundQuadratic) and self.cost.kernel == "quadratic":
@@ -204,15 +218,15 @@ class Problem:
         """Knots and rows of every constraint; the same for all problems of a form."""
         shapes = self.known.row_shapes
         if shapes is None:
-            stated = [None if is_users(part) else part.row_shape(self.N) for part in self.constraints]
-            found: list[Any] = stated
+            stated = [None if is_users(constraint) else constraint.row_shape(self.N) for constraint in self.constraints]
+            complete: list[Any] = stated
             if None in stated:
                 # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
-                one = self.take(slice(0, 1))
-                X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
-                parts = zip(stated, one.constraints, strict=True)
-                found = [shape or part.value(X, U).shape[1:] for shape, part in parts]
-            shapes = self.known.row_shapes = tuple((knots, rows) for knots, rows in found)
+                first = self.take(slice(0, 1))
+                X, U = first.x0.new_zeros(first.B, self.N + 1, self.n), first.x0.new_zeros(first.B, self.N, self.m)
+                parts = zip(stated, first.constraints, strict=True)
+                complete = [shape or constraint.value(X, U).shape[1:] for shape, constraint in parts]
+            shapes = self.known.row_shapes = tuple((knots, rows) for knots, rows in complete)
         return shapes
 
     @property
@@ -239,7 +253,7 @@ class Problem:
 
     def __getstate__(self) -> dict[str, Any]:
         """The parts alone: native kernels stay in their process."""
-        return {f.name: getattr(self.current(), f.name) for f in fields(self)} | {"known": Known()}
+        return {f.name: getattr(self.current(), f.name) for f in fields(self)} | {"known": Known(), "derived": {}}
 
     def take(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a list or slice); a row may occur more than once.
@@ -248,15 +262,15 @@ class Problem:
         """
         if isinstance(index, list):
             index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
-        if _is_whole(index, self.B):
+        if is_whole(index, self.B):
             return self
         names = "dynamics", "cost", "constraints", "x0", "goal", "horizon", "free_start", "time"
-        part = self._with({name: take(getattr(self, name), index) for name in names}, known=self.known)
+        subset = self._with({name: take(getattr(self, name), index) for name in names}, known=self.known)
         if self.B == 1 or self.one is not None:
-            object.__setattr__(part, "one", self.one or self)
+            subset._set(one=self.one or self)
         if self.given is not None:
-            object.__setattr__(part, "given", self.given.followed(self, lambda whole: whole.take(index)))
-        return part
+            subset._set(given=self.given.followed(self, lambda whole: whole.take(index)))
+        return subset
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
@@ -315,12 +329,12 @@ class Problem:
         check_tensor(x0, "x0")
         if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
             raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", describe(x0))
-        _check_constraints(constraints)
+        check_constraints(constraints)
         if (now := self.current()) is not self:
             return now.started_at(x0, replaced(constraints, self.constraints, now.constraints), cost, dynamics)
         for field, part, kind in (("cost", cost, Cost), ("dynamics", dynamics, Dynamics)):
             if part is not None and not isinstance(part, kind):
-                raise InputError(field, f"a {kind.__name__}", _named(part))
+                raise InputError(field, f"a {kind.__name__}", kind_of(part))
         if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
             raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
         with computing_on(x0.device):
@@ -335,9 +349,9 @@ class Problem:
                 if other is not None and other != (dims.position, dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
                     raise InputError(f"constraints[{i}]", expected, f"bound ones for {other[1]} s and {other[0]}")
-            if [type(part) for part in rows] != [type(part) for part in self.constraints]:
-                kinds = ", ".join(type(part).__name__ for part in self.constraints)
-                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in rows))
+            if [type(row) for row in rows] != [type(row) for row in self.constraints]:
+                kinds = ", ".join(type(row).__name__ for row in self.constraints)
+                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(row).__name__ for row in rows))
             parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, rows), "constraints": rows}
             parts["dynamics"] = model
             if cost is not None:
@@ -345,8 +359,7 @@ class Problem:
                 if self.goal is None or self.goal.assumed:
                     parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
-            given = self.given and self.given.started(self, x0, constraints, cost, dynamics)
-            object.__setattr__(started, "given", given)
+            started._set(given=self.given and self.given.started(self, x0, constraints, cost, dynamics))
             new = [pair for pair in zip(constraints, rows, strict=False) if place(pair[0], self.constraints) is None]
             pair = lambda part, name: None if part is None else (part, parts[name])
             check_code(dims, started.x0, pair(dynamics, "dynamics"), pair(cost, "cost"), new)
@@ -358,7 +371,7 @@ class Problem:
         if dynamics is not None:
             parts["dynamics"] = dynamics.bind(dims)
         if constraints is not None:
-            rows = [part.bind(dims) for part in without_goal(self.goal, dims, constraints)]
+            rows = [constraint.bind(dims) for constraint in without_goal(self.goal, dims, constraints)]
             parts["constraints"] = with_goal(self.goal, rows, dims)
         parts["x0"] = moved_inside(x0, self.free_start, parts.get("constraints", self.constraints))
         return self._with(parts, known=self.known)
@@ -368,12 +381,15 @@ class Problem:
         names = "dynamics", "cost", "constraints", "x0", "goal", "time"
         return self._with({name: cast(getattr(self, name), dtype) for name in names})
 
-    def _with(self, parts: dict[str, object], known: Known | None = None) -> Self:
+    def _with(
+        self, parts: dict[str, object], known: Known | None = None, derived: dict[str, Any] | None = None
+    ) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
         copy = object.__new__(type(self))
         for name in field_names(type(self)):
             object.__setattr__(copy, name, parts[name] if name in parts else getattr(self, name))
         object.__setattr__(copy, "known", Known() if known is None else known)
+        object.__setattr__(copy, "derived", {} if derived is None else derived)
         return copy
 
     def check_controls(self, U: Tensor, field: str = "U0") -> None:
@@ -387,34 +403,27 @@ class Problem:
         # The bases themselves compute nothing.
         for name, part, kind in (("dynamics", self.dynamics, Dynamics), ("cost", self.cost, Cost)):
             if not isinstance(part, kind) or type(part) is kind:
-                raise InputError(name, f"a {kind.__name__}", _named(part))
+                raise InputError(name, f"a {kind.__name__}", kind_of(part))
         for name in ("n", "m"):
             check_value(getattr(self.dynamics, name, None), Count, f"dynamics.{name}")
-        object.__setattr__(self, "x0", as_states(self.x0))
+        self._set(x0=as_states(self.x0))
         if self.x0.dim() != 2 or not self.x0.is_floating_point():
             raise InputError("x0", f"a floating tensor (B, {self.dynamics.n})", describe(self.x0))
         if self.x0.shape[1] != self.dynamics.n or self.x0.shape[0] < 1:
             raise InputError("x0", f"shape (B, {self.dynamics.n})", tuple(self.x0.shape))
         check_tensor(self.x0, "x0")
-        object.__setattr__(self, "free_start", start_mask(self.free_start, self.x0))
+        self._set(free_start=start_mask(self.free_start, self.x0))
         if isinstance(self.N, bool) or not isinstance(self.N, int) or self.N < 1:
             raise InputError("N", "at least one stage, an int", repr(self.N))
         if self.horizon is not None:
-            object.__setattr__(self, "horizon", checked_horizon(self.horizon, self.x0, self.N))
+            self._set(horizon=checked_horizon(self.horizon, self.x0, self.N))
         if not callable(self.cost.goal):
             raise InputError("cost.goal", "a method, which no field may hide", type(self.cost.goal).__name__)
         if self.goal is not None and not isinstance(self.goal, Goal):
             raise InputError("goal", "a Goal, or None", type(self.goal).__name__)
         if self.time is not None and not isinstance(self.time, FreeTime):
             raise InputError("time", "a FreeTime, or None", shown(self.time))
-        _check_constraints(self.constraints)
-
-
-def _is_whole(index: Rows, B: int) -> bool:
-    """Whether an index takes all B problems in their order."""
-    if isinstance(index, slice):
-        return index.indices(B) == (0, B, 1)
-    return index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
+        check_constraints(self.constraints)
 
 
 def current_problem(problem: Any) -> Problem:
@@ -424,25 +433,10 @@ def current_problem(problem: Any) -> Problem:
         InputError: the argument is no Problem.
     """
     if not isinstance(problem, Problem):
-        raise InputError("problem", "a Problem", _named(problem))
+        raise InputError("problem", "a Problem", kind_of(problem))
     return problem.current()
-
-
-def _check_constraints(constraints: Any) -> None:
-    # A generator is refused, too: this first look would use it up.
-    if not isinstance(constraints, Sequence) or isinstance(constraints, str):
-        raise InputError("constraints", "a list of Constraint", _named(constraints))
-    for constraint in constraints:
-        if not isinstance(constraint, Constraint):
-            raise InputError("constraints", "a list of Constraint", _named(constraint))
-    if (rates := sum(isinstance(constraint, RateBounds) for constraint in constraints)) > 1:
-        raise InputError("constraints", "one RateBounds at most", rates)
 
 
 def _all_bound(constraints: Sequence[Constraint], dims: Dimensions, goal: Goal | None) -> tuple[Constraint, ...]:
     stated = enumerate(without_goal(goal, dims, constraints))
-    return with_goal(goal, [bound(part, dims, f"constraints[{i}]", Constraint) for i, part in stated], dims)
-
-
-def _named(part: object) -> str:
-    return f"the class {part.__name__}" if isinstance(part, type) else type(part).__name__
+    return with_goal(goal, [bound(row, dims, f"constraints[{i}]", Constraint) for i, row in stated], dims)

@@ -33,8 +33,8 @@ def sampled(dynamics: Dynamics | None, X: Tensor, U: Tensor, t: Tensor, rate: fl
     k, h, lengths = _places(t, rate)
     x, u = X[k].clone(), U[k]
     if bool((h > 0).any()):
-        one = X.unsqueeze(0), U.unsqueeze(0), k, h, lengths
-        x = between(dynamics, *one)[0] if dynamics is not None else x + (h / lengths).unsqueeze(-1) * (X[k + 1] - x)
+        path = X.unsqueeze(0), U.unsqueeze(0), k, h, lengths
+        x = between(dynamics, *path)[0] if dynamics is not None else x + (h / lengths).unsqueeze(-1) * (X[k + 1] - x)
     ends = h >= lengths * (1 - ROUNDING)  # a whole stage leads to the knot after it, which may not obey the model
     x[ends] = X[k[ends] + 1]
     if dynamics is None:
@@ -42,18 +42,18 @@ def sampled(dynamics: Dynamics | None, X: Tensor, U: Tensor, t: Tensor, rate: fl
     else:
         named = states_of(dynamics), controls_of(dynamics)
     columns = {TIME_COLUMN: t[k] + h}
-    columns |= {one.label: x[:, i] for i, one in enumerate(named[0])}
+    columns |= {state.label: x[:, i] for i, state in enumerate(named[0])}
     if dynamics is not None:
-        states = {one.name.partition(" [")[0]: x[:, i] for i, one in enumerate(named[0])}  # a unit may stand in a name
+        states = {s.name.partition(" [")[0]: x[:, i] for i, s in enumerate(named[0])}  # a unit may stand in a name
         columns |= _of_position(dynamics, x, u, k, states) | dynamics.derived(x, u)
-    columns |= {one.label: u[:, i] for i, one in enumerate(named[1])}
+    columns |= {control.label: u[:, i] for i, control in enumerate(named[1])}
     return {label: values.detach().cpu().numpy() for label, values in columns.items()}
 
 
 def sample_times(first: float, last: float, rate: float) -> np.ndarray:
     """Times from `first` on, s, `rate` a second, and the `last` one, which may come sooner after the one before."""
-    at = first + np.arange(int((last - first) * rate + ROUNDING) + 1) / rate
-    return at if (last - at[-1]) * rate <= ROUNDING else np.append(at, last)
+    times = first + np.arange(int((last - first) * rate + ROUNDING) + 1) / rate
+    return times if (last - times[-1]) * rate <= ROUNDING else np.append(times, last)
 
 
 def _places(t: Tensor, rate: float | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -64,9 +64,9 @@ def _places(t: Tensor, rate: float | None) -> tuple[Tensor, Tensor, Tensor]:
         h = torch.zeros_like(t)
         h[-1] = t[-1] - t[-2]
     else:
-        at = torch.from_numpy(sample_times(float(t[0]), float(t[-1]), rate)).to(t)
-        k = (torch.searchsorted(t.contiguous(), at + ROUNDING / rate, right=True) - 1).clamp(0, N - 1)
-        h = (at - t[k]).clamp(min=0.0)
+        times = torch.from_numpy(sample_times(float(t[0]), float(t[-1]), rate)).to(t)
+        k = (torch.searchsorted(t.contiguous(), times + ROUNDING / rate, right=True) - 1).clamp(0, N - 1)
+        h = (times - t[k]).clamp(min=0.0)
     return k, h, t[k + 1] - t[k]
 
 
@@ -78,17 +78,17 @@ def _of_position(
     Their names are `vx` and `ax`; where states have such names, but are something else, in the vehicle's axes for
     instance, `dx/dt` and `d2x/dt2`.
     """
-    at = dynamics.position
-    if at is None or at.stop - at.start > 3 or not dynamics.is_integrated:
+    xyz = dynamics.position
+    if xyz is None or xyz.stop - xyz.start > 3 or not dynamics.is_integrated:
         return {}
     model, x, u = dynamics.at(k), x.unsqueeze(0), u.unsqueeze(0)
     rates = model.field(x, u)
     change = slope_along(lambda z: model.field(z, u), (x,), (rates,))
     columns = {}
     for name, other, unit, values in (("v{}", RATE_OF_POSITION, "m/s", rates), ("a{}", SECOND_RATE, "m/s^2", change)):
-        own = {name.format(axis): values[0, :, at.start + i] for i, axis in enumerate("xyz"[: at.stop - at.start])}
-        if all(torch.allclose(states[key], own[key]) for key in own if key in states):
-            columns |= {f"{key} [{unit}]": own[key] for key in own if not own.keys() & states.keys()}
+        new = {name.format(axis): values[0, :, xyz.start + i] for i, axis in enumerate("xyz"[: xyz.stop - xyz.start])}
+        if all(torch.allclose(states[key], new[key]) for key in new if key in states):
+            columns |= {f"{key} [{unit}]": new[key] for key in new if not new.keys() & states.keys()}
         else:
-            columns |= {f"{other.format(key[-1])} [{unit}]": values for key, values in own.items()}
+            columns |= {f"{other.format(key[-1])} [{unit}]": values for key, values in new.items()}
     return columns

@@ -48,8 +48,8 @@ def cost_scale(
     """
     (count, m), N = curvatures.shape[1:], curvatures.shape[1]
     if stages is not None:
-        own = torch.arange(count, device=total.device) < stages.unsqueeze(-1)
-        curvatures, N = torch.where(own.unsqueeze(-1), curvatures, 0.0), stages
+        running = torch.arange(count, device=total.device) < stages.unsqueeze(-1)
+        curvatures, N = torch.where(running.unsqueeze(-1), curvatures, 0.0), stages
     idle, sizes = torch.full_like(curvatures[:, 0], UNLIMITED), torch.ones_like(curvatures[:, 0])
     if bounds is not None:
         half = 0.5 * bounds.range
@@ -121,7 +121,7 @@ def changes_of(
         there = X.clone()
         there[..., position] = goal.unsqueeze(1)
         places.append((there, U))
-    changes = [(cost.total(*place) - total).abs() for place in places]
+    changes = [(cost.total(*trajectory) - total).abs() for trajectory in places]
     return torch.stack(changes).nan_to_num(0.0, 0.0, 0.0).amax(0)
 
 

@@ -42,9 +42,9 @@ def _lengths(problem: Problem) -> Tensor:
     """The lengths of the stages, (B, N) or (1, N), s."""
     model = problem.dynamics
     if isinstance(model, FunctionDynamics) and not model.is_integrated and isinstance(model.values, Values):
-        given = dict(zip(model.values.knot_names, model.values.knot_rows, strict=True)).get(LENGTHS)
-        if given is not None and given[0, 0].numel() == 1:
-            return given.flatten(1)
+        lengths = dict(zip(model.values.knot_names, model.values.knot_rows, strict=True)).get(LENGTHS)
+        if lengths is not None and lengths[0, 0].numel() == 1:
+            return lengths.flatten(1)
     each = [getattr(model.at(k), "dt", None) for k in range(problem.N)]
     if any(dt is None for dt in each):
         raise InputError("dynamics.dt", "a time step, for the times of the knots", "none")

@@ -46,29 +46,29 @@ def check_code(
     where = dims.position and (dims.position.start, dims.position.stop)
     about = dims.B, dims.N, dims.n, dims.m, dims.dt, where, dims.obstacles_from, x0.dtype, x0.device
     if dynamics is not None:
-        _check_once(dynamics, about, lambda part: check_dynamics(part, x0, dims.N))
+        _check_once(dynamics, about, lambda bound: check_dynamics(bound, x0, dims.N))
     if cost is not None:
-        _check_once(cost, about, lambda part: check_cost(part, x0, dims.N, dims.m))
+        _check_once(cost, about, lambda bound: check_cost(bound, x0, dims.N, dims.m))
     for i, constraint in enumerate(constraints):
         name = getattr(constraint[1], "name", None)
         field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
-        _check_once(constraint, about, lambda part, field=field: check_constraint(part, field, x0, dims.N, dims.m))
+        _check_once(constraint, about, lambda bound, field=field: check_constraint(bound, field, x0, dims.N, dims.m))
 
 
-def _check_once(part: Given, about: Hashable, check: Callable[[Any], None]) -> None:
-    if not is_users(part[1]):
+def _check_once(pair: Given, about: Hashable, check: Callable[[Any], None]) -> None:
+    if not is_users(pair[1]):
         return
-    if not any(one in _passed and about in _passed[one] for one in part):
-        facts = _facts_of(part[0])
+    if not any(part in _passed and about in _passed[part] for part in pair):
+        facts = _facts_of(pair[0])
         known = facts is not None and _alike.pop((about, facts.key), None) is not None
         if not known:
-            check(part[1])
+            check(pair[1])
         if facts is not None:
             _alike[about, facts.key] = facts  # the most recent one is the last
-            trim(_alike, ALIKE_KEPT, CAPTURED, lambda held: held.nbytes)
-    for one in part:
+            trim(_alike, ALIKE_KEPT, CAPTURED, lambda kept: kept.nbytes)
+    for part in pair:
         with suppress(TypeError):  # no weak reference to it
-            _passed.setdefault(one, set()).add(about)
+            _passed.setdefault(part, set()).add(about)
 
 
 def _facts_of(part: Any) -> Facts | None:

@@ -10,10 +10,10 @@ import numpy as np
 import scipy
 
 from torchgco.maps.ways import length
+from torchgco.roadmap.cheapest import HOPS
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array, Lattice
 from torchgco.roadmap.mapped import CLOSE_UNITS, Price, Ways, even, in_one, one_of_each_class, ways_of
-from torchgco.roadmap.search import HOPS
 
 ROOMY = 4.0  # units from an obstacle within which a way costs up to double: the middle of doors up to eight units wide
 AVERAGED = 0.8  # units: the standard deviation over which the corners of a path with few of them are averaged

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import take
+from torchgco.roadmap.cheapest import Graph, TorchSearch
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.points import of_boxes
-from torchgco.roadmap.search import Graph, TorchSearch
 
 BYTES_KEPT = 2**26  # bytes of graphs and points that are kept for later searches in a scene
 

@@ -21,9 +21,9 @@ from torchgco.base.shapes import computing_on
 from torchgco.base.tree import moved, take
 from torchgco.maps.ways import length
 from torchgco.roadmap.blocks import Blocks, blocks_of, tightened_by_c
+from torchgco.roadmap.cheapest import DIVERSITY, HOPS
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.lattice import Array, Lattice, lattice_of, sampled
-from torchgco.roadmap.search import DIVERSITY, HOPS
 
 # The most cells of a search, the clearance of free ones in spacings of the nodes, and whether free ones are merged; of
 # further searches where there is no path yet. Through gaps with less clearance than the nodes are apart no trajectory

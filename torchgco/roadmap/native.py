@@ -19,9 +19,9 @@ from torchgco.native.engine import run
 from torchgco.native.includes import included, joined
 from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
+from torchgco.roadmap.cheapest import EDGE_COST, HOPS, LEAST_GAP, TIE, UNIT, Beside, Graph
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.points import CIRCLE, MIDWAY, SHELLS, directions, of_boxes
-from torchgco.roadmap.search import EDGE_COST, HOPS, LEAST_GAP, TIE, UNIT, Beside, Graph
 
 SEARCHES_AT_ONCE = 64  # problems searched together
 GROUP = 4  # of them, at least so many by each thread
@@ -33,7 +33,7 @@ C = Path(__file__).parent / "c"
 class Arguments(Structure): ...
 
 
-SEARCH_HEADER = Header((C / "search.h").read_text())
+SEARCH_HEADER = Header((C / "cheapest.h").read_text())
 SEARCH_HEADER.declare(Arguments)
 
 
@@ -137,7 +137,7 @@ def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.C
         "LANES": EDGES_AT_ONCE,
     }  # fmt: skip
     try:
-        return build(joined(defines(constants) + included("search.c"), C) + SEARCH_HEADER.layout)
+        return build(joined(defines(constants) + included("cheapest.c"), C) + SEARCH_HEADER.layout)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

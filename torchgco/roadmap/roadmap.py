@@ -2,7 +2,7 @@
 
 Points lie around every obstacle, midway between neighbours and, in a fixed low-discrepancy sequence, all over the
 scene; each is joined to a few near ones where the straight line is free. Nothing is random. The search runs in C
-(c/search.c) or, where that can't serve, in PyTorch (search.py), with the same result.
+(c/cheapest.c) or, where that can't serve, in PyTorch (cheapest.py), with the same result.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from torch import Tensor
 from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.tree import take
 from torchgco.roadmap import native
+from torchgco.roadmap.cheapest import DIVERSITY, HOPS, TorchSearch
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
 from torchgco.roadmap.mapped import paths_in_maps
 from torchgco.roadmap.native import NativeSearch
-from torchgco.roadmap.search import DIVERSITY, HOPS, TorchSearch
 
 PROBLEMS_AT_ONCE = 4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours

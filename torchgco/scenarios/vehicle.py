@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf, nan
 from typing import Annotated, Any, Literal, Self
 
@@ -50,6 +51,13 @@ class Task:
     goal: Tensor  # (B, d), m
     goal_radius: float  # m
     layouts: Layouts  # with the vehicle's own numbers where they gave none
+
+    def take(self, places: Sequence[int] | np.ndarray) -> Task:
+        """The problems at some places, ascending."""
+        rows = torch.as_tensor(places, device=self.U0.device)
+        return Task(
+            self.problem.take(rows), self.U0[rows], self.goal[rows], self.goal_radius, self.layouts.take(places)
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -208,53 +216,44 @@ class Vehicle:
             wanted = fitting(layouts.dimension, None if given is None else given.shape[1])
             raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
         whole = self.completed(layouts)
-        assert whole.vehicle_radius is not None and whole.goal_radius is not None and whole.stages is not None
-
-        def tensor(value: object) -> Tensor:
-            return torch.as_tensor(value, dtype=dtype, device=device)
-
+        assert whole.goal_radius is not None and whole.stages is not None
+        tensor = partial(torch.as_tensor, dtype=dtype, device=device)
         dynamics = self.dynamics if layouts.dt is None else replace(self.dynamics, dt=layouts.dt)  # type: ignore
         longest = int(np.max(whole.stages))
         horizon = torch.as_tensor(whole.stages, device=device) if np.ndim(whole.stages) else None
-        radius = self.body or whole.vehicle_radius
-        constraints: list[Constraint] = [
-            Spheres(
-                tensor(layouts.centers),
-                tensor(layouts.radii),
-                radius,
-                None if layouts.velocities is None else tensor(layouts.velocities),
-            ),
-            ControlBounds(
-                tensor(_given(layouts.control_lower, self.limits("control_lower"))),
-                tensor(_given(layouts.control_upper, self.limits("control_upper"))),
-            ),
-        ]
+        gates, legs = gates_of(layouts, longest)
+        constraints = self._constraints(whole, tensor)
+        constraints += [] if gates is None else [replace(gates, centers=tensor(gates.centers))]
+        time, start, goal = free_time(layouts, legs), tensor(whole.start), tensor(whole.goal)
+        rest, moving = (1.0, 1.0) if time is None else (0.0, BESIDE_TIME * dynamics.dt)
+        at_rest = tensor(list(self.control_reference))
+        cost = QuadraticCost(
+            Q=rest * tensor(list(self.state_weight)), R=moving * tensor(list(self.control_weight)),
+            Qf=rest * tensor(list(self.terminal_weight)), x_ref=goal.unsqueeze(1), u_ref=at_rest,
+        )  # fmt: skip
+        center = goal[:, dynamics.position]
+        binds = time is not None or layouts.goal_required is True
+        end = self._required(goal, center, whole.goal_radius) if binds else Goal(center, whole.goal_radius)
+        problem = Problem(dynamics, cost, constraints, start, longest, end, horizon, time=time)
+        return Task(
+            problem, at_rest.expand(layouts.count, longest, -1).contiguous(), center, whole.goal_radius, whole
+        )  # fmt: skip
+
+    def _constraints(self, layouts: Layouts, tensor: Callable[[Any], Tensor]) -> list[Constraint]:
+        """Obstacles and bounds of completed layouts, but for gates; `tensor` makes what they are made of."""
+        assert layouts.vehicle_radius is not None
+        radius, optional = self.body or layouts.vehicle_radius, lambda value: None if value is None else tensor(value)
+        spheres = tensor(layouts.centers), tensor(layouts.radii), radius, optional(layouts.velocities)
+        bounds = (tensor(_given(getattr(layouts, name), self.limits(name))) for name in CONTROL_LIMITS)
+        constraints: list[Constraint] = [Spheres(*spheres), ControlBounds(*bounds)]
         if layouts.box_centers is not None:
-            turns, radii = (
-                None if value is None else tensor(value) for value in (layouts.box_rotations, layouts.box_radii)
-            )
-            boxes = Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, radii)
+            turns, rounding = optional(layouts.box_rotations), optional(layouts.box_radii)
+            boxes = Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, rounding)
             sines = [getattr(layouts, name) for name in SINES]
             constraints.append(boxes if sines[0] is None else OscillatingBoxes(boxes, *map(tensor, sines)))
         if layouts.map is not None:
             constraints.append(Field(layouts.map, radius))
-        constraints += self._state_bounds
-        gates, legs = gates_of(layouts, longest)
-        constraints += [] if gates is None else [replace(gates, centers=tensor(gates.centers))]
-        time = free_time(layouts, legs)
-        rest, moving = (1.0, 1.0) if time is None else (0.0, BESIDE_TIME * dynamics.dt)
-        cost = QuadraticCost(
-            Q=rest * tensor(list(self.state_weight)), R=moving * tensor(list(self.control_weight)),
-            Qf=rest * tensor(list(self.terminal_weight)), x_ref=tensor(whole.goal).unsqueeze(1),
-            u_ref=tensor(list(self.control_reference)),
-        )  # fmt: skip
-        goal, goal_radius = tensor(whole.goal), whole.goal_radius
-        center = goal[:, dynamics.position]
-        binds = time is not None or layouts.goal_required is True
-        end = self._required(goal, center, goal_radius) if binds else Goal(center, goal_radius)
-        problem = Problem(dynamics, cost, constraints, tensor(whole.start), longest, end, horizon, time=time)
-        U0 = tensor(list(self.control_reference)).expand(layouts.count, longest, -1).contiguous()
-        return Task(problem, U0, center, goal_radius, whole)
+        return constraints + self._state_bounds
 
     @property
     def _state_bounds(self) -> list[StateBounds]:

@@ -25,4 +25,5 @@ from torchgco.search.steps import IntoGoal as IntoGoal
 from torchgco.search.steps import Solve as Solve
 from torchgco.search.table import Passes as Passes
 from torchgco.search.table import Row as Row
+from torchgco.search.timed import Timed as Timed
 from torchgco.search.tube import Tube as Tube

@@ -16,7 +16,17 @@ from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Progress
+from torchgco.solvers.ending import fails_between
 from torchgco.solvers.history import Recorder
+
+
+def is_sound(problem: Problem, one: Iterate, limit: float) -> Tensor:
+    """Whether trajectories are feasible, between the knots too, (B,) bool; `limit`: violation at the knots."""
+    sound = one.violation <= limit
+    rows = sound.nonzero().flatten()
+    if rows.numel() > 0:
+        sound[rows] = ~fails_between(problem.take(rows), one.X[rows], one.U[rows])
+    return sound
 
 
 class Best:
@@ -28,7 +38,7 @@ class Best:
         self.call, self.solver, self.recorder = call, solver, recorder
         self.end = copied(first)
         self.worked = torch.ones_like(call.ids, dtype=torch.bool)  # (B,): on which problems the present pass has
-        self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that a cheaper one has replaced
+        self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that one in contact has replaced
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
         self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced
 
@@ -68,12 +78,9 @@ class Best:
         self.replace(rows, preferred, new.best, new)
 
     def _spare(self, problem: Problem, rows: Tensor, preferred: Tensor, old: SolveEnd, new: SolveEnd) -> None:
-        """Remember those of two trajectories that lose by their cost alone to one that touches between two knots."""
+        """Remember those of two feasible trajectories that lose to one that touches between two knots."""
         limit = self.solver.violation_tolerance
         fits = (old.best.violation <= limit) & (new.best.violation <= limit)
-        if not bool(fits.any()):
-            return
-        fits &= arrive_alike(problem, new.best.X, old.best.X)
         if not bool(fits.any()):
             return
         chosen = preferred.view(-1, 1, 1)
@@ -85,21 +92,38 @@ class Best:
             if not bool(fits.any()):
                 return
         for at in fits.nonzero().flatten():
+            part, row = problem.take(at.unsqueeze(0)), int(rows[at])
             one = take(old if bool(preferred[at]) else new, at.unsqueeze(0))
-            kept = self.spare.setdefault(int(rows[at]), one)
-            if bool(one.best.cost < kept.best.cost):
-                self.spare[int(rows[at])] = one
+            kept = self.spare.get(row)
+            if kept is None or bool(is_preferred(part, one.best, kept.best, limit)):
+                self.spare[row] = one
 
     def restore(self, rows: Tensor, touching: Tensor) -> None:
-        """Take back the clear trajectories that cheaper ones of `rows` have replaced.
+        """Take back the clear trajectories that ones of `rows` have replaced that were better only by their cost.
 
         That is where these are still `touching` an obstacle, (b,) bool, or have become more expensive by keeping clear.
         """
         for row, touches in zip(rows.tolist(), touching.tolist(), strict=True):
-            one = self.spare.pop(row, None)
-            if one is not None and (touches or bool(one.best.cost < self.end.best.cost[row])):
-                put(self.end.best, rows.new_tensor([row]), one.best)
-                self.end.status[row] = one.status
+            one, at = self.spare.get(row), rows.new_tensor([row])
+            if one is None or not bool(arrive_alike(self.call.problem.take(at), one.best.X, self.end.best.X[at])):
+                continue
+            if touches or bool(one.best.cost < self.end.best.cost[row]):
+                self._take_back(row)
+
+    def settle(self) -> None:
+        """Take back the clear trajectories that others have replaced which aren't feasible between the knots."""
+        rows = torch.tensor(sorted(self.spare), dtype=torch.int64, device=self.call.ids.device)
+        if rows.numel() > 0:
+            sound = is_sound(self.call.problem.take(rows), take(self.end.best, rows), self.solver.violation_tolerance)
+            for row in rows[~sound].tolist():
+                self._take_back(row)
+
+    def _take_back(self, row: int) -> None:
+        """Put the spare trajectory of a problem in the place of its best one."""
+        one = self.spare.pop(row)
+        self._arrived.clear()
+        put(self.end.best, self.end.status.new_tensor([row]), one.best)
+        self.end.status[row] = one.status
 
     def replace(self, rows: Tensor, where: Tensor, trajectories: Iterate, new: SolveEnd) -> None:
         """New trajectories of `rows` where a mask (b,) says so, and the counts of their solves."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.base.options import Count
 from torchgco.base.status import is_over
-from torchgco.base.tree import take
+from torchgco.base.tree import put, take
 from torchgco.kernels import measured, path_clearance
 from torchgco.lagrangian.quality import leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -139,6 +139,26 @@ def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) ->
         clearance[rows] = torch.where(serves, now[rows], clearance[rows])
         rows = rows[clearance[rows] < 0]
     return touching, clearance[touching] < 0
+
+
+def clear_further(search: Search, call: Call, end: SolveEnd) -> None:
+    """The interior point goes on among larger obstacles where solves of a call have ended in contact between knots.
+
+    Args:
+        end: how they have ended; the trajectories that are clearer take their places in it.
+    """
+    solver, limit = replace(search.interior, warm_barrier=GROWN_BARRIER), search.solver.violation_tolerance
+
+    def once(rows: Tensor, larger: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
+        new = continued(solver, larger, old)
+        serves, found, clearance = serving(call.problem.take(rows), new.best, old, least, limit)
+        chosen = serves.nonzero().flatten()
+        put(end.best, rows[chosen], take(found, chosen))
+        end.status[rows[chosen]] = new.status[chosen]
+        end.iterations[rows] += new.iterations
+        return serves, clearance
+
+    cleared(call, end.best, ClearChords().rounds, limit, once)
 
 
 def serving(

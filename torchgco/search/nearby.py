@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -124,12 +124,12 @@ def _filled(part: Constraint, at: Tensor) -> Tensor:
 
 def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
     """The problems with fewer obstacles, which share kernels and the scale of the cost: neither depends on these."""
-    other = problem._with({"constraints": constraints}, known=replace(problem.known, row_shapes=None, interior=None))
-    object.__setattr__(other, "cost_scale", cost_scale(problem))
-    known = vars(problem).get("start_is_clear")
-    if known is not None and bool(known.all()):  # then it is clear of fewer, too
-        object.__setattr__(other, "start_is_clear", known)
-    return other
+    derived: dict[str, Any] = {"cost_scale": cost_scale(problem)}
+    clear = problem.derived.get("start_is_clear")
+    if clear is not None and bool(clear.all()):  # then it is clear of fewer, too
+        derived["start_is_clear"] = clear
+    known = replace(problem.known, row_shapes=None, interior=None)
+    return problem._with({"constraints": constraints}, known, derived)
 
 
 def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:

@@ -16,13 +16,13 @@ from torch import Tensor
 from torchgco.kernels import open_loop
 from torchgco.maps.ways import length
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.cheapest import HOPS
 from torchgco.roadmap.clear import clear_ways, evenly, smoothed
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.mapped import even
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import around_body
-from torchgco.roadmap.search import HOPS
 from torchgco.search.candidates import Candidates
 from torchgco.search.following import Paths
 from torchgco.search.proposals import Part

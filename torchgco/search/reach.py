@@ -179,6 +179,14 @@ def limit_of(problem: Problem, climbs: int = 0) -> Limit | None:
     return Limit(step, push) if bool(torch.isfinite(torch.minimum(step, push)).any()) else None
 
 
+def push_of(problem: Problem) -> Tensor:
+    """The largest increase of the speed, (B,), m/s^2, also where speeds are bounded; infinite where none is."""
+    box = _Box.of(problem)
+    if box is None or not problem.dynamics.is_integrated:
+        return torch.full_like(problem.x0[:, 0], torch.inf)
+    return _strongest(problem, box, 0)
+
+
 class _Box(NamedTuple):
     """Where states and controls are looked at."""
 

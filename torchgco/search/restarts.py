@@ -25,11 +25,13 @@ from torchgco.search.proposals import PathProposals
 from torchgco.search.reach import Horizon, horizon_of
 from torchgco.search.rows import Tighten
 from torchgco.search.search import Late, Search
+from torchgco.search.settled import settle
 from torchgco.search.starts import Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.suitability import suited_paths
 from torchgco.search.table import Passes, Row, passes_of
 from torchgco.search.through_gates import solved_through_gates
+from torchgco.search.timed import Timed
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
@@ -154,7 +156,8 @@ class Restarts(Solver):
         solver = self.local
         session = Session(call, solver.inner.as_printed, record=solver.record)
         passes, guidance = self._suited(session.call.problem)
-        again = partial(self._ended, passes, guidance)
+        # Among what moves a goal is sought, required or not: where there is no way, there is none again.
+        again = partial(self._ended, [None if isinstance(one, Timed) else one for one in passes], guidance)
         search = Search(session.call, solver, passes, guidance, self.interior, session.recorder, again)
         self._run(search, passes)
         end = search.best.end
@@ -172,15 +175,22 @@ class Restarts(Solver):
         return search.best.end
 
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
-        """All passes, until the time is over."""
+        """All passes, until the time is over; and in the last, what was sound before it is looked at again."""
+        begun: tuple[int, str] | None = None
         for number, (name, one) in enumerate(zip(self.passes.names, passes, strict=True), start=1):
             if search.begun and search.call.late:
-                return
-            search.next_pass(number, name)
+                break
+            if begun is not None:
+                search.end_pass(*begun)
+            begun = number, name
+            search.next_pass(*begun)
             with suppress(Late):
                 if one is not None:
                     one.run(search)
-            search.end_pass(number, name)
+        if self._finishes:
+            settle(search, next((one for one in self.passes.steps if isinstance(one, ClearChords)), None))
+        if begun is not None:
+            search.end_pass(*begun)
 
     def _suited(self, problem: Problem) -> tuple[Sequence[Row | None], Guidance | None]:
         """The passes, None for those that can't serve these problems, and the guidance, None where it can't.

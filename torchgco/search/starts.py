@@ -11,13 +11,13 @@ from torch import Tensor
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive
 from torchgco.base.status import STOPPED, UNMOVED, Status, is_over
-from torchgco.base.tree import put, take
+from torchgco.base.tree import take
 from torchgco.kernels import measured, open_loop, path_clearance
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived, outside_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
-from torchgco.search.chords import GROWN_BARRIER, ClearChords, cleared, serving
+from torchgco.search.chords import clear_further
 from torchgco.search.converge import Converge, continued, keep_clear, keep_tight, solved_nearby
 from torchgco.search.reach import beyond_reach
 from torchgco.search.search import Search
@@ -111,25 +111,9 @@ class Starts(Row):
         call = replace(search.call.take(each), callback=None, warm=None)
         X, U = self._guess(call, take(search.best.end.best, each), start)
         end = solved_nearby(search.interior, replace(call, U0=U), X)
-        self._clear(search, call, end)
+        clear_further(search, call, end)
         for number in range(self.count):
             keep_tight(search, rows, take(end, slice(number, None, self.count)))
-
-    @staticmethod
-    def _clear(search: Search, call: Call, end: SolveEnd) -> None:
-        """The interior point goes on among larger obstacles where results touch one between two knots."""
-        solver, limit = replace(search.interior, warm_barrier=GROWN_BARRIER), search.solver.violation_tolerance
-
-        def once(rows: Tensor, larger: Call, old: Iterate, least: Tensor) -> tuple[Tensor, Tensor]:
-            new = continued(solver, larger, old)
-            serves, found, clearance = serving(call.problem.take(rows), new.best, old, least, limit)
-            chosen = serves.nonzero().flatten()
-            put(end.best, rows[chosen], take(found, chosen))
-            end.status[rows[chosen]] = new.status[chosen]
-            end.iterations[rows] += new.iterations
-            return serves, clearance
-
-        cleared(call, end.best, ClearChords().rounds, limit, once)
 
     def _guess(self, call: Call, best: Iterate, start: Tensor) -> tuple[Tensor, Tensor]:
         """States (b, N+1, n) and controls (b, N, m) to begin with, for starts of the numbers (b,)."""

@@ -68,14 +68,14 @@ def _captures(problem: Problem) -> bool:
     """Whether values of users' functions lead to tensors that ask for gradients, as those of the first problem show."""
     if not any(map(is_users, (problem.dynamics, problem.cost, *problem.constraints))):
         return False
-    one = problem.take(slice(0, 1))
-    X, U = (part.detach() for part in one.at_rest)
+    single = problem.take(slice(0, 1))
+    X, U = (z.detach() for z in single.at_rest)
     uses: list[tuple[object, Callable[[], Tensor]]] = [
-        (one.dynamics, lambda: one.along.step(X[:, :-1], U)),
-        (one.cost, lambda: one.cost.total(X, U)),
-        *((part, lambda part=part: part.value(X, U)) for part in one.constraints),
+        (single.dynamics, lambda: single.along.step(X[:, :-1], U)),
+        (single.cost, lambda: single.cost.total(X, U)),
+        *((row, lambda row=row: row.value(X, U)) for row in single.constraints),
     ]
-    with computing_on(one.x0.device), recording():  # a user's function may make tensors, too
+    with computing_on(single.x0.device), recording():  # a user's function may make tensors, too
         return any(is_users(part) and asks(value()) for part, value in uses)
 
 
@@ -97,84 +97,84 @@ def attached(
     checks = not torch.is_inference_mode_enabled()  # where nothing can be recorded, to know the step that is left
     account = solution.account.smoothed(smoothing) if solution.account is not None and smoothing else solution.account
     known = {"trace": solution.trace, "search": solution.search, "account": account, "reason": points.reason}
-    found = replace(points.solution, **known)
+    result = replace(points.solution, **known)
     rows = (points.reason == Why.DIFFERENTIABLE).nonzero().flatten()
     if not checks or (rows.numel() == 0 and not records):
-        return for_user(problem, found, solution.K)
+        return for_user(problem, result, solution.K)
     with recording():
-        at = points.take(rows)
+        subset = points.take(rows)
         try:  # where no problem is left, gradients are those of none: 0
-            live = _live(asked, at, rows)
-            found_at = residual(live, at.solution.X, at.solution.U, at.costates, at.lam)
+            live = _live(asked, subset, rows)
+            found_at = residual(live, subset.solution.X, subset.solution.U, subset.costates, subset.lam)
         except MISTAKES:
             if rows.numel() > 0:
                 raise
-            return for_user(problem, _constant(found), solution.K)  # a user's function that takes no empty batch
-        near = _are_exact(at, found_at)
+            return for_user(problem, _constant(result), solution.K)  # a user's function that takes no empty batch
+        near = _are_exact(subset, found_at)
         if not bool(near.all()):
             points.reason[rows[~near]] = int(Why.NOT_STATIONARY)
-            rows, at, found_at = rows[near], at.take(near.nonzero().flatten()), found_at.take(near)
+            rows, subset, found_at = rows[near], subset.take(near.nonzero().flatten()), found_at.take(near)
             live = live.take(near.nonzero().flatten())
         if records:
-            found = _with_values(found, rows, _values(live, at, found_at))
-        return for_user(problem, found, solution.K)
+            result = _with_values(result, rows, _values(live, subset, found_at))
+        return for_user(problem, result, solution.K)
 
 
-def _constant(found: Solution) -> Solution:
+def _constant(solution: Solution) -> Solution:
     """The solution of functions that take no empty batch: losses of it can be differentiated, by no other tensor."""
-    lam = tuple(part.requires_grad_() for part in found.multipliers.lam)
-    for part in (found.X, found.U, found.cost):
-        part.requires_grad_()
-    return replace(found, multipliers=Multipliers(lam, found.multipliers.mu))
+    lam = tuple(z.requires_grad_() for z in solution.multipliers.lam)
+    for z in (solution.X, solution.U, solution.cost):
+        z.requires_grad_()
+    return replace(solution, multipliers=Multipliers(lam, solution.multipliers.mu))
 
 
-def _live(problem: Problem, at: Points, rows: Tensor) -> Problem:
+def _live(problem: Problem, points: Points, rows: Tensor) -> Problem:
     """The problems `rows` with gradients recorded, and obstacles grown as at their points."""
     live = for_solvers(problem.recorded()).take(rows)
-    return live.grown(at.growth) if bool((at.growth > 0).any()) else live
+    return live.grown(points.growth) if bool((points.growth > 0).any()) else live
 
 
 def _are_exact(at: Points, of: Residual) -> Tensor:
     """Whether the step (B,) from the points to where the conditions hold to first order is small, and a number."""
     with not_recording():
         c = of.rows if at.gap is None else of.rows + at.gap
-        x, u, y, _ = (part[0].abs() for part in _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None]))
+        x, u, y, _ = (z[0].abs() for z in _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None]))
         size = 1.0 + torch.maximum(at.solution.X.abs().flatten(1).amax(-1), at.solution.U.abs().flatten(1).amax(-1))
         step = torch.maximum(x.flatten(1).amax(-1), u.flatten(1).amax(-1))
         largest = at.costates.abs().flatten(1).amax(-1)
         return (step <= EXACT_STEP * size) & (y.flatten(1).amax(-1) <= EXACT_COSTATES * largest)
 
 
-def _system(at: Points) -> System:
-    found = at.solution
-    problem = at.problem
+def _system(points: Points) -> System:
+    end = points.solution
+    problem = points.problem
     if problem.cost.kernel == "quadratic":
         # Its numbers may be the user's own tensors, which a step of an optimizer changes before `backward`.
         problem = problem._with({"cost": copied(problem.cost)}, problem.known)
-    return System(problem, found.X, found.U, found.multipliers.lam, at.active, at.give, gains_of(problem, found))
+    return System(problem, end.X, end.U, end.multipliers.lam, points.active, points.give, gains_of(problem, end))
 
 
-def _values(live: Problem, at: Points, of: Residual) -> tuple[Tensor, ...]:
+def _values(live: Problem, points: Points, of: Residual) -> tuple[Tensor, ...]:
     """X, U, multipliers (B, R) and costs of the points, which lead to the residual of their problems `live`."""
-    found, multipliers = at.solution, at.solution.multipliers.lam
-    flat = torch.cat([found.X.new_zeros(len(found), 0), *(lam.flatten(1) for lam in multipliers)], dim=1)
-    values = found.X, found.U, flat, found.cost
-    X, U, lam, cost = Solved.apply(_system(at), values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
+    solution, multipliers = points.solution, points.solution.multipliers.lam
+    flat = torch.cat([solution.X.new_zeros(len(solution), 0), *(lam.flatten(1) for lam in multipliers)], dim=1)
+    values = solution.X, solution.U, flat, solution.cost
+    X, U, lam, cost = Solved.apply(_system(points), values, of.x, of.u, of.gaps, of.rows, of.lagrangian)
     start = of.start if live.free_start is None else torch.where(live.free_start, X[:, 0], of.start)
     X = torch.cat((start.unsqueeze(1), X[:, 1:]), dim=1)
-    if at.give is not None and len(found) > 0:
+    if points.give is not None and len(solution) > 0:
         cost = live.cost.total(X, U)  # no minimum of the cost, so no envelope
     return X, U, lam, cost
 
 
-def _with_values(found: Solution, rows: Tensor, values: tuple[Tensor, ...]) -> Solution:
+def _with_values(whole: Solution, rows: Tensor, values: tuple[Tensor, ...]) -> Solution:
     """The solution with these in its problems `rows`."""
     X, U, lam, cost = values
-    held, parts = found.multipliers.lam, lam.split([old[0].numel() for old in found.multipliers.lam], dim=1)
-    multipliers = tuple(_written(old, rows, new.view(-1, *old.shape[1:])) for old, new in zip(held, parts, strict=True))
+    lams, parts = whole.multipliers.lam, lam.split([old[0].numel() for old in whole.multipliers.lam], dim=1)
+    multipliers = tuple(_written(old, rows, new.view(-1, *old.shape[1:])) for old, new in zip(lams, parts, strict=True))
     return replace(
-        found, X=_written(found.X, rows, X), U=_written(found.U, rows, U), cost=_written(found.cost, rows, cost),
-        multipliers=Multipliers(multipliers, found.multipliers.mu),
+        whole, X=_written(whole.X, rows, X), U=_written(whole.U, rows, U), cost=_written(whole.cost, rows, cost),
+        multipliers=Multipliers(multipliers, whole.multipliers.mu),
     )  # fmt: skip
 
 
@@ -197,16 +197,16 @@ def for_systems(problem: Problem, solution: Solution) -> tuple[Problem, Solution
     return whole, replace(solution, X=X.contiguous(), U=U.contiguous(), multipliers=multipliers)
 
 
-def for_user(problem: Problem, found: Solution, K: Tensor) -> Solution:
+def for_user(problem: Problem, solution: Solution, K: Tensor) -> Solution:
     """The same solution in the user's states and controls, with the times where these are free; gradients go along.
 
     Args:
         problem: the user's.
         K: its gains.
     """
-    if found.X.shape[-1] == problem.n and problem.time is None:
-        return found
-    lam = found.multipliers.lam[: len(problem.constraints)]
-    parts = {"X": found.X[..., : problem.n], "U": found.U[..., : problem.m], "K": K}
-    times = None if problem.time is None else times_of(problem, factors_in(problem, found.X))
-    return replace(found, **parts, multipliers=Multipliers(lam, found.multipliers.mu), times=times)
+    if solution.X.shape[-1] == problem.n and problem.time is None:
+        return solution
+    lam = solution.multipliers.lam[: len(problem.constraints)]
+    parts = {"X": solution.X[..., : problem.n], "U": solution.U[..., : problem.m], "K": K}
+    times = None if problem.time is None else times_of(problem, factors_in(problem, solution.X))
+    return replace(solution, **parts, multipliers=Multipliers(lam, solution.multipliers.mu), times=times)

@@ -40,15 +40,15 @@ class System:
         """`solve` of one right hand side, or of all those that `is_grads_batched` and `vectorize` hide in one."""
         parts = [x, u, torch.zeros_like(x[:, 1:]) if gaps is None else gaps, rows]
         if not any(map(is_legacy_batchedtensor, parts)):
-            return tuple(part[0] for part in self.solve(*(part.unsqueeze(0) for part in parts)))
+            return tuple(z[0] for z in self.solve(*(z.unsqueeze(0) for z in parts)))
         level = torch._C._vmapmode_increment_nesting() - 1
         torch._C._vmapmode_decrement_nesting()
-        hidden = next(part for part in parts if is_legacy_batchedtensor(part))
+        hidden = next(z for z in parts if is_legacy_batchedtensor(z))
         count = _remove_batch_dim(hidden, level, 1, 0).shape[0]
-        plain = [_remove_batch_dim(part, level, count, 0) for part in parts]
+        plain = [_remove_batch_dim(z, level, count, 0) for z in parts]
         if any(map(is_legacy_batchedtensor, plain)):
             raise RuntimeError("solutions: one `vectorize` or `is_grads_batched` within another isn't served")
-        return tuple(_add_batch_dim(part, 0, level) for part in self.solve(*plain))
+        return tuple(_add_batch_dim(z, 0, level) for z in self.solve(*plain))
 
     def solve(self, x: Tensor, u: Tensor, gaps: Tensor | None, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """-K^-1 of right hand sides x (C, B, N+1, n), u (C, B, N, m), gaps (C, B, N, n), rows (C, B, R); as these."""
@@ -60,8 +60,8 @@ class System:
             a = torch.cat((x, torch.nn.functional.pad(u, (0, 0, 0, 1))), dim=-1)
             right = RightSides(a, gaps, rows)
             point = self.X, self.U, self.multipliers, self.active
-            found = interior_of(self.problem).kkt(self.problem, *point, right, self.give, self.K)
-        return found.z[..., :n], found.z[:, :, :-1, n:], found.y, found.v
+            step = interior_of(self.problem).kkt(self.problem, *point, right, self.give, self.K)
+        return step.z[..., :n], step.z[:, :, :-1, n:], step.y, step.v
 
 
 class Solved(torch.autograd.Function):
@@ -128,19 +128,19 @@ class Adjoint(Last):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.system, ctx.parts = inputs[0], [torch.empty_like(part, device="meta") for part in inputs[5:]]
+        ctx.system, ctx.parts = inputs[0], [torch.empty_like(z, device="meta") for z in inputs[5:]]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, x: Tensor, u: Tensor, gaps: Tensor, rows: Tensor, cost: Tensor) -> tuple[Any, ...]:
         X, U, _, lam = ctx.system.once(x, u, gaps, rows)
-        return None, X, U, lam, cost.clone(), *(torch.zeros_like(part, device=x.device) for part in ctx.parts)
+        return None, X, U, lam, cost.clone(), *(torch.zeros_like(z, device=x.device) for z in ctx.parts)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], system: System, *given: Tensor) -> tuple[Any, Any]:
+    def vmap(info: Any, in_dims: tuple[Any, ...], system: System, *arguments: Tensor) -> tuple[Any, Any]:
         X, U, lam, cost = (
-            part.expand(info.batch_size, *part.shape) if dim is None else part.movedim(dim, 0)
-            for part, dim in zip(given[:4], in_dims[1:5], strict=True)
+            z.expand(info.batch_size, *z.shape) if dim is None else z.movedim(dim, 0)
+            for z, dim in zip(arguments[:4], in_dims[1:5], strict=True)
         )
         return (*system.solve(X, U, None, lam), cost.clone()), (0,) * 5
 
@@ -152,4 +152,4 @@ class Fixed(Last):
 
     @staticmethod
     def forward(*parts: Tensor) -> tuple[Tensor, ...]:
-        return tuple(part.view_as(part) for part in parts)
+        return tuple(z.view_as(z) for z in parts)

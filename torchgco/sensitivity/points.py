@@ -65,7 +65,7 @@ class Points:
     @property
     def lam(self) -> Tensor:
         """Multipliers of the rows that hold, 0 of others, (B, R)."""
-        flat = [part.flatten(1) for part in self.solution.multipliers.lam]
+        flat = [lam.flatten(1) for lam in self.solution.multipliers.lam]
         return torch.where(self.active, torch.cat([self.growth.new_zeros(len(self.growth), 0), *flat], dim=1), 0.0)
 
     def take(self, rows: Tensor) -> Points:
@@ -96,35 +96,35 @@ def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> P
         (active, untold), give, gap = rows_that_hold(problem, result), None, None
         weak = (untold.any(-1) & (reason == Why.DIFFERENTIABLE)).nonzero().flatten()
         reason[weak] = _weakness(problem.take(weak), result.take(weak), active[weak], untold[weak])
-    found = solve_at(problem, result, active, probe(problem, active), give)
-    for where, why in ((~(found.left.amax(0) <= LEFT_OPEN), Why.DEPENDENT_ROWS), (~found.definite, Why.NOT_STRICT)):
+    kkt = solve_at(problem, result, active, probe(problem, active), give)
+    for where, why in ((~(kkt.left.amax(0) <= LEFT_OPEN), Why.DEPENDENT_ROWS), (~kkt.definite, Why.NOT_STRICT)):
         reason[where & (reason == Why.DIFFERENTIABLE)] = int(why)
-    return Points(result, problem, growth, active, found.costates, reason, give, gap)
+    return Points(result, problem, growth, active, kkt.costates, reason, give, gap)
 
 
 def _polish(problem: Problem, rows: Tensor, growth: Tensor, result: Solution, reason: Tensor, smoothing: float) -> None:
     """Polish the solutions of the problems `rows`, with obstacles grown by `growth` (B,), in place; and say why not."""
     if rows.numel() == 0:
         return
-    part, old, by = problem.take(rows), result.take(rows), growth[rows]
-    asked = part.grown(by) if bool((by > 0).any()) else part
+    subset, old, by = problem.take(rows), result.take(rows), growth[rows]
+    asked = subset.grown(by) if bool((by > 0).any()) else subset
     call = replace(Call.checked(asked, old.U, warm=old.multipliers), X0=old.X)
     end = POLISH.solved(call, smoothing=smoothing)
     new = Session(call, own_units=True).trajectories(end)
     stays = torch.maximum(_moved(new.X, old.X), _moved(new.U, old.U)) <= STATIONARY_MOVE
     stays = end.status == SOLVED if smoothing > 0 else stays
-    stays &= ~(chord_clearance(part, new.X) < chord_clearance(part, old.X).clamp(max=0.0))
-    leaves = (stays | (end.status == SOLVED)) & leaves_goal(part, new.X, old.X)
+    stays &= ~(chord_clearance(subset, new.X) < chord_clearance(subset, old.X).clamp(max=0.0))
+    leaves = (stays | (end.status == SOLVED)) & leaves_goal(subset, new.X, old.X)
     why = torch.where(stays, int(Why.DIFFERENTIABLE), int(Why.NOT_SMOOTHED if smoothing > 0 else Why.MOVED))
     reason[rows] = torch.where(leaves, int(Why.LEAVES_GOAL), why)
     kept = (reason[rows] == Why.DIFFERENTIABLE).nonzero().flatten()
     if kept.numel() > 0:
         best = take(new, kept)
-        worst, more = measured(part.take(kept), best.X, best.U), old.iterations[kept] + end.iterations[kept]
+        worst, more = measured(subset.take(kept), best.X, best.U), old.iterations[kept] + end.iterations[kept]
         parts = {"X": best.X, "U": best.U, "multipliers": best.multipliers, "cost": best.cost}
         if smoothing > 0:  # constraints hold, but it is another cost that can't be improved
             status = torch.full_like(more, int(Status.FEASIBLE))
-            parts["status"] = judged_between(part.take(kept), best.X, best.U, status)
+            parts["status"] = judged_between(subset.take(kept), best.X, best.U, status)
         put(result, rows[kept], replace(old.take(kept), **parts, violation=worst, iterations=more))
 
 
@@ -136,8 +136,8 @@ def _moved(new: Tensor, old: Tensor) -> Tensor:
 def clearance(problem: Problem, X: Tensor) -> Tensor:
     """The smallest distance (B,) at the knots from obstacles, m; infinite without any."""
     least = torch.full_like(X[:, 0, 0], torch.inf)
-    for part in problem.obstacles:
-        apart = part.distances(X)
+    for obstacle in problem.obstacles:
+        apart = obstacle.distances(X)
         if apart[0].numel() > 0:
             least = torch.minimum(least, apart.flatten(1).amin(-1))
     return least
@@ -147,9 +147,9 @@ def rows_that_hold(problem: Problem, solution: Solution) -> tuple[Tensor, Tensor
     """Which rows hold as equalities, and of which inequalities that isn't known, (B, R) bool."""
     unit, none = cost_unit(problem).view(-1, 1, 1), torch.zeros_like(solution.status, dtype=torch.bool)[:, None][:, :0]
     hold, untold = [none], [none]
-    for part, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
-        slack, pushes = -part.value(solution.X, solution.U), lam / unit
-        equal = torch.full_like(slack, part.sense == "equality", dtype=torch.bool)
+    for constraint, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
+        slack, pushes = -constraint.value(solution.X, solution.U), lam / unit
+        equal = torch.full_like(slack, constraint.sense == "equality", dtype=torch.bool)
         ratio = pushes.abs() / slack.abs()
         hold.append((equal | (pushes > slack)).flatten(1))
         untold.append((~equal & (ratio > 1.0 / TOLD) & (ratio < TOLD)).flatten(1))
@@ -163,8 +163,8 @@ def _rows_in_barrier(problem: Problem, solution: Solution, mu: float) -> tuple[T
     """
     none = solution.cost.new_zeros(len(solution.cost), 0)
     active, give, gap = [none.bool()], [none], [none]
-    for part, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
-        slack, equal = -part.value(solution.X, solution.U), part.sense == "equality"
+    for constraint, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
+        slack, equal = -constraint.value(solution.X, solution.U), constraint.sense == "equality"
         inside = (slack * lam > 0.5 * mu) & (not equal)
         active.append((inside | (lam > 0) | equal).flatten(1))
         give.append(torch.where(inside, slack / lam, 0.0).flatten(1))

@@ -58,13 +58,13 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
     if current_problem(before) is not before:
         expected = "another problem: numbers of the one that was solved have been changed in place"
         raise InputError("changed", expected, "the changed one itself")
-    for one in (before, changed):
-        refuse_forms(one, "a prediction")
-        if for_solvers(one) is not one:
+    for each in (before, changed):
+        refuse_forms(each, "a prediction")
+        if for_solvers(each) is not each:
             expected = "a problem with one horizon, a fixed time and no rows of two knots, for a prediction"
-            got = "rows of two knots" if one.time is None else "a free time"
-            raise InputError("problem", expected, got if one.horizon is None else "horizons per problem")
-    was, now = ((one.B, one.N, one.n, one.m, one.row_shapes) for one in (before, changed))
+            got = "rows of two knots" if each.time is None else "a free time"
+            raise InputError("problem", expected, got if each.horizon is None else "horizons per problem")
+    was, now = ((each.B, each.N, each.n, each.m, each.row_shapes) for each in (before, changed))
     if was != now:
         raise InputError("changed", f"a problem with B, N, n, m, rows as before, {was}", now)
     with torch.no_grad(), computing_on(changed.x0.device):
@@ -74,24 +74,22 @@ def predicted(solution: Solution, changed: Problem, problem: Problem | None = No
         return _stepped(changed, points, of)
 
 
-def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:
+def _stepped(problem: Problem, points: Points, of: Residual) -> Solution:
     """The points one step further."""
-    old, holds = at.solution, at.reason == Why.DIFFERENTIABLE
-    system = System(at.problem, old.X, old.U, old.multipliers.lam, at.active, K=gains_of(at.problem, old))
-    x, u, _, v = (
-        part[0].detach() for part in system.solve(*(z.detach()[None] for z in (of.x, of.u, of.gaps, of.rows)))
-    )
+    old, holds = points.solution, points.reason == Why.DIFFERENTIABLE
+    system = System(points.problem, old.X, old.U, old.multipliers.lam, points.active, K=gains_of(points.problem, old))
+    x, u, _, v = (z[0].detach() for z in system.solve(*(z.detach()[None] for z in (of.x, of.u, of.gaps, of.rows))))
     holds &= torch.isfinite(x).flatten(1).all(-1) & torch.isfinite(u).flatten(1).all(-1)
     keep = holds.view(-1, 1, 1)
     moved = old.X + torch.where(keep, x, 0.0)
     X = torch.cat((problem.start_in(moved[:, 0]).unsqueeze(1), moved[:, 1:]), dim=1)
     X, U = followed(problem, X, old.U + torch.where(keep, u, 0.0), old.K)
-    lam = at.lam + torch.where(holds.unsqueeze(-1) & at.active, v, 0.0)
-    reason = torch.where(_rows_change(problem, at, X, U, lam) & holds, int(Why.ROWS_CHANGE), at.reason)
+    lam = points.lam + torch.where(holds.unsqueeze(-1) & points.active, v, 0.0)
+    reason = torch.where(_rows_change(problem, points, X, U, lam) & holds, int(Why.ROWS_CHANGE), points.reason)
     worst = measured(problem, X, U)
     status = torch.where(worst <= ADMITTED, int(Status.FEASIBLE), int(Status.INFEASIBLE))
     status = judged_between(problem, X, U, status)
-    sizes = [part[0].numel() for part in old.multipliers.lam]
+    sizes = [rows[0].numel() for rows in old.multipliers.lam]
     parts = zip(lam.split(sizes, dim=1), old.multipliers.lam, strict=True)
     none = torch.zeros_like(old.iterations)
     return replace(
@@ -101,14 +99,14 @@ def _stepped(problem: Problem, at: Points, of: Residual) -> Solution:
     )  # fmt: skip
 
 
-def _rows_change(problem: Problem, at: Points, X: Tensor, U: Tensor, lam: Tensor) -> Tensor:
+def _rows_change(problem: Problem, points: Points, X: Tensor, U: Tensor, lam: Tensor) -> Tensor:
     """Where an inequality that held pulls now, or one that didn't hold is violated, (B,) bool."""
     change, sizes = torch.zeros(problem.B, dtype=torch.bool, device=X.device), [0]
-    for part in problem.constraints:
-        c = part.value(X, U).flatten(1)
-        own = slice(sizes[-1], sizes[-1] + c.shape[1])
-        sizes.append(own.stop)
-        if part.sense == "inequality":
-            active = at.active[:, own]
-            change |= (torch.where(active, -lam[:, own], c - CROSSED) > 0).any(-1)
+    for constraint in problem.constraints:
+        c = constraint.value(X, U).flatten(1)
+        rows = slice(sizes[-1], sizes[-1] + c.shape[1])
+        sizes.append(rows.stop)
+        if constraint.sense == "inequality":
+            active = points.active[:, rows]
+            change |= (torch.where(active, -lam[:, rows], c - CROSSED) > 0).any(-1)
     return change

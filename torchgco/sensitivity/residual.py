@@ -28,7 +28,7 @@ class Residual:
 
     def take(self, rows: Tensor) -> Residual:
         """That of the problems at `rows`, places or a mask."""
-        return Residual(**{name: part[rows] for name, part in vars(self).items()})
+        return Residual(**{name: values[rows] for name, values in vars(self).items()})
 
 
 def residual(problem: Problem, X: Tensor, U: Tensor, y: Tensor, lam: Tensor) -> Residual:
@@ -42,10 +42,10 @@ def residual(problem: Problem, X: Tensor, U: Tensor, y: Tensor, lam: Tensor) -> 
         first = start if problem.free_start is None else torch.where(problem.free_start, states[:, 0], start)
         Z = torch.cat((first.unsqueeze(1), states[:, 1:]), dim=1)
         gaps = problem.along.step(Z[:, :-1], U) - Z[:, 1:]
-        rows = [part.value(Z, U).flatten(1) for part in problem.constraints]
+        rows = [constraint.value(Z, U).flatten(1) for constraint in problem.constraints]
         c = torch.cat([gaps.new_zeros(len(gaps), 0), *rows], dim=1)
         # Sums by problem, knots last: one over all axes would be split among threads by batch size.
-        held = torch.where(lam != 0, lam * c, 0.0).sum(-1)
-        lagrangian = problem.cost.total(Z, U) + (y[:, 1:] * gaps).sum(-1).sum(-1) + held
+        of_rows = torch.where(lam != 0, lam * c, 0.0).sum(-1)
+        lagrangian = problem.cost.total(Z, U) + (y[:, 1:] * gaps).sum(-1).sum(-1) + of_rows
         by_x, by_u = torch.autograd.grad(lagrangian.sum(), (states, U), create_graph=True, materialize_grads=True)
         return Residual(start, by_x, by_u, gaps, c, lagrangian)

@@ -305,8 +305,8 @@ class OuterLoop:
         if self.guidance is None or rows.numel() == 0:
             return
         problem = running.take(rows)
-        place = s.rows[rows]
-        key = DrawKey(self.call.seed, self.call.ids[place], self.call.outer[place] + s.outer[rows])
+        where = s.rows[rows]
+        key = DrawKey(self.call.seed, self.call.ids[where], self.call.outer[where] + s.outer[rows])
         advice = self.guidance.update(problem, s.X[rows], s.U[rows], take(s.penalty, rows), key)
         if advice.penalty is not None:
             if s.penalty is None:
@@ -328,18 +328,18 @@ class OuterLoop:
         taken = advice.taken.nonzero().flatten()
         if taken.numel() == 0:
             return
-        part, place, U = problem.take(taken), rows[taken], advice.U[taken]
-        X, old = open_loop(part, U), take(s.multipliers, place)
-        lam = tuple(torch.zeros_like(part) for part in old.lam)
-        unit = Lagrangian(part, Multipliers(lam, torch.ones_like(old.mu)), None, True)
-        cost, merit = value(unit, s.X[place], s.U[place])
-        needed = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
-        put(s.multipliers, place, Multipliers(lam, torch.maximum(old.mu, HOLD * needed).clamp(max=PENALTY_MAX)))
+        subset, where, U = problem.take(taken), rows[taken], advice.U[taken]
+        X, old = open_loop(subset, U), take(s.multipliers, where)
+        lam = tuple(torch.zeros_like(z) for z in old.lam)
+        unit = Lagrangian(subset, Multipliers(lam, torch.ones_like(old.mu)), None, True)
+        cost, merit = value(unit, s.X[where], s.U[where])
+        needed = (subset.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
+        put(s.multipliers, where, Multipliers(lam, torch.maximum(old.mu, HOLD * needed).clamp(max=PENALTY_MAX)))
         s.X, s.U = s.X.clone(), s.U.clone()
-        s.X[place], s.U[place] = X, U
-        s.replaced[place] = True
-        penalized = s.penalty.is_active[place] if s.penalty is not None else torch.zeros_like(taken, dtype=torch.bool)
-        s.guided[place] += ~penalized
+        s.X[where], s.U[where] = X, U
+        s.replaced[where] = True
+        penalized = s.penalty.is_active[where] if s.penalty is not None else torch.zeros_like(taken, dtype=torch.bool)
+        s.guided[where] += ~penalized
 
     def end(self, s: State, places: Tensor, status: Tensor) -> None:
         """Keep the best and the last iterate of the problems at `places` of the state."""

@@ -123,12 +123,12 @@ class Call:
 
     def take(self, index: Rows) -> Self:
         """The same call for the problems in `index`; itself for all of them in their order."""
-        part = self.problem.take(index)
-        if part is self.problem:
+        subset = self.problem.take(index)
+        if subset is self.problem:
             return self
-        held = self.U0, self.ids, self.rows, self.outer, self.warm, self.X0
-        U0, ids, rows, outer, warm, X0 = take(held, index)
-        return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline, X0)
+        values = self.U0, self.ids, self.rows, self.outer, self.warm, self.X0
+        U0, ids, rows, outer, warm, X0 = take(values, index)
+        return type(self)(subset, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline, X0)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
         """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""
@@ -218,13 +218,13 @@ class Solver(Brief, Checked):
             call = call if X0 is None else self._from_states(call, X0, problem)
             if problem.free_start is not None and bool(problem.free_start.any()) and not self.frees_start(call.problem):
                 expected = "InteriorPoint, also within gco, does"
-                held = f"free_start: the start is held at x0, as {type(self).__name__} doesn't choose it; {expected}"
-                warnings.warn(held, StartWarning, stacklevel=2)
-            found = self.run(call)
-            found = replace(found, status=judged_between(call.problem, found.X, found.U, found.status))
-            found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
-            self._check(problem, call, found)
-            return replace(found, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
+                text = f"free_start: the start is held at x0, as {type(self).__name__} doesn't choose it; {expected}"
+                warnings.warn(text, StartWarning, stacklevel=2)
+            solution = self.run(call)
+            solution = replace(solution, status=judged_between(call.problem, solution.X, solution.U, solution.status))
+            solution = solution if whole is problem else solution.of_first_states(problem.n, problem.horizon)
+            self._check(problem, call, solution)
+            return replace(solution, account=Account(problem, self, kernels=self.kernels or used(call.problem)))
 
     def _in_time(
         self,
@@ -244,17 +244,17 @@ class Solver(Brief, Checked):
         chooser = self.choosing_time(call.problem)
         if chooser is None:
             raise InputError("solver", CHOOSING_TIME, type(self).__name__)
-        found = solve_in_time(chooser, problem, call, X0)
-        self._check(problem, call, found)
-        _, X, U = at_times(problem, found.X, found.U, found.times)
+        solution = solve_in_time(chooser, problem, call, X0)
+        self._check(problem, call, solution)
+        _, X, U = at_times(problem, solution.X, solution.U, solution.times)
         account = Account(problem, self, kernels=self.kernels or used(call.problem))
-        return replace(found, status=judged_between(call.problem, X, U, found.status), account=account)
+        return replace(solution, status=judged_between(call.problem, X, U, solution.status), account=account)
 
-    def _check(self, problem: Problem, call: Call, found: Solution) -> None:
+    def _check(self, problem: Problem, call: Call, solution: Solution) -> None:
         """Raise InputError where code that branches on values has mixed knots or problems: only PyTorch's kernels call
         such code."""
         if self.kernels is None and not call.problem.known.in_c:
-            check_rows(problem, found.X, found.U, found.times)
+            check_rows(problem, solution.X, solution.U, solution.times)
 
     def choosing_time(self, problem: Problem) -> Chooser | None:
         """What solves problems with a free time, in the form `in_time`, for this solver; None: it can't."""
@@ -289,7 +289,7 @@ class Solver(Brief, Checked):
         whole = for_solvers(current_problem(problem), self.joins_knots)
         with computing_on(whole.x0.device):
             self.announce(whole)
-            if whole.B > 0 and kernels_of(whole).compiled and whole.known.expects_interior:
+            if whole.B > 0 and kernels_of(whole) and whole.known.expects_interior:
                 interior_of(whole)
         return self
 

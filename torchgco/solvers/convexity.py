@@ -22,7 +22,7 @@ def looks_convex(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """
     size = X.amax(1, keepdim=True) - X.amin(1, keepdim=True)
     size = torch.where(size > 0, size, 1.0)
-    found = torch.isfinite(X).flatten(1).all(-1)
+    convex = torch.isfinite(X).flatten(1).all(-1)
     for number in range(SEGMENTS):
         ends = [2.0 * uniform(2 * number + i, (problem.N + 1, problem.n + problem.m), X) - 1.0 for i in (0, 1)]
         states = [X + size * end[:, : problem.n] for end in ends]
@@ -31,12 +31,12 @@ def looks_convex(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
             values = [_values(problem, *z) for z in zip(states, controls, strict=True)]
             middle = _values(problem, 0.5 * (states[0] + states[1]), 0.5 * (controls[0] + controls[1]))
         except MISTAKES:  # code that refuses such values
-            return torch.zeros_like(found)
+            return torch.zeros_like(convex)
         for (a, affine), (b, _), (m, _) in zip(*values, middle, strict=True):
             most = CURVES * torch.maximum(a.abs().amax(-1), b.abs().amax(-1)).unsqueeze(-1)
             gap = 0.5 * (a + b) - m
-            found &= ((gap.abs() if affine else -gap) <= most).all(-1)
-    return found
+            convex &= ((gap.abs() if affine else -gap) <= most).all(-1)
+    return convex
 
 
 def _values(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[Tensor, bool]]:
@@ -44,6 +44,6 @@ def _values(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[Tensor, bool]]
     cost = problem.cost
     with cost.precision(X.dtype):
         stages = cost.stage(X[:, :-1], U, torch.arange(problem.N, device=X.device)), cost.terminal(X[:, -1])
-    rows = [(part.value(X, U), part.sense == "equality") for part in problem.constraints]
-    found = [(problem.dynamics.field(X[:, :-1], U), True), *((value, False) for value in stages), *rows]
-    return [(value.reshape(len(X), -1), affine) for value, affine in found if value.numel() > 0]
+    rows = [(constraint.value(X, U), constraint.sense == "equality") for constraint in problem.constraints]
+    values = [(problem.dynamics.field(X[:, :-1], U), True), *((value, False) for value in stages), *rows]
+    return [(value.reshape(len(X), -1), affine) for value, affine in values if value.numel() > 0]

@@ -82,10 +82,10 @@ def _rounds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
 
 def _binds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
     """Whether a row binds, (B,): others have no stiffness."""
-    found = torch.zeros_like(lagrangian.multipliers.mu, dtype=torch.bool)
-    for part, lam in zip(lagrangian.problem.constraints, lagrangian.multipliers.lam, strict=True):
-        found |= (binding(part.sense, part.value(X, U), lam) != 0).flatten(1).any(-1)
-    return found
+    binds = torch.zeros_like(lagrangian.multipliers.mu, dtype=torch.bool)
+    for constraint, lam in zip(lagrangian.problem.constraints, lagrangian.multipliers.lam, strict=True):
+        binds |= (binding(constraint.sense, constraint.value(X, U), lam) != 0).flatten(1).any(-1)
+    return binds
 
 
 def _sizes(problem: Problem, U: Tensor) -> Tensor:
@@ -126,22 +126,28 @@ def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Te
     rows = ((status == Status.CONVERGED) | (status == Status.FEASIBLE)).nonzero().flatten()
     if rows.numel() == 0:
         return status
-    part, X, U = problem.take(rows), X[rows], U[rows]
-    bad = path_clearance(part, X, U) < 0 if all(one.has_chords for one in part.obstacles) else rows < 0
-    for way in passages(part, X, U).values():
-        bad = bad | ~way.passed.all(-1)
+    bad = fails_between(problem.take(rows), X[rows], U[rows])
     status = status.clone()
     status[rows[bad]] = int(Status.INFEASIBLE)
     return status
 
 
-def touches(problem: Problem, found: Solution) -> Tensor:
+def fails_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """Whether trajectories touch an obstacle that can be measured between two knots, or miss a gate, (B,) bool."""
+    chords = all(one.has_chords for one in problem.obstacles)
+    bad = path_clearance(problem, X, U) < 0 if chords else torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    for way in passages(problem, X, U).values():
+        bad = bad | ~way.passed.all(-1)
+    return bad
+
+
+def touches(problem: Problem, solution: Solution) -> Tensor:
     """Which trajectories (B,) are INFEASIBLE only because they touch an obstacle between two knots."""
-    touching = (found.status == Status.INFEASIBLE) & (found.violation <= ADMITTED)
+    touching = (solution.status == Status.INFEASIBLE) & (solution.violation <= ADMITTED)
     rows = touching.nonzero().flatten()
     if rows.numel() > 0:
-        times = None if found.times is None else found.times[rows]
-        touching[rows] = path_clearance(*at_times(problem.take(rows), found.X[rows], found.U[rows], times)) < 0
+        times = None if solution.times is None else solution.times[rows]
+        touching[rows] = path_clearance(*at_times(problem.take(rows), solution.X[rows], solution.U[rows], times)) < 0
     return touching
 
 

@@ -73,5 +73,5 @@ def appended(trace: pd.DataFrame | None, later: pd.DataFrame | None) -> pd.DataF
     import pandas as pd
 
     before = trace.groupby("element")["attempt"].max()
-    own = later.assign(attempt=later["attempt"] + later["element"].map(before).fillna(0).astype(int))
-    return pd.concat((trace, own)).sort_values(ORDER, ignore_index=True)
+    numbered = later.assign(attempt=later["attempt"] + later["element"].map(before).fillna(0).astype(int))
+    return pd.concat((trace, numbered)).sort_values(ORDER, ignore_index=True)

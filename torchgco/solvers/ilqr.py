@@ -88,9 +88,9 @@ def descend(
     cost, merit = value(lagrangian, X, U)
     rows = torch.arange(problem.B, device=U.device)
     none = (torch.zeros_like(rows) for _ in range(3))
-    found = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
+    whole = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
     status = start_status(problem, X, merit, start_is_clear)
-    running, going = found, status == Status.RUNNING
+    running, going = whole, status == Status.RUNNING
     while (stay := going.nonzero().flatten()).numel() > 0:
         if stay.numel() < going.numel():
             running, lagrangian = take(running, stay), lagrangian.take(stay)
@@ -99,9 +99,9 @@ def descend(
         reason = torch.where(end.stuck, int(Status.LINE_SEARCH_FAILED), int(Status.MAX_ITERATIONS))
         now = torch.where(end.ended, reason, end.status)
         status[running.rows], going = now, now == Status.RUNNING
-        if running is not found:
-            put(found, running.rows, running)
-    return found, status
+        if running is not whole:
+            put(whole, running.rows, running)
+    return whole, status
 
 
 class RepeatedDescent:
@@ -123,8 +123,8 @@ class RepeatedDescent:
 
     def take(self, index: Rows) -> RepeatedDescent:
         """The same for the problems in `index`."""
-        part = self.problem.take(index)
-        return self if part is self.problem else RepeatedDescent(self.inner, part.renewed())
+        subset = self.problem.take(index)
+        return self if subset is self.problem else RepeatedDescent(self.inner, subset.renewed())
 
     def refresh(self, i: int) -> None:
         """The numbers of constraint i have been written."""
@@ -138,5 +138,5 @@ class RepeatedDescent:
         if kept is not None and kept.solve(U, multipliers):
             return kept.X, kept.U.clone(), kept.violation()
         problem = self.problem.renewed()  # whose numbers are others than those that it was packed with
-        found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, not self.inner.as_printed), U)
-        return found.X, found.U, measured(problem, found.X, found.U)
+        end, _ = descend(self.inner, Lagrangian(problem, multipliers, None, not self.inner.as_printed), U)
+        return end.X, end.U, measured(problem, end.X, end.U)

@@ -31,9 +31,9 @@ def least_violated(call: Call, end: SolveEnd, tolerance: float) -> SolveEnd:
         return end
     problem, old = call.problem.take(rows).held_at(end.best.X[rows, 0]), take(end.best, rows)
     cost_unit(problem)
-    given = Multipliers.zero(problem, HEAVY)
-    found, ended = descend(REPAIR, Lagrangian(problem.in_cost_units(), given, None, phr=True), old.U)
-    X, U, violation = found.X, found.U, measured(problem, found.X, found.U)
+    multipliers = Multipliers.zero(problem, HEAVY)
+    repaired, ended = descend(REPAIR, Lagrangian(problem.in_cost_units(), multipliers, None, phr=True), old.U)
+    X, U, violation = repaired.X, repaired.U, measured(problem, repaired.X, repaired.U)
     # A problem without a feasible trajectory ends at a stationary point of the violation; others may do so, too.
     stuck = (ended != Status.NON_FINITE) & (ended != Status.NOT_POSITIVE_DEFINITE)
     stuck &= (left_to_close(problem, X, U) <= STUCK) & (violation > tolerance)

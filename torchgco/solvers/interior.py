@@ -11,15 +11,13 @@ from torchgco.base.options import Count, Positive
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
-from torchgco.eager.fixed import GOLDEN, ROUNDINGS
-from torchgco.eager.kernels import least_violation
 from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
-from torchgco.kernels.in_pytorch import InteriorKernels
-from torchgco.lagrangian.barrier import BarrierOptions
+from torchgco.lagrangian.barrier import GOLDEN, ROUNDINGS, BarrierOptions, least_violation
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
+from torchgco.native.interior import InteriorKernels
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
@@ -42,9 +40,9 @@ class InteriorPoint(Solver, named="solver"):
     """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
 
     States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
-    anything; Hessians are exact. Returned trajectories are rollouts. What kernels in C can't serve (single precision,
-    other devices, code that can't be traced) is solved by the same algorithm in PyTorch: statuses are the same, and
-    costs within 1e-6.
+    anything; Hessians are exact. Returned trajectories are rollouts. It needs a C compiler. In single precision, on
+    other devices, and of code that can't be traced PyTorch computes values and derivatives, and the same code in C all
+    else, in double precision on the CPU.
 
     Args:
         tolerance: of the optimality conditions, scaled as in the paper; in float32 8e-6, or what rounding allows.
@@ -107,10 +105,10 @@ class InteriorPoint(Solver, named="solver"):
 
     def choosing_time(self, problem: Problem) -> Chooser:
         """This solver; where the time is held, with a tolerance that any trajectory meets, and few iterations."""
-        held = replace(self, tolerance=max(self.tolerance, ROUGH), max_iterations=min(self.max_iterations, FEW))
-        first = replace(self, max_iterations=held.max_iterations)
-        rough = replace(held, max_iterations=DRAWN_ITERATIONS).solved
-        return Chooser(held, self, self.admitted(problem), first, rough=rough)
+        coarse = replace(self, tolerance=max(self.tolerance, ROUGH), max_iterations=min(self.max_iterations, FEW))
+        first = replace(self, max_iterations=coarse.max_iterations)
+        rough = replace(coarse, max_iterations=DRAWN_ITERATIONS).solved
+        return Chooser(coarse, self, self.admitted(problem), first, rough=rough)
 
     def solved(
         self,
@@ -144,15 +142,15 @@ class InteriorPoint(Solver, named="solver"):
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
         begun, falls = torch.zeros_like(status, dtype=torch.bool), torch.zeros_like(status, dtype=torch.bool)
-        for part in rows.split(REPORTED_AT_ONCE):
+        for chunk in rows.split(REPORTED_AT_ONCE):
             if call.late:
-                end.status[part] = Status.TIME_LIMIT
+                end.status[chunk] = Status.TIME_LIMIT
                 continue
-            falls[part] = self._some(kernels, call.take(part), X[part], part, end, smoothing, escapes)
-            begun[part] = True
+            falls[chunk] = self._some(kernels, call.take(chunk), X[chunk], chunk, end, smoothing, escapes)
+            begun[chunk] = True
             if call.callback is not None:
                 done = int((end.status != Status.RUNNING).sum())
-                call.callback(Progress(1, call.rows[part], done, problem.B))
+                call.callback(Progress(1, call.rows[chunk], done, problem.B))
         if not bool(begun.all()):
             others = (~begun).nonzero().flatten()
             put(end.best, others, take(guess or guessed(call), others))
@@ -168,12 +166,12 @@ class InteriorPoint(Solver, named="solver"):
             if call.late:
                 end.status[rows] = Status.TIME_LIMIT
                 return
-            old, part = take(end.best, rows), call.take(rows)
-            part = replace(part, U0=_beside(part.problem, old.U, share), warm=None, X0=None, callback=None)
-            new = SolveEnd.blank(part.problem, part.U0)
-            fell = self._some(kernels, part, open_loop(part.problem, part.U0), torch.arange(len(rows)), new, 0.0, True)
+            old, near = take(end.best, rows), call.take(rows)
+            near = replace(near, U0=_beside(near.problem, old.U, share), warm=None, X0=None, callback=None)
+            new = SolveEnd.blank(near.problem, near.U0)
+            fell = self._some(kernels, near, open_loop(near.problem, near.U0), torch.arange(len(rows)), new, 0.0, True)
             cheaper = new.best.cost < old.cost - STATIONARY * old.cost.abs()
-            better = (new.status == SOLVED) & cheaper & (new.best.violation <= self.admitted(part.problem))
+            better = (new.status == SOLVED) & cheaper & (new.best.violation <= self.admitted(near.problem))
             end.iterations[rows] += new.iterations
             kept = better.nonzero().flatten()
             put(end.best, rows[kept], take(new.best, kept))
@@ -182,16 +180,16 @@ class InteriorPoint(Solver, named="solver"):
 
     def no_worse(self, call: Call, guess: Iterate, end: SolveEnd) -> SolveEnd:
         """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
-        problem, found = call.problem, end.best
+        problem, best = call.problem, end.best
         X, cost, worst = guess.X, guess.cost, guess.violation
-        lost = ~(torch.isfinite(found.cost) & torch.isfinite(found.violation))
-        held = beyond_rounding(found.violation, found.U)
-        worse = is_better(cost, worst, found.cost, held, self.admitted(problem)) | lost
+        lost = ~(torch.isfinite(best.cost) & torch.isfinite(best.violation))
+        violated = beyond_rounding(best.violation, best.U)
+        worse = is_better(cost, worst, best.cost, violated, self.admitted(problem)) | lost
         rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
         if rows.numel() > 0:
-            multipliers = take(found.multipliers, rows)
+            multipliers = take(best.multipliers, rows)
             none = Multipliers(tuple(torch.zeros_like(lam) for lam in multipliers.lam), multipliers.mu)
-            put(found, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
+            put(best, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
         return end
 
     def _some(
@@ -218,16 +216,16 @@ class InteriorPoint(Solver, named="solver"):
         fitted = Multipliers(multipliers, PENALTY * scale.unit)
         out = kernels.solve(problem, X, U, multipliers, X.new_full((problem.B,), mu), scale, how)
         X, U = rolled_out(problem, X, U, out["gains"][..., :-1])
-        found = Iterate(X, U, fitted, problem.cost.total(X, U), measured(problem, X, U))
-        put(end.best, rows, found)
-        put(end.last, rows, found)
+        iterate = Iterate(X, U, fitted, problem.cost.total(X, U), measured(problem, X, U))
+        put(end.best, rows, iterate)
+        put(end.last, rows, iterate)
         status = out["status"].long()
         status = torch.where(status == Status.CONVERGED, SOLVED, status)
         broken = (status == Status.INFEASIBLE).nonzero().flatten()  # rows that were left out
         if broken.numel() > 0:
             fixed = unmoved(problem.take(broken), X[broken], U[broken], self.admitted(problem))
             status[broken] = torch.where(fixed, UNMOVED, int(Status.LINE_SEARCH_FAILED))
-        sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
+        sound = torch.isfinite(iterate.cost) & torch.isfinite(iterate.violation)
         end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]
         return (out["falls"] > 0.0) & (end.status[rows] == SOLVED)
@@ -246,16 +244,16 @@ def rolled_out(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tenso
     rows of a tight solution may be so stiff that rounding decides on the gains, which then make a change that counts of
     one in the last bit: where they do, U alone.
     """
-    found = followed(problem, X, U, K)
-    rows = (~_is_rounding(X, found[0])).nonzero().flatten()
+    rollout = followed(problem, X, U, K)
+    rows = (~_is_rounding(X, rollout[0])).nonzero().flatten()
     if rows.numel() == 0:
-        return found
+        return rollout
     states, controls = X[rows], U[rows]
     alone = followed(problem.take(rows), states, controls, torch.zeros_like(K[rows]))
     better = _is_rounding(states, alone[0])
-    for whole, part in zip(found, alone, strict=True):
-        whole[rows[better]] = part[better]
-    return found
+    for whole, single in zip(rollout, alone, strict=True):
+        whole[rows[better]] = single[better]
+    return rollout
 
 
 def _is_rounding(old: Tensor, new: Tensor) -> Tensor:
@@ -280,8 +278,8 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
         (lower, upper), size = bounds.by_knot, bounds.lower.shape[-1]
         half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
         low, high = (
-            torch.where(at.isinf(), 0.0, push * torch.minimum(at.abs().clamp(min=1.0), half)) for at in (lower, upper)
+            torch.where(b.isinf(), 0.0, push * torch.minimum(b.abs().clamp(min=1.0), half)) for b in (lower, upper)
         )
-        held = z[:, bounds.knots, :size]
-        z[:, bounds.knots, :size] = torch.minimum(torch.maximum(held, lower + low), upper - high)
+        values = z[:, bounds.knots, :size]
+        z[:, bounds.knots, :size] = torch.minimum(torch.maximum(values, lower + low), upper - high)
     return X, U

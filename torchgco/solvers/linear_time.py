@@ -53,14 +53,14 @@ class LinearTime:
         """The shortest times that serve, as factors (B,) of the nominal one; NaN where none does, or none is known."""
         time = self.problem.time
         assert time is not None
-        found = torch.full_like(self.line[:, 0, 0], torch.nan)
-        shares = torch.linspace(0.0, 1.0, TIMES, dtype=found.dtype, device=found.device)
+        shortest = torch.full_like(self.line[:, 0, 0], torch.nan)
+        shares = torch.linspace(0.0, 1.0, TIMES, dtype=shortest.dtype, device=shortest.device)
         least, most = time.least.amin(-1, keepdim=True), time.most.amax(-1, keepdim=True)
         for factor in (least * (most / least) ** shares).flip(-1).unbind(-1):  # the shortest is written last
             steered = self._steered(factor)
             if steered is not None:
-                found = torch.where(self._fits(*steered), factor, found)
-        return found
+                shortest = torch.where(self._fits(*steered), factor, shortest)
+        return shortest
 
     def guess(self, factor: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """States (B, N+1, n) and controls (B, N, m) in factor (B,) times the nominal time; elsewhere the line and U."""
@@ -68,16 +68,16 @@ class LinearTime:
         if steered is None:
             return self.line, U
         x, u, misses = steered
-        place = torch.linspace(0.0, float(STAGES), self.problem.N + 1, dtype=x.dtype, device=x.device)
-        first = place.long().clamp(max=STAGES - 1)
-        share = (place - first).view(1, -1, 1)
+        position = torch.linspace(0.0, float(STAGES), self.problem.N + 1, dtype=x.dtype, device=x.device)
+        first = position.long().clamp(max=STAGES - 1)
+        share = (position - first).view(1, -1, 1)
         X = (1.0 - share) * x[:, first] + share * x[:, first + 1]
         X = self.problem.dynamics.settled(X)
-        held = self.middle.unsqueeze(1) + self.half.unsqueeze(1) * u[:, first[:-1]]
+        controls = self.middle.unsqueeze(1) + self.half.unsqueeze(1) * u[:, first[:-1]]
         lower, upper = self.middle - self.half, self.middle + self.half
-        held = torch.minimum(torch.maximum(held, lower.unsqueeze(1)), upper.unsqueeze(1))
+        controls = torch.minimum(torch.maximum(controls, lower.unsqueeze(1)), upper.unsqueeze(1))
         fits = (self._fits(x, u, misses) & torch.isfinite(X).flatten(1).all(-1)).view(-1, 1, 1)
-        return torch.where(fits, X, self.line), torch.where(fits, held, U)
+        return torch.where(fits, X, self.line), torch.where(fits, controls, U)
 
     def _steered(self, factor: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         """States (B, STAGES+1, n), controls (B, STAGES, m) as shares of half their range, and by how much they miss."""
@@ -89,12 +89,12 @@ class LinearTime:
         generator[:, :n] = torch.cat((A, G, c.unsqueeze(-1)), dim=-1)
         generator *= (factor * problem.N * problem.dynamics.dt / STAGES).view(-1, 1, 1)
         step = exponential(generator)[:, :n]
-        one, push, drift = step[..., :n], step[..., n : n + m], step[..., -1:]
+        phi, push, drift = step[..., :n], step[..., n : n + m], step[..., -1:]
         x, reach, through, start = self.line[:, 0].unsqueeze(-1), [], self.asked, self.line[:, 0].unsqueeze(-1)
         for _ in range(STAGES):
-            x = product(one, x) + drift
+            x = product(phi, x) + drift
             reach.append(product(through, push))
-            through = product(through, one)
+            through = product(through, phi)
         W, missing = torch.cat(reach[::-1], dim=-1), product(self.asked, self.line[:, -1:].mT - x)  # (B, p, STAGES m)
         known = (torch.isfinite(W).all((1, 2)) & torch.isfinite(missing).all((1, 2)) & self.bounded).view(-1, 1, 1)
         W, missing = torch.where(known, W, 0.0), torch.where(known, missing, torch.inf)
@@ -103,8 +103,8 @@ class LinearTime:
         misses = (product(W, u) - missing).abs().amax((1, 2)) / size
         u = u.view(B, STAGES, m)
         path = [start]
-        for part in u.unsqueeze(-1).unbind(1):
-            path.append(product(one, path[-1]) + product(push, part) + drift)
+        for v in u.unsqueeze(-1).unbind(1):
+            path.append(product(phi, path[-1]) + product(push, v) + drift)
         return torch.cat(path, dim=-1).mT, u, misses
 
     def _fits(self, x: Tensor, u: Tensor, misses: Tensor) -> Tensor:
@@ -129,9 +129,9 @@ def _asked(problem: Problem, end: Tensor) -> Tensor:
     """What is asked of the end (B, n), as rows (B, p, n): those of the last knot, else the position, else all."""
     n, where = problem.n, problem.dynamics.position
     parts = [c for c in problem.constraints if c.holds_at(problem.N) and not isinstance(c, Obstacles | Bounds)]
-    balls = [part for part in parts if part.bare.is_goal and part.bare.in_metres]  # of no slope in the middle
-    parts = [part for part in parts if part not in balls]
-    rows = [jacobian(lambda z, part=part: last_rows(part, problem, z), end)[0] for part in parts]
+    balls = [c for c in parts if c.bare.is_goal and c.bare.in_metres]  # of no slope in the middle
+    parts = [c for c in parts if c not in balls]
+    rows = [jacobian(lambda z, c=c: last_rows(c, problem, z), end)[0] for c in parts]
     if not rows or balls:
         every = torch.eye(n, dtype=end.dtype, device=end.device)
         rows.append((every if where is None else every[where]).expand(len(end), -1, -1))

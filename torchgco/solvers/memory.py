@@ -27,8 +27,8 @@ def element_bytes(problem: Problem) -> int:
     """Bytes that one problem of this form takes in a solve, measured to be within a factor of 2 (tests)."""
     N, n, m = problem.N, problem.n, problem.m
     z, s = n + 1, n + 1 + m
-    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
-    rows = sum(lam.numel() for lam in Multipliers.zero(one, 0.0).lam)
+    single = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
+    rows = sum(lam.numel() for lam in Multipliers.zero(single, 0.0).lam)
     # F, H and the derivatives they are built from; native kernels hold them for eight problems only.
     expansion = 0 if kernels_of(problem).compiled else N * (2 * z * s + 2 * s * s)
     return least_bytes(N, n, m, rows) + BYTES_PER_NUMBER * expansion

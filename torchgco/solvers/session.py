@@ -70,55 +70,55 @@ class Session:
         """
         problem, best = self.call.problem, end.best
         size = slots or max(1, problem.B)
-        parts = [self._optimality(best, slice(at, at + size)) for at in range(0, max(1, problem.B), size)]
+        parts = [self._optimality(best, slice(i, i + size)) for i in range(0, max(1, problem.B), size)]
         K, d, left = (torch.cat(column) for column in zip(*parts, strict=True))
-        found, unlike = self._by_users_model(self.trajectories(end, lambda rows: K[rows]))
+        result, unlike = self._by_users_model(self.trajectories(end, lambda rows: K[rows]))
         left = torch.where(unlike, left.clamp(min=1.0), left)
         if problem.free_start is not None:  # stationary for this start alone, unless the interior point chose it
             left = torch.where(problem.free_start.any(-1) & ~is_over(end.status), left.clamp(min=1.0), left)
         limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
         constrained = bool(problem.constraints) or problem.free_start is not None
-        finite = torch.isfinite(found.cost) & torch.isfinite(found.violation)
-        finite &= torch.isfinite(found.X).flatten(1).all(-1)
+        finite = torch.isfinite(result.cost) & torch.isfinite(result.violation)
+        finite &= torch.isfinite(result.X).flatten(1).all(-1)
         ended = torch.where(finite | (ended == Status.INVALID_START), ended, int(Status.NON_FINITE))
-        status = final_status(ended, left, found.violation, tolerance, constrained)
+        status = final_status(ended, left, result.violation, tolerance, constrained)
         user = self.given.problem
         covered = covered_goals(user)
         if bool(covered.any()):
             gave_up = torch.stack([status == reason for reason in GAVE_UP]).any(0)
             status = torch.where(gave_up & covered, int(Status.INFEASIBLE), status)
-        falls = falls_without_end(user, self.given.U0, found, left, tolerance)
+        falls = falls_without_end(user, self.given.U0, result, left, tolerance)
         status = torch.where(falls, int(Status.UNBOUNDED), status)
         return Solution(
-            found.X, found.U, K, d, found.multipliers, found.cost, found.violation, status,
+            result.X, result.U, K, d, result.multipliers, result.cost, result.violation, status,
             end.iterations, end.outer, end.guided,
             None if self.recorder is None else self.recorder.frame(*self.scales),
         )  # fmt: skip
 
-    def _by_users_model(self, found: Iterate) -> tuple[Iterate, Tensor]:
+    def _by_users_model(self, best: Iterate) -> tuple[Iterate, Tensor]:
         """The trajectories with states of the user's own model, and where (B,) those of its compiled code are others.
 
         They may be: at a jump of the model, for which rounding decides; where the model gives NaN and compiled code
         doesn't; and where what the model does depends on more than its arguments, which the TraceWarning says.
         """
         user = self.given.problem
-        unlike = torch.zeros_like(found.cost, dtype=torch.bool)
-        if not kernels_of(user).compiled or not is_users(user.dynamics) or found.U.numel() == 0:
-            return found, unlike
-        X = found.X[:, 1:]
-        gap = (user.along.step(found.X[:, :-1], found.U) - X).abs() / (1.0 + X.abs().amax(dim=(1, 2), keepdim=True))
-        unlike = ~(gap.flatten(1).amax(-1) <= UNLIKE) & torch.isfinite(found.X).flatten(1).all(-1)
+        unlike = torch.zeros_like(best.cost, dtype=torch.bool)
+        if not kernels_of(user).compiled or not is_users(user.dynamics) or best.U.numel() == 0:
+            return best, unlike
+        X = best.X[:, 1:]
+        gap = (user.along.step(best.X[:, :-1], best.U) - X).abs() / (1.0 + X.abs().amax(dim=(1, 2), keepdim=True))
+        unlike = ~(gap.flatten(1).amax(-1) <= UNLIKE) & torch.isfinite(best.X).flatten(1).all(-1)
         rows = unlike.nonzero().flatten()
         if rows.numel() > 0:
-            part, U = user.take(rows), found.U[rows]
-            X = open_loop(part.dynamics, found.X[rows, 0], U)
+            odd, U = user.take(rows), best.U[rows]
+            X = open_loop(odd.dynamics, best.X[rows, 0], U)
             if bool(torch.isfinite(X).all()):
                 told = "compiled code gives other states than the model, whose own are returned, for problems"
                 warnings.warn(f"{told} {rows.tolist()}", TraceWarning, stacklevel=2)
-            own = Iterate(X, U, take(found.multipliers, rows), part.cost.total(X, U), violation(part.constraints, X, U))
-            put(found, rows, own)
-        return found, unlike
+            new = Iterate(X, U, take(best.multipliers, rows), odd.cost.total(X, U), violation(odd.constraints, X, U))
+            put(best, rows, new)
+        return best, unlike
 
     def trajectories(self, end: SolveEnd, gains: Callable[[Tensor], Tensor] | None = None) -> Iterate:
         """The best trajectories in the user's units, as PyTorch's rollouts give them; their own costs and violations.
@@ -138,5 +138,5 @@ class Session:
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
     def _optimality(self, best: Iterate, rows: Rows) -> Optimality:
-        part = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, not self.as_printed)
-        return optimality(part, best.X[rows], best.U[rows])
+        lagrangian = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, not self.as_printed)
+        return optimality(lagrangian, best.X[rows], best.U[rows])

@@ -41,18 +41,18 @@ class Legs:
     @classmethod
     def of(cls, problem: Problem, end: Tensor) -> Legs | None:
         """Those of problems that end at states (B, n); None without gates."""
-        gates, at = gates_of(problem), problem.dynamics.position
-        if gates is None or at is None:
+        gates, position = gates_of(problem), problem.dynamics.position
+        if gates is None or position is None:
             return None
         first, last = torch.zeros_like(gates.places[:, :1]), torch.full_like(gates.places[:, :1], problem.N)
-        stops = torch.cat((problem.x0[:, None, at], gates.centers, end[:, None, at]), dim=1)
+        stops = torch.cat((problem.x0[:, None, position], gates.centers, end[:, None, position]), dim=1)
         return cls(stops, torch.cat((first, gates.places, last), dim=1))
 
     @property
     def farthest(self) -> Tensor:
         """The stop (B, d) that is farthest from the start."""
-        place = (self.stops - self.stops[:, :1]).norm(dim=-1).argmax(-1)
-        return self.stops[torch.arange(len(place), device=place.device), place]
+        index = (self.stops - self.stops[:, :1]).norm(dim=-1).argmax(-1)
+        return self.stops[torch.arange(len(index), device=index.device), index]
 
     def positions(self, N: int) -> Tensor:
         """(B, N+1, d): evenly along each leg from its knot to the next."""
@@ -93,7 +93,7 @@ def asked_of_the_end(problem: Problem) -> Tensor:
     parts = [c for c in problem.constraints if c.holds_at(problem.N) and not isinstance(c, Obstacles)]
     if not parts:
         return z
-    rows = lambda z: torch.cat([last_rows(part, problem, z) for part in parts], dim=-1)
+    rows = lambda z: torch.cat([last_rows(constraint, problem, z) for constraint in parts], dim=-1)
     for _ in range(NEWTON_STEPS):
         try:
             c, (J,) = rows(z), jacobian(rows, z)
@@ -108,10 +108,10 @@ def asked_of_the_end(problem: Problem) -> Tensor:
     return z
 
 
-def last_rows(part: Constraint, problem: Problem, z: Tensor) -> Tensor:
+def last_rows(constraint: Constraint, problem: Problem, z: Tensor) -> Tensor:
     """The rows (B, p) of the last knot at z (B, n): of inequalities, by how much they are violated."""
     X = z.unsqueeze(1).expand(-1, problem.N + 1, -1)
-    knots = torch.arange(problem.N + 1, device=z.device)[part.knots]
-    place = int((knots == problem.N).nonzero()[0, 0])
-    c = part.value(X, z.new_zeros(len(z), problem.N, problem.m))[:, place]
-    return c if part.sense == "equality" else c.clamp(min=0.0)
+    knots = torch.arange(problem.N + 1, device=z.device)[constraint.knots]
+    index = int((knots == problem.N).nonzero()[0, 0])
+    c = constraint.value(X, z.new_zeros(len(z), problem.N, problem.m))[:, index]
+    return c if constraint.sense == "equality" else c.clamp(min=0.0)

@@ -125,14 +125,14 @@ class Timed:
         if legs is None:
             return estimate
         each = legs.stage_factors(torch.where(estimate.isnan(), 1.0, estimate), N)
-        at = time.of_stages(N)
-        return each.new_zeros(len(each), time.count).index_add(1, at, each) / torch.bincount(at)
+        segments = time.of_stages(N)
+        return each.new_zeros(len(each), time.count).index_add(1, segments, each) / torch.bincount(segments)
 
     @cached_property
     def own(self) -> Tensor:
         """`HELD_FIRST` times the estimate, within the bounds, (B, S)."""
-        own = HELD_FIRST * torch.where(self._estimate.isnan(), 1.0, self._estimate)
-        return own.clamp(self.time.least, self.time.most)
+        factors = HELD_FIRST * torch.where(self._estimate.isnan(), 1.0, self._estimate)
+        return factors.clamp(self.time.least, self.time.most)
 
     @cached_property
     def _guess(self) -> tuple[Tensor, Tensor]:
@@ -146,9 +146,9 @@ class Timed:
         """Solve at longer and longer times; see the module."""
         rows, time = torch.arange(self.problem.B, device=self.problem.x0.device), self.time
         guess, again = self.first, torch.zeros_like(rows)
-        given = self.call.X0 is not None
+        has_states = self.call.X0 is not None
         while rows.numel() > 0:
-            self._tried(rows, guess[rows], given)
+            self._tried(rows, guess[rows], has_states)
             best = self.best
             over = (best.status == Status.CONVERGED) | (best.status == Status.INVALID_START)
             if self.chooser.paces:  # a search that found a way is followed by others anyway
@@ -157,7 +157,7 @@ class Timed:
             again += short
             left = (~over | short) & (guess < time.most).any(-1)
             rows = rows[left[rows]]
-            guess, given = torch.minimum(HELD_NEXT * guess, time.most), False
+            guess, has_states = torch.minimum(HELD_NEXT * guess, time.most), False
             if self.call.late:
                 break
         self._freed_where_none_is()
@@ -179,35 +179,35 @@ class Timed:
             return self.own
         return guess if self.call.X0 is not None else torch.where(guess < self._estimate, self.own, guess)
 
-    def _tried(self, rows: Tensor, guess: Tensor, given: bool) -> None:
-        """Solve problems with the time held at `guess` (b, S), then free; `given`: from the user's states."""
-        call = self._at(rows, guess, given)
-        if given and self.call.warm is not None:
+    def _tried(self, rows: Tensor, guess: Tensor, has_states: bool) -> None:
+        """Solve problems with the time held at `guess` (b, S), then free; `has_states`: from the user's states."""
+        call = self._at(rows, guess, has_states)
+        if has_states and self.call.warm is not None:
             self._keep(rows, self.chooser.free.run(call))
             return
-        found = self._at_once(replace(call, warm=None), given)
-        if found is not None:
-            self._keep(rows, found)
-            left = (found.status != Status.CONVERGED) | self._is_short(rows, found)
+        solution = self._at_once(replace(call, warm=None), has_states)
+        if solution is not None:
+            self._keep(rows, solution)
+            left = (solution.status != Status.CONVERGED) | self._is_short(rows, solution)
             left = left.nonzero().flatten()
             rows, call = rows[left], call.take(left)
         if rows.numel() > 0:
             self._held(rows, call)
 
-    def _at_once(self, call: Any, given: bool) -> Solution | None:
+    def _at_once(self, call: Any, has_states: bool) -> Solution | None:
         """Solve a call with the time free from its start; None where it is held first."""
         if self.through_gates and self.chooser.through is not None:
             return self.chooser.through(call)
         if self.chooser.first is None:
             return None
         # States that were chosen, and those through gates, are worth the while.
-        return (self.chooser.free if given or self.through_gates else self.chooser.first).run(call)
+        return (self.chooser.free if has_states or self.through_gates else self.chooser.first).run(call)
 
     def _held(self, rows: Tensor, call: Any) -> None:
         """Find trajectories at the time of the call's starts, and free it."""
-        held = replace(call, problem=at_held_times(call.problem, self.problem.n), warm=None)
+        fixed = replace(call, problem=at_held_times(call.problem, self.problem.n), warm=None)
         solver = self.chooser.held
-        first = solver.run(held if solver.take_states(held.problem) else replace(held, X0=None))
+        first = solver.run(fixed if solver.take_states(fixed.problem) else replace(fixed, X0=None))
         does = first.violation <= self.chooser.limit
         status = torch.where(does & (first.status == Status.CONVERGED), int(Status.FEASIBLE), first.status)
         self._keep(rows, replace(first, status=status))  # stationary for this time alone
@@ -215,9 +215,9 @@ class Timed:
         if does.numel() > 0:
             self._keep(rows[does], self._freed(call.take(does), first.take(does)))
 
-    def _is_short(self, rows: Tensor, found: Solution) -> Tensor:
+    def _is_short(self, rows: Tensor, solution: Solution) -> Tensor:
         """Whether trajectories are as short as they may be."""
-        factors = factors_in(self.problem.take(rows), found.X)
+        factors = factors_in(self.problem.take(rows), solution.X)
         return (factors <= AT_LEAST * self.time.least[rows]).all(-1)
 
     def _freed(self, call: Any, start: Solution | Iterate) -> Solution:
@@ -252,8 +252,8 @@ class Timed:
             return
         far = ((self.first / self.own - 1.0).abs() > SAME_TIME).any(-1)
         for pace in (None, *self.chooser.paces):
-            found = self.best.violation <= self.chooser.limit
-            rows = (found & far if pace is None else found).nonzero().flatten()
+            feasible = self.best.violation <= self.chooser.limit
+            rows = (feasible & far if pace is None else feasible).nonzero().flatten()
             factors = self.own if pace is None else pace * factors_in(self.problem, self.best.X)
             if rows.numel() > 0 and not self.call.late:
                 self._tried(rows, factors.clamp(self.time.least, self.time.most)[rows], False)
@@ -275,68 +275,68 @@ class Timed:
             for number in range(self.chooser.starts):
                 self._keep(rows, ends.take(slice(number, None, self.chooser.starts)))
         rows, rough = done.nonzero().flatten(), self.chooser.rough
-        some = self.best.take(rows)
-        rows = rows[~looks_convex(user.take(rows), some.X[..., : user.n], some.U[..., : user.m])]
+        ended = self.best.take(rows)
+        rows = rows[~looks_convex(user.take(rows), ended.X[..., : user.n], ended.U[..., : user.m])]
         if rows.numel() > 0 and rough is not None and not self.call.late:
             call, old = self._drawn(rows, self.chooser.others), self.best.take(rows)
             ends = rough(call)
             self.best.iterations[rows] += ends.iterations.view(len(rows), -1).sum(1)
             cost = torch.where(ends.best.violation <= NEAR, ends.best.cost, torch.inf)
-            least, place = cost.view(len(rows), -1).min(-1)
+            least, start = cost.view(len(rows), -1).min(-1)
             chosen = (least < old.cost).nonzero().flatten()
             if chosen.numel() > 0:
-                at = chosen * self.chooser.others + place[chosen]
-                self._keep(rows[chosen], self._freed(call.take(at), take(ends.best, at)))
+                index = chosen * self.chooser.others + start[chosen]
+                self._keep(rows[chosen], self._freed(call.take(index), take(ends.best, index)))
 
     def _drawn(self, rows: Tensor, count: int) -> Any:
         """The call of `count` guesses for each of the problems `rows` (b,)."""
         each = rows.repeat_interleave(count)
         start = torch.arange(count, device=rows.device).repeat(rows.numel())
         call, user = replace(self.call.take(each), callback=None, warm=None), self.problem.take(each)
-        of_time, of_controls = (DrawKey(call.seed, call.ids, STREAM + 2 * start + part) for part in (0, 1))
+        of_time, of_controls = (DrawKey(call.seed, call.ids, STREAM + 2 * start + i) for i in (0, 1))
         U = call.U0[..., : user.m]
         U = controls_of(user, U, DRAWN_CONTROLS * smooth_normal(of_controls, KNOTS, U))
-        found = factors_in(user, self.best.X[each])
-        pace = standard_normal(of_time, 1, range(1), found.dtype)[0]
-        guess = (found * torch.exp2(DRAWN_TIMES * pace)).clamp(self.time.least[each], self.time.most[each])
+        factors = factors_in(user, self.best.X[each])
+        pace = standard_normal(of_time, 1, range(1), factors.dtype)[0]
+        guess = (factors * torch.exp2(DRAWN_TIMES * pace)).clamp(self.time.least[each], self.time.most[each])
         x0 = call.problem.x0.clone()
         x0[:, user.n] = guess[:, 0]
         lifted = call.problem._with({"x0": x0}, call.problem.known)
         _, U = states_in_time(user, self._line[each], U, guess)
         return replace(call, problem=lifted, X0=open_loop(lifted, U), U0=U)
 
-    def _at(self, rows: Tensor, guess: Tensor, given: bool) -> Any:
+    def _at(self, rows: Tensor, guess: Tensor, has_states: bool) -> Any:
         """The call of some problems with the guess (b, S) of their factors in starts, states and controls."""
         call, user, n = self.call.take(rows), self.problem.take(rows), self.problem.n
-        X, U = (call.X0, call.U0) if given and call.X0 is not None else (part[rows] for part in self._guess)
+        X, U = (call.X0, call.U0) if has_states and call.X0 is not None else (z[rows] for z in self._guess)
         X, U = states_in_time(user, X[..., :n], U[..., : user.m], guess)
         x0 = call.problem.x0.clone()
         x0[:, n] = guess[:, 0]
         return replace(call, problem=call.problem._with({"x0": x0}, call.problem.known), X0=X, U0=U)
 
-    def _keep(self, rows: Tensor, found: Solution) -> None:
+    def _keep(self, rows: Tensor, solution: Solution) -> None:
         """Keep what is better than before; iterations add up, and so do records."""
         limit, problem = self.chooser.limit, self.call.problem.take(rows)
-        clear = path_clearance(problem, found.X, found.U) >= 0.0
+        clear = path_clearance(problem, solution.X, solution.U) >= 0.0
         if "best" not in vars(self):
-            self.best, self.clear = found, clear
+            self.best, self.clear = solution, clear
             return
         best, old, was = self.best, self.best.take(rows), self.clear[rows]
-        better = is_better(found.cost, found.violation, old.cost, old.violation, limit)
-        same = (found.cost <= old.cost) & (found.violation <= limit)
-        better |= same & (found.status == Status.CONVERGED)
+        better = is_better(solution.cost, solution.violation, old.cost, old.violation, limit)
+        same = (solution.cost <= old.cost) & (solution.violation <= limit)
+        better |= same & (solution.status == Status.CONVERGED)
         # Of feasible trajectories those that touch no obstacle between two knots come first.
-        both = (found.violation <= limit) & (old.violation <= limit)
+        both = (solution.violation <= limit) & (old.violation <= limit)
         better = torch.where(both & (clear != was), clear, better)
         where = better.nonzero().flatten()
         self.clear[rows[where]] = clear[where]
         for name in ("X", "U", "K", "d", "multipliers", "cost", "violation", "status"):
-            put(getattr(best, name), rows[where], take(getattr(found, name), where))
+            put(getattr(best, name), rows[where], take(getattr(solution, name), where))
         for name in ("iterations", "outer_iterations", "guided"):
-            getattr(best, name)[rows] += getattr(found, name)
-        searches = [record for record in (best.search, found.search) if record is not None]
+            getattr(best, name)[rows] += getattr(solution, name)
+        searches = [record for record in (best.search, solution.search) if record is not None]
         search = searches[0].followed_by(searches[1]) if len(searches) == 2 else next(iter(searches), None)
-        self.best = replace(best, trace=appended(best.trace, found.trace), search=search)
+        self.best = replace(best, trace=appended(best.trace, solution.trace), search=search)
 
 
 def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | None) -> Solution:
@@ -346,8 +346,8 @@ def solve_in_time(chooser: Chooser, problem: Problem, call: Any, X0: Tensor | No
         X0: states (B, N+1, n) of the user's problem to begin with; None: those of the linear model, or on the straight
             line to the end.
     """
-    found = _solved(chooser, problem, replace(call, X0=X0))
-    return of_user(problem, found, needed_durations(chooser, problem, call, found))
+    solution = _solved(chooser, problem, replace(call, X0=X0))
+    return of_user(problem, solution, needed_durations(chooser, problem, call, solution))
 
 
 def _solved(chooser: Chooser, problem: Problem, call: Any) -> Solution:
@@ -357,23 +357,23 @@ def _solved(chooser: Chooser, problem: Problem, call: Any) -> Solution:
     then wanders before it sees them.
     """
     scaled, unit = call.in_cost_units()
-    found = Timed(chooser, problem, scaled).run()
-    cost, multipliers = call.problem.cost.total(found.X, found.U), found.multipliers.scaled(unit)
+    solution = Timed(chooser, problem, scaled).run()
+    cost, multipliers = call.problem.cost.total(solution.X, solution.U), solution.multipliers.scaled(unit)
     units = spread(unit, call.rows), spread(call.problem.cost_scale.constant, call.rows)
-    trace = None if found.trace is None else in_units(found.trace, *units)
-    search = None if found.search is None else found.search.in_costs(*units)
-    return replace(found, cost=cost, multipliers=multipliers, trace=trace, search=search)
+    trace = None if solution.trace is None else in_units(solution.trace, *units)
+    search = None if solution.search is None else solution.search.in_costs(*units)
+    return replace(solution, cost=cost, multipliers=multipliers, trace=trace, search=search)
 
 
-def of_user(problem: Problem, found: Solution, needed: Tensor | None = None) -> Solution:
+def of_user(problem: Problem, solution: Solution, needed: Tensor | None = None) -> Solution:
     """A solution of the problem `in_time` as one of the user's: its own states, controls and rows, and the times."""
     n, m, count = problem.n, problem.m, len(problem.constraints)
-    times = times_of(problem, factors_in(problem, found.X))
-    multipliers = Multipliers(found.multipliers.lam[:count], found.multipliers.mu)
-    X, K = found.X[..., :n].contiguous(), found.K[..., :m, :n].contiguous()
-    U, d = found.U[..., :m].contiguous(), found.d[..., :m].contiguous()
-    search = None if found.search is None else found.search.of_first_states(n)
-    return replace(found, X=X, U=U, K=K, d=d, multipliers=multipliers, times=times, needed=needed, search=search)
+    times = times_of(problem, factors_in(problem, solution.X))
+    multipliers = Multipliers(solution.multipliers.lam[:count], solution.multipliers.mu)
+    X, K = solution.X[..., :n].contiguous(), solution.K[..., :m, :n].contiguous()
+    U, d = solution.U[..., :m].contiguous(), solution.d[..., :m].contiguous()
+    search = None if solution.search is None else solution.search.of_first_states(n)
+    return replace(solution, X=X, U=U, K=K, d=d, multipliers=multipliers, times=times, needed=needed, search=search)
 
 
 def lifted_multipliers(problem: Problem, whole: Problem, warm: Multipliers) -> Multipliers:
@@ -383,24 +383,24 @@ def lifted_multipliers(problem: Problem, whole: Problem, warm: Multipliers) -> M
     return Multipliers((*warm.lam, *more), warm.mu)
 
 
-def needed_durations(chooser: Chooser, problem: Problem, call: Any, found: Solution) -> Tensor | None:
+def needed_durations(chooser: Chooser, problem: Problem, call: Any, solution: Solution) -> Tensor | None:
     """Durations (B,), s, beyond the longest allowed, at which problems can be solved that can't within it.
 
     NaN where nothing was asked or found; None where all is feasible. A HorizonWarning names them.
     """
-    rows = (~(found.violation <= chooser.limit) & (found.status != Status.INVALID_START)).nonzero().flatten()
+    rows = (~(solution.violation <= chooser.limit) & (solution.status != Status.INVALID_START)).nonzero().flatten()
     if rows.numel() == 0 or call.late:
         return None
-    some, time = problem.take(rows), problem.time
+    subset, time = problem.take(rows), problem.time
     assert time is not None
     time = time.take(rows)
     freed = replace(time, least=time.most, most=BEYOND * time.most, guess=None, weight=torch.ones_like(time.weight))
-    longer = some._with({"time": freed, "cost": _Nothing(some.cost)})
+    longer = subset._with({"time": freed, "cost": _Nothing(subset.cost)})
     call = replace(call.take(rows), problem=in_time(longer), X0=None, warm=None)
     again = _solved(replace(chooser, starts=0), longer, call)
-    needed = torch.full_like(found.cost, torch.nan)
+    needed = torch.full_like(solution.cost, torch.nan)
     does = again.violation <= chooser.limit
-    needed[rows[does]] = times_of(some, factors_in(some, again.X))[does, -1]
+    needed[rows[does]] = times_of(subset, factors_in(subset, again.X))[does, -1]
     known = (~needed.isnan()).nonzero().flatten().tolist()
     if known:
         places = ", ".join(f"problem {b}: {float(needed[b]):.4g} s" for b in known[:NAMED])

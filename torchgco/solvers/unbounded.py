@@ -27,7 +27,7 @@ def beyond_rounding(violation: Tensor, U: Tensor) -> Tensor:
     return torch.where(violation <= rounding, 0.0, violation)
 
 
-def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor, tolerance: float) -> Tensor:
+def falls_without_end(problem: Problem, U0: Tensor, best: Iterate, left: Tensor, tolerance: float) -> Tensor:
     """Whether the cost of feasible trajectories falls without end, (B,) bool.
 
     It does where the controls that have moved most from the guess U0 (B, N, m) go on in their directions, at no
@@ -36,26 +36,26 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     bounds; where a Newton step would still save a share `left` (B,) of the cost; and where controls have gone very far.
     """
     unit = problem.N * cost_unit(problem)
-    way = (found.U - U0).abs().flatten(1).amax(-1) / (1.0 + U0.abs().flatten(1).amax(-1))
+    way = (best.U - U0).abs().flatten(1).amax(-1) / (1.0 + U0.abs().flatten(1).amax(-1))
     open_ended = (left > STATIONARY) | (way >= FAR_CONTROLS)
-    falls = ((found.cost < -DEEP_FALL * unit) | open_ended) & (beyond_rounding(found.violation, found.U) <= tolerance)
+    falls = ((best.cost < -DEEP_FALL * unit) | open_ended) & (beyond_rounding(best.violation, best.U) <= tolerance)
     rows = falls.nonzero().flatten()
     if rows.numel() == 0:
         return falls
-    X, U0, U, cost, unit = (part[rows] for part in (found.X, U0, found.U, found.cost, unit))
-    held = problem.take(rows).held_at(X[:, 0])
-    before = held.cost.total(open_loop(held, U0), U0)
-    farther, clear = _farther(held, U0, U, tolerance)
+    X, U0, U, cost, unit = (z[rows] for z in (best.X, U0, best.U, best.cost, unit))
+    fixed = problem.take(rows).held_at(X[:, 0])
+    before = fixed.cost.total(open_loop(fixed, U0), U0)
+    farther, clear = _farther(fixed, U0, U, tolerance)
     costs = torch.stack([cost, *farther])
     fall, size, times = before - costs, before.abs() + unit, cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
     linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP_FALL * size)
     rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
-    without = (cost - cost_scale(held).constant).abs() + unit
+    without = (cost - cost_scale(fixed).constant).abs() + unit
     by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]
     falls[rows] = (fall[0] >= BOTTOMLESS * size) | ((linear | by_decades) & clear)
     stuck = (torch.isinf(left[rows]) & ~falls[rows]).nonzero().flatten()
     if stuck.numel() > 0:  # no control Hessian was convex enough: the cost may fall without end at a pole
-        falls[rows[stuck]] = _falls_at_a_pole(held.take(stuck), U[stuck], without[stuck], tolerance)
+        falls[rows[stuck]] = _falls_at_a_pole(fixed.take(stuck), U[stuck], without[stuck], tolerance)
     return falls
 
 
@@ -75,9 +75,9 @@ def _falls_at_a_pole(problem: Problem, U: Tensor, size: Tensor, tolerance: float
         V = U[each] - places.view(-1, 1, 1) * slope[each]
         path = open_loop(many, V)
         costs = torch.where(measured(many, path, V) <= tolerance, many.cost.total(path, V), torch.inf)
-        lowest, at = costs.nan_to_num(torch.inf, torch.inf, torch.inf).view(-1, POLE_PLACES).min(-1)
+        lowest, index = costs.nan_to_num(torch.inf, torch.inf, torch.inf).view(-1, POLE_PLACES).min(-1)
         best.append(lowest)
-        ends = [places.gather(1, (at + by).clamp(0, POLE_PLACES - 1).unsqueeze(-1)) for by in (-1, 1)]
+        ends = [places.gather(1, (index + by).clamp(0, POLE_PLACES - 1).unsqueeze(-1)) for by in (-1, 1)]
         places = ends[0] + (ends[1] - ends[0]) * torch.linspace(0.0, 1.0, POLE_PLACES, dtype=U.dtype, device=U.device)
     first, later = best[0] - best[POLE_ROUNDS // 2], best[POLE_ROUNDS // 2] - best[-1]
     return (later >= 0.5 * first) & (later > STATIONARY * size)

@@ -59,9 +59,9 @@ def diagonal_scatter(a: np.ndarray, source: np.ndarray, offset: int = 0, dim1: i
     return copy
 
 
-def _written(a: np.ndarray, place: tuple[Any, ...], source: np.ndarray) -> np.ndarray:
+def _written(a: np.ndarray, key: tuple[Any, ...], source: np.ndarray) -> np.ndarray:
     copy = a.astype(object)
-    copy[(*place, ...)] = source  # with the ellipsis, a single element is assigned as an array too
+    copy[(*key, ...)] = source  # with the ellipsis, a single element is assigned as an array too
     return copy
 
 
@@ -101,8 +101,8 @@ def squeeze(a: np.ndarray, dim: Any = None) -> np.ndarray:
 
 
 def expand(a: np.ndarray, sizes: Sequence[int], **_: Any) -> np.ndarray:
-    own = (1,) * (len(sizes) - a.ndim) + a.shape
-    return np.broadcast_to(a, [have if want == -1 else want for have, want in zip(own, sizes, strict=True)])
+    shape = (1,) * (len(sizes) - a.ndim) + a.shape
+    return np.broadcast_to(a, [have if want == -1 else want for have, want in zip(shape, sizes, strict=True)])
 
 
 def pieces(a: np.ndarray, sizes: Sequence[int], dim: int = 0) -> list[np.ndarray]:
@@ -116,4 +116,4 @@ def split(a: np.ndarray, size: int | Sequence[int], dim: int = 0) -> list[np.nda
 
 
 def unbind(a: np.ndarray, dim: int = 0) -> list[np.ndarray]:
-    return [boxed(part) for part in np.moveaxis(a, dim, 0)]
+    return [boxed(row) for row in np.moveaxis(a, dim, 0)]

@@ -109,38 +109,38 @@ def _sort(x: Tensor, dim: int = -1, descending: bool = False, *, stable: Any = N
     parts = list(x.unbind(dim))
     for i, j in _exchanges(len(parts)):
         parts[i], parts[j] = torch.minimum(parts[i], parts[j]), torch.maximum(parts[i], parts[j])
-    found = torch.stack(parts[::-1] if descending else parts, dim)
-    return found, _places(found, x, dim)
+    values = torch.stack(parts[::-1] if descending else parts, dim)
+    return values, _places(values, x, dim)
 
 
 def _exchanges(n: int) -> list[tuple[int, int]]:
-    found, p = [], 1
+    pairs, p = [], 1
     while p < n:
         k = p
         while k >= 1:
             for j in range(k % p, n - k, 2 * k):
                 for i in range(min(k, n - j - k)):
                     if (i + j) // (2 * p) == (i + j + k) // (2 * p):
-                        found.append((i + j, i + j + k))
+                        pairs.append((i + j, i + j + k))
             k //= 2
         p *= 2
-    return found
+    return pairs
 
 
-def _places(found: Tensor, among: Tensor, dim: int) -> Tensor:
+def _places(values: Tensor, among: Tensor, dim: int) -> Tensor:
     """Where values are found among others along an axis."""
-    same = found.movedim(dim, -1).unsqueeze(-1) == among.movedim(dim, -1).unsqueeze(-2)
+    same = values.movedim(dim, -1).unsqueeze(-1) == among.movedim(dim, -1).unsqueeze(-2)
     return same.to(torch.uint8).argmax(-1).movedim(-1, dim)
 
 
 def _topk(x: Tensor, k: int, dim: int = -1, largest: bool = True, sorted: bool = True) -> Any:
-    found, places = x.sort(dim, descending=largest)
-    return found.narrow(dim, 0, k), places.narrow(dim, 0, k)
+    values, places = x.sort(dim, descending=largest)
+    return values.narrow(dim, 0, k), places.narrow(dim, 0, k)
 
 
 def _kth(x: Tensor, k: int, dim: int = -1, keepdim: bool = False) -> Any:
-    found = [part.narrow(dim, k - 1, 1) for part in x.sort(dim)]
-    return tuple(found) if keepdim else tuple(part.squeeze(dim) for part in found)
+    kept = [values.narrow(dim, k - 1, 1) for values in x.sort(dim)]
+    return tuple(kept) if keepdim else tuple(values.squeeze(dim) for values in kept)
 
 
 def _median(x: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
@@ -187,17 +187,17 @@ def _convolution(
 ) -> Any:
     if turned:
         return NotImplemented
-    d, given, made = len(stride), weight.shape[1], weight.shape[0]
+    d, width, made = len(stride), weight.shape[1], weight.shape[0]
     x = _pad(x, [size for size in reversed(padding) for _ in (0, 1)])
     sizes = [(x.shape[2 + i] - dilation[i] * (weight.shape[2 + i] - 1) - 1) // stride[i] + 1 for i in range(d)]
     total: Any = 0.0
-    for at in product(*map(range, weight.shape[2:])):
-        part = x
-        for i, k in enumerate(at):
+    for tap in product(*map(range, weight.shape[2:])):
+        cut = x
+        for i, k in enumerate(tap):
             first = k * dilation[i]
-            part = part[(slice(None),) * (2 + i) + (slice(first, first + stride[i] * (sizes[i] - 1) + 1, stride[i]),)]
-        parts, own = part.reshape(len(x), groups, 1, given, -1), weight[(..., *at)].reshape(1, groups, -1, given, 1)
-        total = total + (parts * own).sum(3)
+            cut = cut[(slice(None),) * (2 + i) + (slice(first, first + stride[i] * (sizes[i] - 1) + 1, stride[i]),)]
+        parts, w = cut.reshape(len(x), groups, 1, width, -1), weight[(..., *tap)].reshape(1, groups, -1, width, 1)
+        total = total + (parts * w).sum(3)
     total = total.reshape(len(x), made, *sizes)
     return total if bias is None else total + bias.reshape(made, *[1] * d)
 
@@ -215,25 +215,25 @@ def _avg_pool(
 
 def _trilinear(a: Tensor, b: Tensor, c: Tensor, *lists: Any) -> Tensor:
     """The sum of a b c over the axes of the last list, each factor with the axes of its own list added."""
-    found: Any = 1.0
+    products: Any = 1.0
     for factor, added in zip((a, b, c), lists[:3], strict=True):
         for dim in added:
             factor = factor.unsqueeze(dim)
-        found = found * factor
-    return found.sum(lists[3])
+        products = products * factor
+    return products.sum(lists[3])
 
 
 def _scatter(accumulate: bool) -> Callable[..., Any]:
     def scattered(x: Tensor, dim: int, index: Tensor, source: Any, reduce: Any = None) -> Any:
         if reduce is not None or x.dim() == 0:
             return NotImplemented
-        at: Any = list(torch.meshgrid(*(torch.arange(n, device=x.device) for n in index.shape), indexing="ij"))
-        at[dim] = index
+        indices: Any = list(torch.meshgrid(*(torch.arange(n, device=x.device) for n in index.shape), indexing="ij"))
+        indices[dim] = index
         if isinstance(source, Tensor):
             source = source[tuple(slice(n) for n in index.shape)]
         else:
             source = torch.full(index.shape, float(source), dtype=x.dtype, device=x.device)
-        return x.index_put(at, source, accumulate)
+        return x.index_put(indices, source, accumulate)
 
     return scattered
 

@@ -54,8 +54,8 @@ def _as_type(
     if dtype.is_floating_point and not _is_narrower(dtype, precision):
         return value
     change = _change(dtype, all(_is_whole(slot.dtype) or slot.dtype == torch.bool for slot in sources))
-    own = [known[slot] for slot in sources if slot.dtype == dtype]
-    kept = {id(element) for array in own if array.dtype == object for element in array.flat}
+    same = [known[slot] for slot in sources if slot.dtype == dtype]
+    kept = {id(element) for array in same if array.dtype == object for element in array.flat}
     return boxed(np.frompyfunc(lambda e: e if id(e) in kept else change(e), 1, 1)(boxed(value)))
 
 

@@ -110,8 +110,8 @@ class Facts:
     @property
     def nbytes(self) -> int:
         """The size of the tensors and arrays that are held, of sparse ones as if they were dense."""
-        held = (thing for thing in self.alive if isinstance(thing, (Tensor, np.ndarray)))
-        return sum(int(np.prod(thing.shape)) * thing.dtype.itemsize for thing in held)
+        sized = (thing for thing in self.alive if isinstance(thing, (Tensor, np.ndarray)))
+        return sum(int(np.prod(thing.shape)) * thing.dtype.itemsize for thing in sized)
 
     def walk(self, thing: Any) -> None:
         kind = type(thing)
@@ -147,9 +147,9 @@ class Facts:
 
     def _first(self, thing: Any) -> bool:
         """Whether the walk comes here for the first time; a fact in itself."""
-        place = self._met.setdefault(id(thing), len(self._met))
-        self.note(type(thing), place)
-        is_new = place == len(self._passed)
+        index = self._met.setdefault(id(thing), len(self._met))
+        self.note(type(thing), index)
+        is_new = index == len(self._passed)
         if is_new:
             self._passed.append(thing)
         return is_new
@@ -242,10 +242,10 @@ class Facts:
             return self.note(function.__name__)
         return self.same(function)
 
-    def _descriptor(self, found: Any) -> None:
-        if not is_trusted(found.__objclass__.__module__) and not found.__objclass__.__module__.startswith("torch._C"):
-            raise Unseen(found.__name__)
-        self.same(found)
+    def _descriptor(self, method: Any) -> None:
+        if not is_trusted(method.__objclass__.__module__) and not method.__objclass__.__module__.startswith("torch._C"):
+            raise Unseen(method.__name__)
+        self.same(method)
 
     def _module(self, module: types.ModuleType) -> None:
         if is_library(module):
@@ -302,9 +302,9 @@ class Facts:
         # Classes that were registered for an abstract one.
         others = len(abc._get_dump(cls)[0]) if "_abc_impl" in vars(cls) else 0  # type: ignore[attr-defined]
         if is_library(cls):
-            held = [value for name, value in vars(cls).items() if name not in BESIDES] if cls.__flags__ & HEAP else []
-            self.alive += held
-            self.note(id(cls), others, *map(id, held))
+            body = [value for name, value in vars(cls).items() if name not in BESIDES] if cls.__flags__ & HEAP else []
+            self.alive += body
+            self.note(id(cls), others, *map(id, body))
             for base in cls.__bases__:
                 self._class(base)
             return
@@ -336,7 +336,7 @@ class Facts:
         if is_tuple:
             self._all(thing)
         of_torchgco = kind.__module__.partition(".")[0] == "torchgco"
-        own = {*thing.batched, *thing.per_element} if isinstance(thing, PerElement) else set()
+        varying = {*thing.batched, *thing.per_element} if isinstance(thing, PerElement) else set()
         values = {field.name: getattr(thing, field.name) for field in fields(thing)} if is_dataclass(thing) else {}
         if not of_torchgco or not values:
             slots = [name for base in kind.__mro__ for name, value in vars(base).items() if isinstance(value, _SLOT)]
@@ -345,7 +345,7 @@ class Facts:
         self.note(len(values))
         for name, value in values.items():
             self.note(name)
-            if name in own:
+            if name in varying:
                 self._form(value)
             elif of_torchgco and isinstance(value, Tensor) and value.numel() <= COMPARED_NUMBERS:
                 content = _bytes(value)
@@ -358,8 +358,8 @@ class Facts:
         """What a trace sees of values per problem: a row that all problems share is traced as such."""
         if isinstance(value, tuple):
             self.note(len(value))
-            for part in value:
-                self._form(part)
+            for member in value:
+                self._form(member)
         elif type(value) is dict:
             self._all(value)
             self._form(tuple(value.values()))
@@ -392,8 +392,8 @@ _WALKS: dict[type, Callable[[Facts, Any], object]] = {
     **dict.fromkeys((list, collections.deque), Facts._all),
     **dict.fromkeys((set, frozenset), Facts._set),
     complex: lambda facts, number: facts.note(number.real.hex(), number.imag.hex()),
-    range: lambda facts, part: facts.note(part.start, part.stop, part.step),
-    slice: lambda facts, part: facts._all((part.start, part.stop, part.step)),
+    range: lambda facts, span: facts.note(span.start, span.stop, span.step),
+    slice: lambda facts, span: facts._all((span.start, span.stop, span.step)),
     types.SimpleNamespace: lambda facts, space: facts._items(vars(space)),
     types.FunctionType: Facts._function,
     types.MethodType: lambda facts, method: facts._all((method.__func__, method.__self__)),
@@ -403,8 +403,8 @@ _WALKS: dict[type, Callable[[Facts, Any], object]] = {
         (types.MethodDescriptorType, types.WrapperDescriptorType, types.ClassMethodDescriptorType), Facts._descriptor
     ),
     **dict.fromkeys((staticmethod, classmethod), lambda facts, method: facts.walk(method.__func__)),
-    property: lambda facts, found: facts._all((found.fget, found.fset, found.fdel)),
-    functools.cached_property: lambda facts, found: facts.walk(found.func),
-    functools.partial: lambda facts, part: facts._all((part.func, part.args, part.keywords, vars(part))),
+    property: lambda facts, accessor: facts._all((accessor.fget, accessor.fset, accessor.fdel)),
+    functools.cached_property: lambda facts, accessor: facts.walk(accessor.func),
+    functools.partial: lambda facts, call: facts._all((call.func, call.args, call.keywords, vars(call))),
     types.ModuleType: Facts._module,
 }

@@ -129,21 +129,21 @@ class Nets:
         shared: Sequence[Slot],
         result: Slot,
     ) -> None:
-        found = _Search(shapes, set(shared))
+        search = _Search(shapes, set(shared))
         for operation in operations:
-            found.take(operation)
-        parts = [part for part in found.parts if _is_worth_it(part, shapes)]
-        self._part = {id(operation): part for part in parts for operation in part.operations}
-        read = {slot for one in operations if id(one) not in self._part for slot in one.inputs}
-        read |= {result, *(part.source for part in parts)}
-        for part in parts:
-            part.outputs = [slot for slot in part.widths if slot in read]
-        self._matrices = list(dict.fromkeys(slot for part in parts for slot in part.matrices))
-        weights = dict.fromkeys(slot for part in parts for slot in part.vectors)
+            search.take(operation)
+        parts = [net for net in search.parts if _is_worth_it(net, shapes)]
+        self._part = {id(operation): net for net in parts for operation in net.operations}
+        read = {slot for op in operations if id(op) not in self._part for slot in op.inputs}
+        read |= {result, *(net.source for net in parts)}
+        for net in parts:
+            net.outputs = [slot for slot in net.widths if slot in read]
+        self._matrices = list(dict.fromkeys(slot for net in parts for slot in net.matrices))
+        weights = dict.fromkeys(slot for net in parts for slot in net.vectors)
         self._weights = [*weights, *(slot for slot in self._matrices if slot not in weights)]
         self.shapes = {slot: shapes[slot] for slot in self._weights}
         self.alone = {slot for slot in self._weights if slot not in read}  # weights that only networks read
-        self._shapes = {slot: shapes[slot] for part in parts for slot in (*part.widths, *part.weights, part.source)}
+        self._shapes = {slot: shapes[slot] for net in parts for slot in (*net.widths, *net.weights, net.source)}
 
     @property
     def size(self) -> int:
@@ -157,20 +157,20 @@ class Nets:
         """
         places, end = self._places(first)
         numbers = torch.zeros(end - first, dtype=torch.float64, device="cpu")
-        for (slot, turned), place in places.items():
+        for (slot, turned), start in places.items():
             value = known[slot].detach().to_dense()
-            part = numbers[place - first :][: value.numel()]
-            part.copy_((value.T if turned else value).reshape(-1))
+            entries = numbers[start - first :][: value.numel()]
+            entries.copy_((value.T if turned else value).reshape(-1))
         return numbers
 
     def steps(self, operations: Sequence[Operation], whole: bool) -> Iterator[tuple[Part | None, Operation]]:
         """Operations in order; if networks stay whole, each with the first of its operations, without the others."""
         begun = set()
         for operation in operations:
-            part = self._part.get(id(operation)) if whole else None
-            if part is None or id(part) not in begun:
-                yield part, operation
-            begun.add(id(part))
+            net = self._part.get(id(operation)) if whole else None
+            if net is None or id(net) not in begun:
+                yield net, operation
+            begun.add(id(net))
 
     def call(self, part: Part, known: dict[Slot, Any], first: int, precision: torch.dtype, calls: list[Call]) -> None:
         """Add a network's calls to `calls`, one a row, and its outputs, symbols, to `known`.
@@ -202,18 +202,18 @@ class Nets:
 
         Each begins a line of the cache, which loads of whole vectors then don't cross.
         """
-        places, place = {}, first
+        places, start = {}, first
         for slot, turned in (*((slot, False) for slot in self._weights), *((slot, True) for slot in self._matrices)):
-            place = -(-place // LINE) * LINE
-            places[slot, turned] = place
-            place += math.prod(self.shapes[slot])
-        return places, place
+            start = -(-start // LINE) * LINE
+            places[slot, turned] = start
+            start += math.prod(self.shapes[slot])
+        return places, start
 
 
-def _is_worth_it(part: Part, shapes: Mapping[Slot, tuple[int, ...]]) -> bool:
+def _is_worth_it(net: Part, shapes: Mapping[Slot, tuple[int, ...]]) -> bool:
     """Whether there are enough weights, and a function that isn't linear: linear systems keep zeros and ones."""
-    curved = any(name_of(one.function).removeprefix("aten.") in CURVED for one in part.operations)
-    return curved and sum(math.prod(shapes[slot]) for slot in part.matrices) >= LEAST_NET
+    curved = any(name_of(op.function).removeprefix("aten.") in CURVED for op in net.operations)
+    return curved and sum(math.prod(shapes[slot]) for slot in net.matrices) >= LEAST_NET
 
 
 class _Search:
@@ -240,32 +240,32 @@ class _Search:
             return
         if len({slot.dtype for slot in operation.inputs}) > 1:
             return
-        part = self._of.get(source) or next((part for part in self.parts if part.source == source), None)
-        if part is None:
-            part = Part(source, k, rows)
-            self.parts.append(part)
-        elif part.rows != rows:
+        net = self._of.get(source) or next((net for net in self.parts if net.source == source), None)
+        if net is None:
+            net = Part(source, k, rows)
+            self.parts.append(net)
+        elif net.rows != rows:
             return
-        part.vectors += bias
-        part.matrices.append(matrix)
-        self._add(part, operation)
+        net.vectors += bias
+        net.matrices.append(matrix)
+        self._add(net, operation)
 
     def _take_neurons(self, operation: Operation) -> None:
         parts = {id(self._of[slot]): self._of[slot] for slot in operation.inputs if slot in self._of}
         if len(parts) != 1:
             return
-        (part,) = parts.values()
-        widths = {self._width(slot, part.rows) for slot in operation.outputs}
+        (net,) = parts.values()
+        widths = {self._width(slot, net.rows) for slot in operation.outputs}
         read = [slot for slot in operation.inputs if slot not in self._of]
         if None in widths or len(widths) > 1 or not self._shared.issuperset(read):
             return
         (width,) = widths
-        if any(part.widths[slot] != width for slot in operation.inputs if slot in self._of):
+        if any(net.widths[slot] != width for slot in operation.inputs if slot in self._of):
             return
         if not all(self._is_of_neurons(slot, width) for slot in read):
             return
-        part.vectors += read
-        self._add(part, operation)
+        net.vectors += read
+        self._add(net, operation)
 
     def _is_of_neurons(self, slot: Slot, width: int | None) -> bool:
         """Whether all rows are combined with the same weights: one, or one of each neuron, but not one of each row."""
@@ -277,11 +277,11 @@ class _Search:
         shape = self._shapes[slot]
         return shape[-1] if shape and math.prod(shape[:-1]) == rows else None
 
-    def _add(self, part: Part, operation: Operation) -> None:
-        part.operations.append(operation)
+    def _add(self, net: Part, operation: Operation) -> None:
+        net.operations.append(operation)
         for slot in operation.outputs:
-            self._of[slot] = part
-            part.widths[slot] = self._shapes[slot][-1]
+            self._of[slot] = net
+            net.widths[slot] = self._shapes[slot][-1]
 
 
 class _Layers:
@@ -289,18 +289,18 @@ class _Layers:
 
     def __init__(
         self,
-        part: Part,
+        net: Part,
         shapes: Mapping[Slot, tuple[int, ...]],
         places: Mapping[tuple[Slot, bool], int],
         precision: torch.dtype,
     ) -> None:
         import casadi as ca
 
-        self._part, self._shapes, self._places, self._precision = part, shapes, places, precision
+        self._part, self._shapes, self._places, self._precision = net, shapes, places, precision
         self._layers: list[Linear | Neurons] = []
         self._symbols = [ca.SX.sym("a0")]  # of a neuron of each layer
         self._read: dict[Slot, Any] = {}  # symbols of an entry of a vector of weights, or of a single weight
-        self._forms: dict[Slot, Any] = {part.source: self._symbols[0]}  # a neuron of each slot, of these symbols
+        self._forms: dict[Slot, Any] = {net.source: self._symbols[0]}  # a neuron of each slot, of these symbols
 
     def net(self) -> Net:
         for operation in self._part.operations:
@@ -315,8 +315,8 @@ class _Layers:
         *bias, source, matrix = operation.args
         k, h = self._shapes[matrix]
         turned = self._places[matrix, True]
-        at = self._places[bias[0], False] if bias else None
-        symbol = self._add(Linear(self._layer(source), k, h, self._places[matrix, False], turned, at))
+        bias_start = self._places[bias[0], False] if bias else None
+        symbol = self._add(Linear(self._layer(source), k, h, self._places[matrix, False], turned, bias_start))
         (made,) = operation.outputs
         narrow = torch.finfo(made.dtype).eps > torch.finfo(self._precision).eps
         self._forms[made] = to_single(symbol) if narrow else symbol

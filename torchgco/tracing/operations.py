@@ -58,9 +58,9 @@ def _comparison(compare: Callable) -> Callable:
     """
 
     def compared(a: Any, b: Any) -> Any:
-        found = compare(a, b)
-        if not isinstance(found, _casadi().SX) or not found.is_constant():
-            return found
+        result = compare(a, b)
+        if not isinstance(result, _casadi().SX) or not result.is_constant():
+            return result
         return compare(_itself(a), b) if isinstance(a, _casadi().SX) else compare(a, _itself(b))
 
     return _binary(compared)

@@ -204,9 +204,9 @@ class Recording(TorchDispatchMode):
         return tensor
 
     def _unfit(self, what: str, operation: Any, kind: type[_Unfit] | None = None) -> _Unfit:
-        found = (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
-        self.unfit = self.unfit or found
-        return found
+        error = (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
+        self.unfit = self.unfit or error
+        return error
 
     def _follows(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on the function's arguments."""
@@ -214,9 +214,9 @@ class Recording(TorchDispatchMode):
 
     def look(self, *tree: Any) -> None:
         """Note that Python code reads values in `tree`, or sees a shape that depends on them."""
-        found = [self.slot(leaf) for leaf in _leaves(tree) if isinstance(leaf, Tensor) and self._is_outer(leaf)]
-        self.looked |= bool(found)
-        self.read += found
+        slots = [self.slot(leaf) for leaf in _leaves(tree) if isinstance(leaf, Tensor) and self._is_outer(leaf)]
+        self.looked |= bool(slots)
+        self.read += slots
 
     def _is_outer(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on one from outside that isn't an argument."""
@@ -230,9 +230,9 @@ def _has_own_memory(tensor: Tensor) -> bool:
         return tensor.untyped_storage().resizable()
 
 
-def _overlap(one: Tensor, other: Tensor) -> bool:
+def _overlap(a: Tensor, b: Tensor) -> bool:
     """Whether two tensors may share memory."""
-    (first, last), (begin, end) = _memory(one), _memory(other)
+    (first, last), (begin, end) = _memory(a), _memory(b)
     return first < end and begin < last
 
 
@@ -274,7 +274,7 @@ class _Reading(TorchDispatchMode):
     def __init__(self, arguments: Iterable[Any]) -> None:
         super().__init__()
         self.values, self.path = list[Any](), list[Any]()
-        self._known = {id(part): part for part in arguments}
+        self._known = {id(argument): argument for argument in arguments}
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
@@ -284,8 +284,8 @@ class _Reading(TorchDispatchMode):
         elif SHAPED_BY_VALUES in func.tags:
             self.values.append(tuple(out.shape) if isinstance(out, Tensor) else None)
         kinds = {argument.name: str(argument.type) for argument in func._schema.arguments}
-        given = [*zip(kinds.values(), args, strict=False), *((kinds[name], part) for name, part in kwargs.items())]
-        self.path.append((str(func), *(self._number(kind, leaf) for kind, part in given for leaf in _leaves(part))))
+        typed = [*zip(kinds.values(), args, strict=False), *((kinds[name], value) for name, value in kwargs.items())]
+        self.path.append((str(func), *(self._number(kind, leaf) for kind, value in typed for leaf in _leaves(value))))
         self._known |= {id(leaf): leaf for leaf in _leaves(out)}
         return out
 
@@ -299,12 +299,12 @@ class _Reading(TorchDispatchMode):
         return False
 
 
-def take_same_branches(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+def take_same_branches(call: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
     """Whether Python code reads the same of tensors in two calls (function, *arguments), or then does the same.
 
     One of the calls may consist of several, one for each knot.
     """
-    (values, path), (others, other_path) = _read(*one), _read(*other)
+    (values, path), (others, other_path) = _read(*call), _read(*other)
     return (None not in values and _repeat(values, others)) or _repeat(path, other_path)
 
 
@@ -316,9 +316,9 @@ def _read(function: Callable[..., Tensor], *arguments: Any) -> tuple[list[Any], 
     return [*reading.values, *(tensor.tolist() for tensor in calls.read)], reading.path
 
 
-def _repeat(some: list[Any], others: list[Any]) -> bool:
+def _repeat(values: list[Any], others: list[Any]) -> bool:
     """Whether one of two lists is the other one, once or several times."""
-    few, many = sorted((some, others), key=len)
+    few, many = sorted((values, others), key=len)
     return many == len(many) // max(1, len(few)) * few
 
 
@@ -357,12 +357,12 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
 def replay_all(operations: Iterable[Operation], known: dict[Slot, Any]) -> None:
     """Apply PyTorch's operations in order, each with the default type that it was recorded with."""
     with torch.no_grad():
-        for default, some in groupby(operations, key=lambda operation: operation.default):
+        for default, group in groupby(operations, key=lambda operation: operation.default):
             usual = torch.get_default_dtype()
             if default is not usual:  # it was changed since
                 torch.set_default_dtype(default)
             try:
-                for operation in some:
+                for operation in group:
                     operation.replay(known)
             finally:
                 if default is not usual:
@@ -393,18 +393,18 @@ def _mapped(function: Callable[[Any], Any], tree: Any) -> Any:
     As PyTorch's `tree_map` of these three, which looks for many kinds more and takes half of the time of a trace.
     """
     if isinstance(tree, (tuple, list)):
-        mapped = [_mapped(function, part) for part in tree]
+        mapped = [_mapped(function, branch) for branch in tree]
         return mapped if isinstance(tree, list) else tuple(mapped)
     if isinstance(tree, dict):
-        return {name: _mapped(function, part) for name, part in tree.items()}
+        return {name: _mapped(function, branch) for name, branch in tree.items()}
     return function(tree)
 
 
 def _leaves(tree: Any) -> Iterator[Any]:
     """The leaves of what `_mapped` takes, in order."""
     if isinstance(tree, (tuple, list, dict)):
-        for part in tree.values() if isinstance(tree, dict) else tree:
-            yield from _leaves(part)
+        for branch in tree.values() if isinstance(tree, dict) else tree:
+            yield from _leaves(branch)
     else:
         yield tree
 
@@ -414,8 +414,8 @@ def _out_of_place(operation: Any) -> Any:
     """The operation that makes a tensor of what this one does in place; None where there is none."""
     name, overload = name_of(operation).removesuffix("_"), operation._overloadname
     packet = getattr(torch.ops.aten, name.removeprefix("aten."), None)
-    found = getattr(packet, overload, None) if name_of(operation).endswith("_") else None
-    return None if found is None or found._schema.is_mutable else found
+    variant = getattr(packet, overload, None) if name_of(operation).endswith("_") else None
+    return None if variant is None or variant._schema.is_mutable else variant
 
 
 @cache
@@ -429,7 +429,7 @@ def _shaping(operation: Any, args: Sequence[Any]) -> Sequence[Any]:
     """The arguments whose values may decide the result's shape: of an indexed tensor, the masks."""
     if name_of(operation) != "aten.index":
         return args
-    return [place for place in args[1] if place is not None and place.dtype in (torch.bool, torch.uint8)]
+    return [index for index in args[1] if index is not None and index.dtype in (torch.bool, torch.uint8)]
 
 
 @cache
@@ -437,8 +437,8 @@ def _decompositions() -> dict[Any, Callable]:
     from torch._decomp import core_aten_decompositions, decomposition_table
 
     # Those of the whole table that aren't made of the primitives of PyTorch's compiler.
-    own = {op: rule for op, rule in decomposition_table.items() if rule.__module__ == "torch._decomp.decompositions"}
-    return own | dict(core_aten_decompositions())
+    rules = {op: rule for op, rule in decomposition_table.items() if rule.__module__ == "torch._decomp.decompositions"}
+    return rules | dict(core_aten_decompositions())
 
 
 @cache

@@ -7,7 +7,7 @@ whenever they are asked for, and a problem's own numbers for each problem. Only 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cached_property
@@ -25,15 +25,9 @@ from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.nets import MOST_WEIGHTS, Call, Nets
 from torchgco.tracing.operations import OPERATIONS
-from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
+from torchgco.tracing.picks import followers, indices, needed, picks_of
+from torchgco.tracing.recorder import Operation, Recording, Slot, name_of, record, replay_all
 
-INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
-# What moves numbers and computes none.
-PICKING = {f"aten.{name}" for name in (
-    "index", "index_select", "select", "slice", "unsqueeze", "squeeze", "view", "reshape", "expand", "detach", "alias",
-    "clone", "permute", "transpose", "t", "unbind", "split", "cat", "stack",
-)}  # fmt: skip
-PROBED = 3  # problems for which a function is asked which numbers it takes
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
 
@@ -71,69 +65,95 @@ class Traced:
     ) -> None:
         self.field = field
         self._precision = max((example.dtype for example in examples), key=lambda dtype: torch.finfo(dtype).bits)
+        self._shapes = [tuple(example.shape) for example in examples]
         index = torch.zeros(1, dtype=torch.int64, device=examples[0].device)
         recording = record(field, function, index, *map(scattered, examples))
         self._index, *self._variables = recording.inputs
         self._result, self._captured = recording.result, recording.captured
-        operations = _needed(recording.operations, self._result)
-        followers = _followers(recording.operations, self._variables)
+        before = self._split(recording)
+        places = {id(tensor): i for i, tensor in enumerate(own)}
+        self._named = {slot: places[id(tensor)] for slot, tensor in self._captured.items() if id(tensor) in places}
+        self._of_one_row = [_one_row(tensor) for tensor in own]
+        outer = [slot for slot in recording.outside if slot not in self._named]
+        self.looked, self.outside = recording.looked, [self._captured[slot] for slot in outer]
+        self._sort(recording, [slot for slot in outer if slot.dtype.is_floating_point], index)
+        self._fix(recording, before, followers(self._plain, outer))
+
+    def _split(self, recording: Recording) -> list[Operation]:
+        """CasADi's operations, which depend on the variables, and PyTorch's; returns all that come before the former.
+
+        Raises:
+            InputError: see the class.
+        """
+        operations = needed(recording.operations, self._result)
+        symbolic = followers(recording.operations, self._variables)
         for operation in recording.operations:
-            if not operation.outputs and not followers.isdisjoint(operation.inputs):
+            if not operation.outputs and not symbolic.isdisjoint(operation.inputs):
                 what = f"one that fails for some values of its arguments: {operation.title}"
-                raise InputError(field, "a function that can be traced", what)
-        self._symbolic = [one for one in operations if followers.issuperset(one.outputs)]
-        self._plain = [one for one in operations if not followers.issuperset(one.outputs)]
+                raise InputError(self.field, "a function that can be traced", what)
+        self._symbolic = [op for op in operations if symbolic.issuperset(op.outputs)]
+        self._plain = [op for op in operations if not symbolic.issuperset(op.outputs)]
         for operation in self._symbolic:
             if name_of(operation.function) not in OPERATIONS:
-                raise _unknown(field, operation)
+                raise _unknown(self.field, operation)
         # Where PyTorch's part ends and CasADi's begins.
-        border = dict.fromkeys(slot for one in self._symbolic for slot in one.inputs) | {self._result: None}
-        border = [slot for slot in border if slot not in followers]
-        places = {id(tensor): place for place, tensor in enumerate(own)}
-        self._named = {slot: places[id(tensor)] for slot, tensor in self._captured.items() if id(tensor) in places}
-        self._of_one_row, named = [_one_row(tensor) for tensor in own], list(self._named)
-        varying = _followers(self._plain, [self._index, *named])
-        self._own = [slot for slot in border if slot in varying]
-        outer = [slot for slot in recording.outside if slot not in named]
-        self.looked, self.outside = recording.looked, [self._captured[slot] for slot in outer]
-        read = [slot for slot in outer if slot.dtype.is_floating_point]
-        reached = _followers(self._plain, read) - varying
-        shared = [slot for slot in border if slot in reached and slot.dtype.is_floating_point]
+        border = dict.fromkeys(slot for op in self._symbolic for slot in op.inputs) | {self._result: None}
+        self._border = [slot for slot in border if slot not in symbolic]
+        self._indexed = {slot for op in self._plain if self._index in op.inputs for slot in op.inputs}
+        return [op for op in recording.operations if op.outputs and not symbolic.issuperset(op.outputs)]
+
+    def _sort(self, recording: Recording, read: list[Slot], index: Tensor) -> None:
+        """What is between PyTorch's part and CasADi's: a problem's own numbers, shared ones, weights, and constants.
+
+        Args:
+            read: floating tensors that the function has read, other than its arguments and `own`.
+            index: of a first problem, (1,).
+        """
+        varying = followers(self._plain, [self._index, *self._named])
+        reached = followers(self._plain, read) - varying
+        shared = [slot for slot in self._border if slot in reached and slot.dtype.is_floating_point]
         self._nets = Nets(self._symbolic, recording.shapes, shared, self._result)
         if self._nets.size > MOST_WEIGHTS:
-            raise InputError(field, f"networks of at most {MOST_WEIGHTS} weights in native kernels", self._nets.size)
-        self._shared = [slot for slot in shared if slot not in self._nets.alone]
+            expected = f"networks of at most {MOST_WEIGHTS} weights in native kernels"
+            raise InputError(self.field, expected, self._nets.size)
         computed = self._computed(index)
+        self._own = [slot for slot in self._border if slot in varying]
         self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
-        self._shared_shapes = {slot: tuple(computed[slot].shape) for slot in self._shared}
-        others = [slot for slot in border if slot not in varying and slot not in shared]
-        self._constants = {slot: _array(computed[slot]) for slot in others}
+        self._shared_shapes = {slot: tuple(computed[slot].shape) for slot in shared if slot not in self._nets.alone}
+        constant = {slot: computed[slot] for slot in self._border if slot not in varying and slot not in shared}
+        self._constants = {slot: _array(value) for slot, value in constant.items()}
         self._weights = {slot: _array(computed[slot]) for slot in self._nets.alone}
-        outside = _followers(self._plain, outer)
-        self._fixed = {slot: computed[slot].detach().clone() for slot in others if slot in outside}
-        # What Python code has read is part of the trace, too; of problems' own numbers it has read a first problem's.
-        every = [one for one in recording.operations if one.outputs and not followers.issuperset(one.outputs)]
-        of_problems = _followers(every, [self._index, *named])
-        self.reads_own = not of_problems.isdisjoint(recording.read)
-        self._fixed |= self._replayed(every, [slot for slot in recording.read if slot not in of_problems])
-        self._again = _needed(every, *shared, *self._fixed)
-        self.is_mixed = not outside.isdisjoint(self._own)
-        learned = _followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
-        self._numbers = _flat([computed[slot] for slot in self._shared])
+        places = indices(self._symbolic)
+        self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in places]
+        numbers = [computed[slot] for slot in self._shared_shapes]
+        self._numbers = _flat(numbers)
         self.shared = torch.cat((self._numbers, self._nets.numbers(computed, self._numbers.numel())))
-        sizes = [computed[slot].numel() for slot in self._shared]
-        self.pattern = _pattern(self._numbers, np.repeat([slot in learned for slot in self._shared], sizes))
-        if (alike := _earlier(field, self.pattern.shape)) is not None:
+        learned = followers(self._plain, [slot for slot in read if self._captured[slot].requires_grad])
+        is_learned = np.repeat([slot in learned for slot in self._shared_shapes], [value.numel() for value in numbers])
+        self.pattern = _pattern(self._numbers, is_learned)
+        if (alike := _earlier(self.field, self.pattern.shape)) is not None:
             self.pattern = np.where(np.isnan(alike.pattern), np.nan, self.pattern)
-        indices = {slot for one in self._symbolic if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
-        self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
-        self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
-        self._shapes = [tuple(example.shape) for example in examples]
+
+    def _fix(self, recording: Recording, before: list[Operation], outside: set[Slot]) -> None:
+        """What has to stay as it is, or the function is traced again: constants from outside, and what Python has read.
+
+        Of problems' own numbers Python has read a first problem's.
+
+        Args:
+            before: all operations that don't depend on the variables.
+            outside: what depends on tensors from outside.
+        """
+        of_problems = followers(before, [self._index, *self._named])
+        self.reads_own = not of_problems.isdisjoint(recording.read)
+        self.is_mixed = not outside.isdisjoint(self._own)
+        kept = [slot for slot in self._constants if slot in outside]
+        self._fixed = self._replayed(before, [*kept, *(slot for slot in recording.read if slot not in of_problems)])
+        self._again = needed(before, *self._shared_shapes, *self._nets.alone, *self._fixed)
 
     def _replayed(self, operations: list[Operation], wanted: Sequence[Slot]) -> dict[Slot, Tensor]:
         """What slots hold that depend on no argument, as tensors that nobody changes."""
         known: dict[Slot, Any] = dict(self._captured)
-        replay_all(_needed(operations, *wanted), known)
+        replay_all(needed(operations, *wanted), known)
         return {slot: known[slot].detach().clone() for slot in wanted}
 
     @property
@@ -154,7 +174,7 @@ class Traced:
         number, an index, what Python code has read, or the shape or type of a tensor has changed: the function is to be
         traced again.
         """
-        if not self._shared and not self._fixed and not self._nets.shapes:
+        if not self._shared_shapes and not self._fixed and not self._nets.shapes:
             return self.shared
         known: dict[Slot, Any] = dict(self._captured)
         shapes = (self._shared_shapes | self._nets.shapes).items()
@@ -165,7 +185,7 @@ class Traced:
             return None
         if not same or any((known[s].shape, known[s].dtype) != (torch.Size(shape), s.dtype) for s, shape in shapes):
             return None
-        shared, pattern = _flat([known[slot] for slot in self._shared]), torch.from_numpy(self.pattern)
+        shared, pattern = _flat([known[slot] for slot in self._shared_shapes]), torch.from_numpy(self.pattern)
         same = (shared == pattern) & (shared.signbit() == pattern.signbit())
         if not bool((same | pattern.isnan()).all()):
             return None
@@ -204,41 +224,9 @@ class Traced:
 
         These are the ones at the places `named`, in turn. None where a number is computed, or chosen by others.
         """
-        operations = _needed(self._plain, *self._own)
-        at = {slot for one in operations if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
-        chosen = at & (_followers(operations, [self._index, *self._named]) - {self._index})
-        if not _followers(operations, self._named).issuperset(self._own):
-            return None
-        if chosen or not self._named or any(name_of(one.function) not in PICKING for one in operations):
-            return None
-        others = self._captured.keys() & {slot for one in operations for slot in one.inputs} - self._named.keys()
         own = {slot: self._captured[slot] for slot in self._named}
-        rows = {slot: PROBED if slot in self._indexed else 1 for slot in own}
-        odd = any(part.dim() == 0 or (len(part) > 1 and rows[slot] == 1) for slot, part in own.items())
-        if odd or any(slot.dtype.is_floating_point for slot in others):
-            return None
-        sizes = {slot: math.prod(part.shape[1:]) for slot, part in own.items()}
-        known: dict[Slot, Any] = {slot: self._captured[slot] for slot in others}
-        total, first, row_of = sum(sizes.values()), 0, list[int]()  # row_of: 1 for numbers of a problem's own row
-        for slot, part in own.items():
-            places = torch.arange(first, first + sizes[slot], dtype=torch.float64)
-            numbers = total * torch.arange(rows[slot]).unsqueeze(-1) + places
-            known[slot] = numbers.reshape(rows[slot], *part.shape[1:]).to(part.device)
-            row_of, first = row_of + [int(rows[slot] > 1)] * sizes[slot], first + sizes[slot]
-        try:
-            found = torch.stack([self._picked(operations, known, i) for i in range(PROBED)])
-        except (RuntimeError, IndexError):  # other shapes than these
-            return None
-        if not bool((found[0] < total).all()):
-            return None
-        moved = total * torch.tensor(row_of)[found[0]]
-        return found[0] if torch.equal(found, found[0] + torch.arange(PROBED).unsqueeze(-1) * moved) else None
-
-    def _picked(self, operations: list[Operation], known: dict[Slot, Any], i: int) -> Tensor:
-        some = next(iter(known.values()))
-        known = {**known, self._index: torch.full((1,), i, dtype=torch.int64, device=some.device)}
-        replay_all(operations, known)
-        return torch.cat([known[slot].flatten().long().cpu() for slot in self._own])
+        operations = needed(self._plain, *self._own)
+        return picks_of(operations, own, self._own, self._index, self._captured, self._indexed)
 
     @property
     def named(self) -> list[int]:
@@ -253,8 +241,8 @@ class Traced:
         if len(own) != len(self._of_one_row):
             return None
         tensors, indexed = [], {self._named[slot] for slot in self._indexed if slot in self._named}
-        for place, (tensor, was_row) in enumerate(zip(own, self._of_one_row, strict=True)):
-            if was_row and not _one_row(tensor) and place not in indexed:
+        for i, (tensor, was_row) in enumerate(zip(own, self._of_one_row, strict=True)):
+            if was_row and not _one_row(tensor) and i not in indexed:
                 return None
             # The row of a single problem stands for all of its repetitions.
             is_spread = _one_row(tensor) and not was_row
@@ -262,7 +250,7 @@ class Traced:
         _ = self.picks  # once for all copies
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
-        copy._captured = self._captured | {slot: tensors[place] for slot, place in self._named.items()}
+        copy._captured = self._captured | {slot: tensors[i] for slot, i in self._named.items()}
         return copy
 
     def forget_values(self) -> None:
@@ -285,7 +273,7 @@ class Traced:
     def kin(self) -> str:
         """A text that functions share which differ in numbers alone, and few others."""
         shapes = self._shapes, self._own_shapes, [*self._shared_shapes.values(), *self._nets.shapes.values()]
-        return f"{shapes} {' '.join(name_of(one.function) for one in self._symbolic)}"
+        return f"{shapes} {' '.join(name_of(op.function) for op in self._symbolic)}"
 
     def __call__(
         self,
@@ -315,10 +303,10 @@ class Traced:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
         if calls is None:
             known |= self._weights
-        for part, operation in self._nets.steps(self._symbolic, calls is not None):
+        for net, operation in self._nets.steps(self._symbolic, calls is not None):
             try:
-                if part is not None and calls is not None:
-                    self._nets.call(part, known, len(self.pattern), self._precision, calls)
+                if net is not None and calls is not None:
+                    self._nets.call(net, known, len(self.pattern), self._precision, calls)
                 else:
                     replay(operation, known, self._precision)
             except NoCounterpart as error:
@@ -354,10 +342,10 @@ _EARLIER: ContextVar[list[Traced]] = ContextVar("earlier")
 def _earlier(field: str, shape: tuple[int, ...]) -> Traced | None:
     """The first of the earlier traces that is of this function, each once."""
     left = _EARLIER.get([])
-    found = next((one for one in left if one.field == field and one.pattern.shape == shape), None)
-    if found is not None:
-        left.remove(found)
-    return found
+    trace = next((trace for trace in left if trace.field == field and trace.pattern.shape == shape), None)
+    if trace is not None:
+        left.remove(trace)
+    return trace
 
 
 def _one_row(value: Tensor) -> bool:
@@ -366,14 +354,14 @@ def _one_row(value: Tensor) -> bool:
 
 def own_tensors(part: PerElement) -> list[Tensor]:
     """The tensors of a part of a problem, and of parts within it, that may differ from problem to problem."""
-    found: list[Tensor] = []
+    tensors: list[Tensor] = []
     for value in (getattr(part, name) for name in (*part.batched, *part.per_element)):
         for leaf in value if isinstance(value, tuple) else (value,):
             if isinstance(leaf, PerElement):
-                found += own_tensors(leaf)
+                tensors += own_tensors(leaf)
             elif isinstance(leaf, Tensor):
-                found.append(leaf)
-    return found
+                tensors.append(leaf)
+    return tensors
 
 
 def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
@@ -384,12 +372,12 @@ def _pattern(numbers: Tensor, learned: np.ndarray) -> np.ndarray:
     return pattern
 
 
-def _is_same(one: Tensor, other: Tensor) -> bool:
+def _is_same(a: Tensor, b: Tensor) -> bool:
     """Whether two tensors have the same shape and numbers, be they NaN."""
-    if torch.equal(one, other):
+    if torch.equal(a, b):
         return True
-    known = torch.where(one == other, one, torch.nan) if one.shape == other.shape and one.is_floating_point() else None
-    return known is not None and torch.equal(known.isnan(), one.isnan()) and torch.equal(one.isnan(), other.isnan())
+    known = torch.where(a == b, a, torch.nan) if a.shape == b.shape and a.is_floating_point() else None
+    return known is not None and torch.equal(known.isnan(), a.isnan()) and torch.equal(a.isnan(), b.isnan())
 
 
 def _flat(values: Sequence[Tensor]) -> Tensor:
@@ -398,32 +386,13 @@ def _flat(values: Sequence[Tensor]) -> Tensor:
     return torch.cat([torch.zeros(0, dtype=torch.float64, device="cpu"), *parts])
 
 
-def _needed(operations: list[Operation], *results: Slot) -> list[Operation]:
-    """The operations that the results depend on."""
-    wanted, kept = set(results), []
-    for operation in reversed(operations):
-        if not wanted.isdisjoint(operation.outputs):
-            wanted.update(operation.inputs)
-            kept.append(operation)
-    return kept[::-1]
-
-
-def _followers(operations: Iterable[Operation], sources: Iterable[Slot]) -> set[Slot]:
-    """`sources`, and all slots that depend on them."""
-    reached = set(sources)
-    for operation in operations:
-        if not reached.isdisjoint(operation.inputs):
-            reached.update(operation.outputs)
-    return reached
-
-
 def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict[Slot, np.ndarray]:
     """One array per slot, cut from `numbers` in turn."""
-    arrays, place = {}, 0
+    arrays, start = {}, 0
     for slot, shape in shapes.items():
         size = int(np.prod(shape))
-        arrays[slot] = numbers[place : place + size].reshape(shape)
-        place += size
+        arrays[slot] = numbers[start : start + size].reshape(shape)
+        start += size
     return arrays
 
 

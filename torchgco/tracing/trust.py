@@ -52,10 +52,10 @@ def is_library(thing: types.FunctionType | type | types.ModuleType) -> bool:
         return False
     if not thing.__flags__ & HEAP:
         return True
-    found: Any = sys.modules.get(thing.__module__)
+    named: Any = sys.modules.get(thing.__module__)
     for name in thing.__qualname__.split("."):
-        found = getattr(found, "__dict__", {}).get(name)
-    return found is thing
+        named = getattr(named, "__dict__", {}).get(name)
+    return named is thing
 
 
 def tells_settings(name: str, function: Any) -> bool:
@@ -75,10 +75,10 @@ def is_fixed(operation: Any) -> bool:
 @functools.lru_cache(maxsize=4096)
 def is_python(module: str) -> bool:
     """Whether a module is written in Python."""
-    found = sys.modules.get(module)
-    file = getattr(found, "__dict__", {}).get("__file__")
+    loaded = sys.modules.get(module)
+    file = getattr(loaded, "__dict__", {}).get("__file__")
     in_c = module in sys.builtin_module_names if file is None else not str(file).endswith((".py", ".pyc"))
-    return found is not None and not in_c
+    return loaded is not None and not in_c
 
 
 @functools.lru_cache(maxsize=4096)
@@ -86,8 +86,8 @@ def is_made(cls: type) -> bool:
     """Whether a class is made by a program in Python: its objects know nothing that `vars` and slots don't have."""
     if not cls.__flags__ & HEAP or not is_python(cls.__module__):
         return False
-    own = (value for value in vars(cls).values() if isinstance(value, _IN_C))
-    return not any(value.__objclass__ is cls for value in own)
+    slots = (value for value in vars(cls).values() if isinstance(value, _IN_C))
+    return not any(value.__objclass__ is cls for value in slots)
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ def contents(tensors: Iterable[Tensor]) -> tuple[Hashable, ...] | None:
     for tensor in tensors:
         if tensor.layout is not torch.strided or tensor.device.type != "cpu":
             return None
-        place, size = tensor.data_ptr(), tensor.nbytes
+        address, size = tensor.data_ptr(), tensor.nbytes
         if not tensor.is_contiguous():
             seen.append(tensor.stride())
             if size > 0:  # all from the first number to the last: strides are never negative
                 steps = ((count - 1) * by for count, by in zip(tensor.shape, tensor.stride(), strict=True))
                 size = (sum(steps) + 1) * tensor.element_size()
-        seen += place, tensor.shape, tensor.dtype, ctypes.string_at(place, size)
+        seen += address, tensor.shape, tensor.dtype, ctypes.string_at(address, size)
     return tuple(seen)

@@ -15,7 +15,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
-from torchgco.view.flights import Flight
+from torchgco.view.flights import ShownFlight
 from torchgco.view.packing import Packing, number
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
 from torchgco.view.vehicles import Look, Shape, shape_of
@@ -70,7 +70,7 @@ class Document:
         label: str,
         problem: Problem,
         b: int,
-        flights: Sequence[Flight],
+        flights: Sequence[ShownFlight],
         search: SearchPart | None = None,
         times: np.ndarray | None = None,
     ) -> None:

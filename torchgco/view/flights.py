@@ -22,7 +22,7 @@ Rows = list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
-class Flight:
+class ShownFlight:
     """One solver's trajectory through one layout.
 
     Args:
@@ -51,7 +51,7 @@ class Flight:
     notes: list[str] = field(default_factory=list)
     sensed: Sensed | None = None
 
-    def until(self, last: int) -> Flight:
+    def until(self, last: int) -> ShownFlight:
         """The same up to a knot."""
         kept = slice(0, last + 1)
         attitude = None if self.attitude is None else self.attitude[kept]
@@ -118,11 +118,11 @@ def flights_of(
     rows: list[Rows],
     admitted: float,
     touching: np.ndarray,
-) -> list[Flight]:
+) -> list[ShownFlight]:
     """The trajectories X (B, N+1, n), U (B, N, m) of one solver.
 
     Args:
-        results, rows: of each problem, as in `Flight`.
+        results, rows: of each problem, as in `ShownFlight`.
         admitted: the violation up to which nothing is marked.
         touching: (B,) bool: where contact is looked for.
     """
@@ -139,5 +139,5 @@ def flights_of(
             places = contacts(part.obstacles, path, dt, kept)
         told = [*rows[b], *worst_row(problem, bad, which)]
         attitude = look.attitude(kept) if body is None else turned(body, kept)
-        found.append(Flight(solver, path, attitude, results[b], told, bad, which, places))
+        found.append(ShownFlight(solver, path, attitude, results[b], told, bad, which, places))
     return found

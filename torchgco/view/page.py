@@ -16,7 +16,7 @@ STATIC, THREE = HERE / "static", HERE / "vendor" / "three"
 BUILT = {"three.core.min.js": THREE / "three.core.min.js", "three.module.min.js": THREE / "three.module.min.js"}
 MODULES = (
     "data.js", "shapes.js", "camera.js", "vehicle.js", "tubes.js", "scenery.js", "missions.js", "flights.js",
-    "search.js", "hover.js", "panel.js", "main.js",
+    "searches.js", "hover.js", "panel.js", "main.js",
 )  # fmt: skip
 POLICY = "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src data: blob:"
 

@@ -31,6 +31,7 @@ class Shapes:
         radius: (M | 1,) by which they are rounded.
         turn: (M | 1, 4) unit quaternions [w, x, y, z], or (M | 1,) angles in the plane; None: sides along the axes.
         velocity: (M | 1, d), m/s; None: at rest.
+        track: (T, M, d), where centres are every `step` seconds, between which they move evenly; None: by velocity.
         until: s, when they stop to move and to count; None: never.
         cells: of a map, which may have a ceiling that the page cuts off at first.
         unknown: what they count as, of the cells that a map doesn't know; None: others.
@@ -44,6 +45,8 @@ class Shapes:
     until: float | None = None
     cells: bool = False
     unknown: Unknown | None = None
+    track: np.ndarray | None = None
+    step: float = 0.0
 
     def packed(self, packing: Packing, middle: np.ndarray) -> dict[str, Any]:
         """As the page reads them; centres count from `middle` (d,), near which half precision is finest."""
@@ -51,6 +54,9 @@ class Shapes:
         held |= {"cells": self.cells, "unknown": self.unknown}
         arrays = {"center": self.center - middle, "half": self.half, "radius": self.radius, "turn": self.turn}
         arrays["velocity"] = self.velocity
+        if self.track is not None:
+            held |= {"knots": len(self.track), "step": self.step}
+            arrays["track"] = (self.track - middle).reshape(-1, self.track.shape[-1])
         return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}
 
 
@@ -91,9 +97,11 @@ def shapes_of(part: Obstacles, b: int) -> Shapes | None:
     if found is None or found.sines is not None:
         return None
     until = None if part.stops is None else float(part.stops[b]) * part.dt
-    if not found.half.any():
-        return Shapes(found.center, np.zeros((1, found.center.shape[1])), found.radius, None, found.velocity, until)
-    return Shapes(found.center, found.half, found.radius, turns(found.sides), found.velocity, until)
+    half, turn = np.zeros((1, found.center.shape[1])), None
+    if found.half.any():
+        half, turn = found.half, turns(found.sides)
+    motion = {"velocity": found.velocity, "until": until, "track": found.track, "step": found.step}
+    return Shapes(found.center, half, found.radius, turn, **motion)
 
 
 def turns(axes: np.ndarray) -> np.ndarray | None:
@@ -102,6 +110,7 @@ def turns(axes: np.ndarray) -> np.ndarray | None:
         return None
     if axes.shape[-1] == 2:
         return np.arctan2(axes[:, 0, 1], axes[:, 0, 0])
+    axes = axes * np.sign(np.linalg.det(axes))[:, None, None]  # a box is the same with all its sides turned about
     return Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat(scalar_first=True)
 
 

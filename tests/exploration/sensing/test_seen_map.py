@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from tests.reference.sensing import chords, cubes, distances, inside
 from torchgco.exploration.sensing import Lidar, Scan, SeenMap, World, library
+from torchgco.exploration.sensing.cells import CellSearch
 from torchgco.exploration.sensing.grid import (
     CHORD,
     FREE,
@@ -22,7 +23,6 @@ from torchgco.exploration.sensing.grid import (
     REACH,
     UNKNOWN,
 )
-from torchgco.exploration.sensing.search import Search
 from torchgco.exploration.sensing.world import Motion
 
 CORNER, SIZE, SHAPE = np.array([-2.0, -1.5, -1.0]), 0.25, (17, 13, 9)
@@ -173,7 +173,7 @@ def dijkstra_cost(seen: SeenMap, radius: float, band: float, shy: float, start: 
     return dijkstra(graph.tocsr(), indices=index[start])[index[goal]]
 
 
-def whole(search: Search, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, bool]:
+def whole(search: CellSearch, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, bool]:
     found = search.path(start, goal)
     assert found is not None and search.pending is None
     return found
@@ -185,7 +185,7 @@ def test_the_cheapest_path_is_that_of_dijkstra(shy: float) -> None:
     found = 0
     for _ in range(6):
         seen = drawn(rng, 0.9)
-        search = Search(seen, radius=0.12, band=0.5, shy=shy)
+        search = CellSearch(seen, radius=0.12, band=0.5, shy=shy)
         start, goal = (1, 1, 1), (15, 11, 7)
         slow = dijkstra_cost(seen, 0.12, 0.5, shy, start, goal)
         path, arrives = whole(search, *(CORNER + (np.array(c) + 0.5) * SIZE for c in (start, goal)))
@@ -206,7 +206,7 @@ def test_where_no_path_leads_to_the_goal_it_ends_at_the_nearest_cell() -> None:
     seen.state[:] = FREE
     seen.state[9] = OCCUPIED  # a wall from side to side
     seen.measure()
-    path, arrives = whole(Search(seen, radius=0.1), CORNER + 0.6, CORNER + SPAN - 0.6)
+    path, arrives = whole(CellSearch(seen, radius=0.1), CORNER + 0.6, CORNER + SPAN - 0.6)
     assert not arrives and seen.cell(path[-1])[0] == 8
 
 
@@ -215,7 +215,7 @@ def test_a_search_in_parts_ends_as_one_in_whole(share: float) -> None:
     """Also where the vehicle moves on meanwhile; another goal begins another search."""
     rng = np.random.default_rng(7)
     seen = drawn(rng, share)
-    one, parts = Search(seen, radius=0.12), Search(seen, radius=0.12, limit=9)
+    one, parts = CellSearch(seen, radius=0.12), CellSearch(seen, radius=0.12, limit=9)
     start, goal = CORNER + 0.4, CORNER + SPAN - 0.4
     path, arrives = whole(one, start, goal)
     calls, looked, found = 0, 0, None

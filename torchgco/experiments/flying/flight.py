@@ -8,7 +8,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,13 +24,14 @@ from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import MAX_PROCESSES, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
 from torchgco.experiments.flying.progress import Bar
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.results.durations import durations, with_lengths
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
 from torchgco.judging.judge import frame_columns, gates_passed, judge
 from torchgco.kernels import use_native
 from torchgco.problem.problem import Problem
-from torchgco.scenarios import Layouts, Task
+from torchgco.scenarios import Layouts
 from torchgco.search.reach import short_horizons
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Progress
@@ -43,7 +44,7 @@ NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
 
 
 @dataclass(frozen=True)
-class Plan:
+class Schedule:
     """How a study is flown: options of `study` that decide no result.
 
     Args:
@@ -91,13 +92,13 @@ class Plan:
         return [number for number in ids if self.jobs is None or number * self.jobs // count == self.job]
 
 
-def plan_of(setup: Setup) -> Plan:
+def plan_of(setup: Setup) -> Schedule:
     """The plan of a configuration, with its number of processes.
 
     Raises:
-        InputError: as Plan.
+        InputError: as Schedule.
     """
-    plan = Plan(**{field.name: setup.configuration["study"][field.name] for field in fields(Plan)})
+    plan = Schedule(**{field.name: setup.configuration["study"][field.name] for field in fields(Schedule)})
     if plan.workers is not None:
         return plan
     # On a GPU the batches of several processes would share one device.
@@ -107,14 +108,24 @@ def plan_of(setup: Setup) -> Plan:
 
 @dataclass
 class Batch(ABC):
-    """A batch of layouts that one solver flies, and how much of it the bar has shown."""
+    """A batch of a study's layouts that one solver flies, and how much of it the bar has shown."""
 
-    setup: Setup
-    layouts: Layouts
+    tasks: Tasks
+    places: Sequence[int]
     name: str
     solver: Any
     bar: Bar
     shown: float = field(default=0.0, kw_only=True)
+
+    @property
+    def setup(self) -> Setup:
+        """Of the study."""
+        return self.tasks.setup
+
+    @cached_property
+    def layouts(self) -> Layouts:
+        """Of this batch."""
+        return self.tasks.layouts.take(self.places)
 
     @abstractmethod
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
@@ -131,7 +142,7 @@ class Batch(ABC):
 
 
 @dataclass
-class Flight(Batch):
+class SolveBatch(Batch):
     """Single trajectories."""
 
     stages: int | None = None  # N of the controls returned: the most of the study; None: of these layouts
@@ -143,12 +154,9 @@ class Flight(Batch):
         Layouts with as many stages and gates are solved together; their controls end with those at rest. Where the time
         is free the lengths of the stages are a column more (`durations`).
         """
-        places = self.layouts.alike()
-        if len(places) == 1:
-            flown = [self._fly(self.layouts)]
-        else:
-            flown = [self._fly(self.layouts.take(some)) for some in places]
-        order = np.argsort(np.concatenate(places), kind="stable")
+        groups = self.layouts.alike()
+        flown = [self._fly(np.array(self.places)[rows]) for rows in groups]
+        order = np.argsort(np.concatenate(groups), kind="stable")
         rows = pd.concat([some for some, _ in flown], ignore_index=True).iloc[order].reset_index(drop=True)
         longest = max(self.stages or 0, *(U.shape[1] for _, U in flown))
         return rows, np.concatenate([self._lengthened(U, longest) for _, U in flown])[order]
@@ -157,10 +165,7 @@ class Flight(Batch):
         """See `Batch`; solvers of other libraries build what they need in the process that flies."""
         if self.solver.kernels is None:
             with warnings.catch_warnings(action="ignore"):  # the processes give them
-                self.solver.prepare(self._task(self.layouts.take(self.layouts.alike()[0])).problem)
-
-    def _task(self, layouts: Layouts) -> Task:
-        return self.setup.task(layouts)
+                self.solver.prepare(self.tasks.of(np.array(self.places)[self.layouts.alike()[0]]).problem)
 
     def _lengthened(self, U: np.ndarray, stages: int) -> np.ndarray:
         """Controls (L, N, m) with those at rest after them, up to so many stages."""
@@ -168,10 +173,10 @@ class Flight(Batch):
         rest = np.pad(rest, (0, U.shape[-1] - len(rest)))  # further stages take no time
         return np.concatenate((U, np.broadcast_to(rest, (len(U), stages - U.shape[1], len(rest)))), axis=1)
 
-    def _fly(self, layouts: Layouts) -> tuple[pd.DataFrame, np.ndarray]:
+    def _fly(self, places: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
         """The same of layouts with as many stages and gates."""
         setup, self.shown = self.setup, 0
-        task = self._task(layouts)
+        task, layouts = self.tasks.of(places), self.tasks.layouts.take(places)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
         if (told := short_horizons(task.problem)) is not None:
             self.bar.write(f"{self.name}: {told.replace('problem', 'layout')} (scenario.stages)", sys.stderr)
@@ -180,8 +185,7 @@ class Flight(Batch):
         statuses = [status.name for status in solution.statuses]
         U = solution.U.detach().to("cpu", torch.float64)
         U[[status in NOT_FLOWN for status in statuses]] = torch.nan
-        exact = (setup.device.type, setup.dtype) == ("cpu", torch.float64)
-        checked = task if exact else setup.vehicle.task(layouts)
+        checked = self.tasks.of(places, exact=True)
         free = checked.problem.time is not None
         times = solution.t.detach().to("cpu", torch.float64) if free else None
         verdict = judge(checked.problem, U, checked.goal, checked.goal_radius, times=times)

@@ -28,7 +28,7 @@ SINGLE = (
 
 
 @dataclass
-class MissionFlight(Batch):
+class MissionBatch(Batch):
     """Missions in lockstep, planned by one solver."""
 
     plans: bool = False  # keep the planned positions, for figures
@@ -38,7 +38,7 @@ class MissionFlight(Batch):
         setup, layouts = self.setup, self.layouts
         assert setup.mission is not None
         mission = replace(setup.mission, planner=replace(setup.mission.planner, solver=self.solver))
-        problem = setup.vehicle.task(layouts).problem
+        problem = self.tasks.of(self.places, exact=True).problem
         ids = torch.as_tensor(layouts.ids)
         progress = partial(self._progress, float(problem.dynamics.dt), mission.duration)
         log = mission.fly(problem, seed=setup.seed, ids=ids, report=progress)

@@ -18,9 +18,10 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
-from torchgco.experiments.flying.flight import Batch, Flight, Plan, fly, plan_of, prepare
-from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionFlight
+from torchgco.experiments.flying.flight import Batch, Schedule, SolveBatch, fly, plan_of, prepare
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionBatch
 from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.flying.workers import Shared, run_all
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
@@ -122,25 +123,32 @@ def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
     store.close()
     trials = store.table()
     if study.plan.explain:
-        say(explained(study.setup, study.layouts, trials))
-    elif study.setup.mission is None and (told := advised(study.setup, study.layouts, trials)):
+        say(explained(study.tasks, trials))
+    elif study.setup.mission is None and (told := advised(study.tasks, trials)):
         say(told)
     say(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
         say(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
     if (trials["status"] == Status.INVALID_START.name).all():
-        raise InputError("scenario", where_to_start(study.setup, study.layouts), "none")
+        raise InputError("scenario", where_to_start(study.tasks), "none")
 
 
 @dataclass(frozen=True)
 class _Study:
     """A configuration, checked and built."""
 
-    setup: Setup
-    plan: Plan
-    layouts: Layouts
+    plan: Schedule
+    tasks: Tasks
     solvers: dict[str, Any]  # by name, the one under study first
     manifest: Manifest
+
+    @property
+    def setup(self) -> Setup:
+        return self.tasks.setup
+
+    @property
+    def layouts(self) -> Layouts:
+        return self.tasks.layouts
 
     @property
     def rivals(self) -> int:
@@ -152,24 +160,22 @@ def _finish(study: _Study, store: StudyFolder, rows: pd.DataFrame, flown: np.nda
     """Write the files of a study from its rows and what was flown, (solver, L, ...)."""
     held: np.ndarray | pd.DataFrame = flown
     if study.setup.mission is not None:
-        held = mission_table(store.path, study.setup, study.layouts, list(study.solvers), flown)
+        held = mission_table(store.path, study.tasks, list(study.solvers), flown)
     store.finish(with_success(rows, study.layouts, study.rivals), held, study.layouts)
 
 
 def _report(study: _Study, folder: Path) -> str:
     """Write the report of a finished study, and return it as text."""
     if study.setup.mission is not None:
-        return write_mission_report(folder, study.setup, figures=study.plan.figures)
+        return write_mission_report(folder, study.tasks, figures=study.plan.figures)
     plan = study.plan
-    return write_report(
-        folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, study.setup.vehicle
-    )
+    return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, study.tasks)
 
 
 def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
     setup = build(configuration)
-    layouts = setup.layouts()
-    task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
+    tasks = Tasks(setup, setup.layouts())
+    task = tasks.of([0], exact=True)  # raises where model and layouts don't fit
     plan = plan_of(setup)
     if setup.mission is not None:
         check_mission(setup.mission, task)
@@ -186,9 +192,9 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
     manifest = Manifest(
         configuration={"version": VERSION, **decided},
         solvers={name: settings_of(held) for name, held in rivals.items()},
-        layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(decided)),
+        layouts=layout_digests(tasks.layouts, configuration["model"]["vehicle"], closed_loop(decided)),
     )
-    return _Study(setup, plan, layouts, solvers, manifest)
+    return _Study(plan, tasks, solvers, manifest)
 
 
 def check_mission(mission: Mission, task: Task) -> None:
@@ -253,13 +259,15 @@ def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
     return [run[first : first + size].tolist() for run in runs for first in range(0, len(run), size)]
 
 
-def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Batch:
+def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar, alone: bool = False) -> Batch:
+    """The flight of some layouts; `alone`: by another process, which makes their problems itself."""
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
-    layouts, solver = study.layouts.take(ids), study.solvers[name]
+    tasks, solver = study.tasks, study.solvers[name]
+    tasks, places = (tasks.part(ids), range(len(ids))) if alone else (tasks, ids)
     if study.setup.mission is None:
         most = None if study.layouts.stages is None else int(np.max(study.layouts.stages))
-        return Flight(study.setup, layouts, name, solver, bar, most)
-    return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
+        return SolveBatch(tasks, places, name, solver, bar, most)
+    return MissionBatch(tasks, places, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
 
 
 def _fly_side_by_side(
@@ -277,7 +285,7 @@ def _fly_side_by_side(
         shown = max(shown, finished)
         bar.set_postfix_str(f"solved {int(shown)}/{total}", refresh=True)
 
-    flights = [_flight(study, name, ids, Shared()) for name, ids in batches]
+    flights = [_flight(study, name, ids, Shared(), alone=True) for name, ids in batches]
     bar.set_description("compiling")
     for name in study.solvers:
         if first := next((flight for flight in flights if flight.name == name), None):
@@ -309,8 +317,8 @@ def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, n
     names, every, times = flown["solver"].tolist(), flown["U"], flown.get("times")
     found = {name: np.full((*U.shape[:1], U.shape[1] + 1, study.setup.vehicle.dynamics.n), np.nan)
              for name, U in zip(names, every, strict=True)}  # fmt: skip
-    for places in study.layouts.together():
-        problem = study.setup.vehicle.task(study.layouts.take(places)).problem
+    for places in study.tasks.groups:
+        problem = study.tasks.of(places, exact=True).problem
         for i, name in enumerate(names):
             U = torch.from_numpy(every[i][places, : problem.N])
             t = times_at(None if times is None else times[i], places, problem.N)

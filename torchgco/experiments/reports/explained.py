@@ -5,33 +5,33 @@ from __future__ import annotations
 import textwrap
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import torch
 
 from torchgco.base.status import Status
-from torchgco.experiments.config.build import Setup
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.explaining.advice import Facts, advice
 from torchgco.explaining.barred import map_facts
 from torchgco.explaining.explain import LINE_WIDTH, explanation
-from torchgco.scenarios import Layouts
 
 EXPLAINED = 8  # layouts at most
 
 
-def advised(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
+def advised(tasks: Tasks, trials: pd.DataFrame) -> str:
     """What to try for the layouts whose goal the solver under study didn't reach; "" where it reached all.
 
     As `Solution.explain` has it, without solving again: of the first layouts, each sentence with those that it is for.
     """
+    setup = tasks.setup
     own = trials[trials["solver"] == setup.solver_name]
     short = own[~own["reached"].astype("boolean").fillna(False).astype(bool)]
     if len(short) == 0:
         return ""
     shown = short.head(EXPLAINED)
-    problem = setup.task(layouts.take(shown["layout"].tolist())).problem
     found: dict[str, list[str]] = {}
-    for i, row in enumerate(shown.to_dict("records")):
-        one, status = problem.take(torch.tensor([i], device=problem.x0.device)), Status[str(row["status"])]
+    for row in shown.to_dict("records"):
+        one, status = tasks.of([row["layout"]]).problem, Status[str(row["status"])]
         facts = Facts(
             status, setup.solver, hasattr(setup.solver, "passes"), bool(one.obstacles), False, None,
             float(row["clearance"]), **map_facts(one, status, False),
@@ -46,37 +46,38 @@ def advised(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
     return "\n".join([*lines, "study.explain=true tells what was tried."])
 
 
-def where_to_start(setup: Setup, layouts: Layouts) -> str:
+def where_to_start(tasks: Tasks) -> str:
     """What a study needs all of whose layouts begin inside an obstacle."""
-    problem = setup.vehicle.task(layouts.take([0])).problem
+    problem = tasks.of([0], exact=True).problem
     unknown = map_facts(problem, Status.INVALID_START, False)["in_unknown"]
     free = ", or scenario.unknown=free, as unknown cells count as occupied" if unknown else ""
     return f"a layout whose start is outside its obstacles{free}"
 
 
-def explained(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
+def explained(tasks: Tasks, trials: pd.DataFrame) -> str:
     """What happened to the first layouts that the solver under study failed on.
 
     Failed are those without success, where that is known, else those whose goal wasn't reached. They are solved again
     with a record, by which no bit of a result changes.
     """
-    own = trials[trials["solver"] == setup.solver_name]
+    name = tasks.setup.solver_name
+    own = trials[trials["solver"] == name]
     failed = own.loc[~own["success"].fillna(own["reached"]).astype(bool), "layout"].tolist()
     if not failed:
-        return f"\n{setup.solver_name} failed on no layout: there is nothing to explain."
+        return f"\n{name} failed on no layout: there is nothing to explain."
     shown = failed[:EXPLAINED]
-    part, found = layouts.take(shown), dict[int, str]()
-    for places in part.alike():
-        found |= _told(setup, part.take(places))
+    found = dict[int, str]()
+    for rows in tasks.layouts.take(shown).alike():
+        found |= _told(tasks, np.array(shown)[rows])
     told = [found[number] for number in shown]
     more = f", the first {len(shown)} of them here" if len(failed) > len(shown) else ""
-    return "\n\n".join([f"\n{setup.solver_name} failed on {len(failed)} of {len(own)} layouts{more}.", *told])
+    return "\n\n".join([f"\n{name} failed on {len(failed)} of {len(own)} layouts{more}.", *told])
 
 
-def _told(setup: Setup, layouts: Layouts) -> dict[int, str]:
+def _told(tasks: Tasks, places: np.ndarray) -> dict[int, str]:
     """What happened to layouts with as many stages, by their numbers."""
-    task = setup.task(layouts)
-    ids = torch.as_tensor(layouts.ids, device=setup.device)
+    setup, task = tasks.setup, tasks.of(places)
+    ids = torch.as_tensor(places, device=setup.device)
     solution = setup.solver.recording().solve(task.problem, task.U0, seed=setup.seed, ids=ids)
     solution = replace(solution, account=solution.account.asked(task.problem, setup.solver_name))
-    return {number: explanation(solution, i, what=f"Layout {number}") for i, number in enumerate(layouts.ids.tolist())}
+    return {number: explanation(solution, i, what=f"Layout {number}") for i, number in enumerate(places.tolist())}

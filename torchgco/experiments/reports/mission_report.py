@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT
 from torchgco.experiments.flying.progress import draw as draw_all
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.folder import LAYOUTS, MISSION, PLANS_FILE, TIME_STEPS, TRIALS, read_trials
+from torchgco.experiments.results.folder import MISSION, PLANS_FILE, TIME_STEPS, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
 from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.missions.contact import Contact
@@ -29,24 +29,22 @@ from torchgco.plotting.course import Course
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.silhouettes import body_of
 from torchgco.plotting.style import save
-from torchgco.scenarios import Layouts
 
 SNAPSHOTS = 4  # instants of a mission in one figure
 
 
-def mission_table(
-    folder: Path, setup: Setup, layouts: Layouts, solvers: Sequence[str], logs: np.ndarray
-) -> pd.DataFrame:
+def mission_table(folder: Path, tasks: Tasks, solvers: Sequence[str], logs: np.ndarray) -> pd.DataFrame:
     """The rows of mission.parquet from packed logs (solver, L, K, W).
 
     Where the logs hold plans, these and all time steps are written into files of their own.
     """
-    assert setup.mission is not None
-    problem = setup.vehicle.task(layouts).problem
+    mission, layouts = tasks.setup.mission, tasks.layouts
+    assert mission is not None
+    problem = tasks.of(range(layouts.count), exact=True).problem
     period, contact, gates = float(problem.dynamics.dt), Contact.among(problem), Passing.among(problem)
     frames, plans, fine = [], [], []
     for name, rows in zip(solvers, logs, strict=True):
-        arrays = unpacked(rows, setup.mission.substeps(period) or 1, not setup.mission.sees_all)
+        arrays = unpacked(rows, mission.substeps(period) or 1, not mission.sees_all)
         passed = None if gates is None else gates_passed(arrays, gates)
         frame = mission_frame(arrays, layouts.ids.tolist(), period, clearances(arrays, period, contact), passed)
         frame.insert(0, "solver", name)
@@ -63,18 +61,18 @@ def mission_table(
     return pd.concat(frames, ignore_index=True)
 
 
-def write_mission_report(folder: Path, setup: Setup, figures: bool = True) -> str:
+def write_mission_report(folder: Path, tasks: Tasks, figures: bool = True) -> str:
     """Write summary.csv, paired.csv and figures next to the mission.parquet in a folder; return the report as text."""
     trials = read_trials(folder / TRIALS)
     parts = parts_of(trials)
     write_tables(folder, parts)
     if figures:
-        draw_all(_drawings(folder, trials, setup))
+        draw_all(_drawings(folder, trials, tasks))
     text = format_report(parts, "table")
     return mission_lines(trials) if trials["layout"].nunique() <= PLANS_KEPT else text
 
 
-def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Callable[[], object]]:
+def _drawings(folder: Path, trials: pd.DataFrame, tasks: Tasks) -> dict[str, Callable[[], object]]:
     """Functions that draw and write: outcomes, and where few missions fly, for each what the paper shows of it."""
     held: dict[str, Callable[[], object]] = {}
 
@@ -89,9 +87,9 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
     with np.load(folder / PLANS_FILE, allow_pickle=False) as flown:
         plans = dict(zip(flown["solver"].tolist(), flown["plan"], strict=True))
     tables = [pd.read_parquet(folder / name) for name in (MISSION, TIME_STEPS)]
-    layouts = Layouts.load(folder / LAYOUTS)
-    for i, number in enumerate(layouts.ids.tolist()):
-        course, period = _course(setup, layouts.take([i]))
+    airframe = airframe_of(tasks.setup.vehicle.dynamics)
+    for number in tasks.layouts.ids.tolist():  # in a study they are places
+        course, period = _course(tasks, number)
         rows, fine = (_by_solver(table[table["mission"] == number]) for table in tables)
         if not rows:  # a start in contact
             continue
@@ -100,10 +98,10 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
         if len(course.reaches):
             add(f"{number}-distance", partial(draw.distance_figure, fine, course))
         for name, frame in rows.items():
-            plan, label = plans[name][i][: len(frame)], f"{number}-{name}"
+            plan, label = plans[name][number][: len(frame)], f"{number}-{name}"
             steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
             add(f"{label}-snapshots", partial(draw.snapshots_figure, frame, plan, course, steps, period))
-            add(f"{label}-commands", partial(draw.commands_figure, fine[name], airframe_of(setup.vehicle.dynamics)))
+            add(f"{label}-commands", partial(draw.commands_figure, fine[name], airframe))
             add(f"{label}-states", partial(draw.states_figure, fine[name], course.goal))
             add(f"{label}-tracking", partial(draw.tracking_figure, frame))
             gif = folder / "figures" / f"{label}.gif"
@@ -115,9 +113,9 @@ def _by_solver(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {str(name): rows for name, rows in table.groupby("solver", sort=False)}
 
 
-def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
+def _course(tasks: Tasks, number: int) -> tuple[Course, float]:
     """The obstacles, the gates and the goal of one layout, and its control period, s."""
-    task = setup.vehicle.task(layouts)
+    task, setup, layouts = tasks.of([number], exact=True), tasks.setup, tasks.layouts.take([number])
     assert setup.mission is not None
     near = setup.mission.goal_radius
     radius = float(task.goal_radius) if near is None else near

@@ -25,7 +25,7 @@ from torchgco.native.compiler import NativeError
 from torchgco.plotting.course import DRAWN_STATES
 from torchgco.problem.problem import Problem
 from torchgco.view.document import Document, SearchPart
-from torchgco.view.flights import Flight, Rows, whole
+from torchgco.view.flights import Rows, ShownFlight, whole
 from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
@@ -81,7 +81,7 @@ class _Log:
                 missing = f"no map: {error}"
         return cls(steps, study.rows, plans, loops, missing)  # type: ignore[arg-type]
 
-    def flight(self, study: Study, problem: Problem, solver: str, number: int, notes: list[str]) -> Flight | None:
+    def flight(self, study: Study, problem: Problem, solver: str, number: int, notes: list[str]) -> ShownFlight | None:
         """The flight of a mission, the problem of which is given; None without a finite state."""
         key = solver, number
         steps, plan, loop = self.steps.get(key), self.plans.get(key), self.loops.get(solver)
@@ -105,12 +105,12 @@ class _Log:
         return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(seen, sought, safe))
 
 
-def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:
+def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> ShownFlight:
     X = whole(steps[list(DRAWN_STATES)].to_numpy(dtype=float))
     path, clear = X[:, :3], steps["clearance"].to_numpy(dtype=float)
     bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
     place = next((i for i, one in enumerate(problem.constraints) if one in problem.obstacles), -1)
-    return Flight(
+    return ShownFlight(
         solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", _told(row), bad,
         np.where(bad > 0, place, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt), X),
         notes=_notes(steps)[: len(path)],

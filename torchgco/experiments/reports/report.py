@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.progress import draw
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
@@ -36,7 +37,7 @@ from torchgco.plotting.rates import rates_figure, sweep_figure
 from torchgco.plotting.silhouettes import body_of
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
-from torchgco.scenarios import Layouts, Vehicle
+from torchgco.scenarios import Layouts
 
 Drawings = dict[str, Callable[[], Figure]]
 SHOWN_LAYOUTS = 12  # layouts in a picture, at most
@@ -49,7 +50,7 @@ def write_report(
     trajectories: Callable[[Arrays], Arrays] | None = None,
     figures: bool = True,
     printed: Columns | None = None,
-    vehicle: Vehicle | None = None,
+    tasks: Tasks | None = None,
     trials: pd.DataFrame | None = None,
     form: str = "table",
 ) -> str:
@@ -60,7 +61,8 @@ def write_report(
             the arrays of `solutions.npz`; None: no such picture.
         figures: False: tables alone.
         printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
-        vehicle: whose numbers these pictures show where layouts have none; None: layouts have all that is known.
+        tasks: of the study, whose numbers these pictures show where layouts have none; None: layouts have all that is
+            known.
         trials: the table in that file, where it is known.
         form: of the table that is returned, one of OUTPUTS.
 
@@ -73,7 +75,7 @@ def write_report(
     held = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
         stored = Layouts.load(folder / LAYOUTS)
-        layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), vehicle)
+        layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), tasks)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
             states = {name: X[:SHOWN_LAYOUTS] for name, X in trajectories(solutions).items()}
         if figures:
@@ -87,18 +89,20 @@ def write_report(
     return format_report(parts, form)
 
 
-def _posed(layouts: Layouts, vehicle: Vehicle | None) -> tuple[Arrays, dict[str, Any]]:
+def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any]]:
     """The arrays of layouts as problems are made of them, the vehicle's body where it is no ball, and its position."""
-    if vehicle is None:
+    if tasks is None:
         return layouts.arrays(), {}
-    groups = [(rows, vehicle.task(layouts.take(rows))) for rows in layouts.alike()]
-    one = groups[0][1].problem
-    arrays, how = vehicle.completed(layouts).arrays(), {"body": body_of(one), "position": one.dynamics.position}
-    if one.dynamics.position is None:
+    groups = layouts.alike()
+    problems = [tasks.of(places, exact=True).problem for places in groups]  # the first of the study's own
+    first, arrays = problems[0], tasks.setup.vehicle.completed(layouts).arrays()
+    how = {"body": body_of(first), "position": first.dynamics.position}
+    if first.dynamics.position is None:
         return arrays, how
     start, goal = (np.full((layouts.count, layouts.dimension), np.nan) for _ in range(2))
-    for rows, task in groups:
-        start[rows], goal[rows] = task.problem.x0[:, task.problem.position].numpy(), task.goal.numpy()
+    for places, problem in zip(groups, problems, strict=True):
+        assert problem.goal is not None
+        start[places], goal[places] = problem.x0[:, problem.position].numpy(), problem.goal.position.numpy()
     return {**arrays, "start": start, "goal": goal}, how
 
 

@@ -183,17 +183,16 @@ def _trajectories(
     """The judged columns of single trajectories, by (solver, layout)."""
     arrays = readable(folder / SOLUTIONS, read_npz, trust=trust)
     names, place = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
-    parts = []
+    parts, tasks = [], [vehicle.task(layouts.take(places)) for places in layouts.together(BATCH)]
     for name in manifest.solvers:
         controls = torch.from_numpy(arrays["U"][names.index(name)])
         held_times = arrays["times"][names.index(name)] if "times" in arrays else None
-        for places in layouts.together(BATCH):
-            some = layouts.take(places)
-            task = vehicle.task(some)
-            stored = [place[number] for number in some.ids.tolist()]
+        for task in tasks:
+            ids = task.layouts.ids
+            stored = [place[number] for number in ids.tolist()]
             times = times_at(held_times, stored, task.problem.N)
             verdict = judge(task.problem, controls[stored, : task.problem.N], task.goal, task.goal_radius, times=times)
-            columns = {"solver": name, "layout": some.ids, **frame_columns(verdict)}
+            columns = {"solver": name, "layout": ids, **frame_columns(verdict)}
             more = durations(times) | gates_passed(task.problem, verdict)
             parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))

@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Self
@@ -87,7 +88,7 @@ class Manifest:
     solvers: dict[str, Any]
     layouts: dict[int, str]
 
-    @property
+    @cached_property
     def settings(self) -> dict[str, str]:
         """Digest of each solver's settings, by its name."""
         return {name: digest(settings) for name, settings in self.solvers.items()}
@@ -164,37 +165,47 @@ def layout_digests(
             known cost doesn't count.
         loop: of missions, see `closed_loop`.
     """
+    shared = _normal(_shared(layouts, vehicle) | dict(loop or {}))  # once for all: a study may have thousands
+    moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
+    spheres, numbers = SPHERES if moves else REQUIRED, layouts.ids.tolist()
+    return {number: _digest_of(shared | _normal(_of_layout(layouts, spheres, i))) for i, number in enumerate(numbers)}
+
+
+def _shared(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides flights in all layouts alike; arrays with a row for each stand in `_of_layout` again."""
     model = {key: value for key, value in vehicle.items() if key not in (*OVERRULED, "name")}
     if layouts.dt is not None:
         model["dynamics"] = {key: value for key, value in dict(model["dynamics"]).items() if key != "dt"}
-    shared = {"model": model, "dt": layouts.dt, **(loop or {})}
+    values: dict[str, Any] = {"model": model, "dt": layouts.dt}
     for key, field in OVERRULED.items():
-        given = getattr(layouts, field)
-        shared[key] = vehicle.get(key) if given is None else given
-    alone = layouts.map is not None and layouts.map.batch is not None
-    if layouts.map is not None and not alone:
-        shared["map"] = _map_digests(layouts.map)
-    shared |= {name: value for name in (TIME, BINDS) if (value := getattr(layouts, name)) is not None}
-    shared = _normal(shared)  # once for all layouts: a study may have thousands
-    moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
-    codes = {}
-    for i, number in enumerate(layouts.ids.tolist()):
-        own: dict[str, Any] = {**_there(layouts, SPHERES if moves else REQUIRED, i)}
-        boxes = _there(layouts, (*BOXES, *SINES), i)
-        if "box_radii" in boxes and not boxes["box_radii"].any():
-            del boxes["box_radii"]  # sharp boxes, as without the array
-        own |= {name: part for name, part in boxes.items() if len(part)}
-        own |= _there(layouts, GATES, i)
-        own |= {name: states[i] for name in ("start", "goal") if (states := getattr(layouts, name)) is not None}
-        if isinstance(layouts.stages, np.ndarray):
-            own["stages"] = int(layouts.stages[i])
-        if alone and layouts.map is not None:
-            own["map"] = _map_digests(layouts.map.single(i))
-        codes[number] = _digest_of({**shared, **_normal(own)})
-    return codes
+        values[key] = vehicle.get(key) if (own := getattr(layouts, field)) is None else own
+    values |= {name: own for name in (TIME, BINDS) if (own := getattr(layouts, name)) is not None}
+    if layouts.map is not None and layouts.map.batch is None:
+        values["map"] = _map_digests(layouts.map)
+    return values
 
 
-def _there(layouts: Layouts, names: Sequence[str], i: int) -> dict[str, np.ndarray]:
+def _of_layout(layouts: Layouts, spheres: Sequence[str], i: int) -> dict[str, Any]:
+    """What decides flights in the layout at place i alone; sharp boxes are as without radii.
+
+    Args:
+        spheres: arrays of spheres that count: velocities of none that moves don't.
+    """
+    boxes = _present(layouts, (*BOXES, *SINES), i)
+    if "box_radii" in boxes and not boxes["box_radii"].any():
+        del boxes["box_radii"]
+    values: dict[str, Any] = {**_present(layouts, spheres, i)}
+    values |= {name: part for name, part in boxes.items() if len(part)}
+    values |= _present(layouts, GATES, i)
+    values |= {name: states[i] for name in ("start", "goal") if (states := getattr(layouts, name)) is not None}
+    if isinstance(layouts.stages, np.ndarray):
+        values["stages"] = int(layouts.stages[i])
+    if layouts.map is not None and layouts.map.batch is not None:
+        values["map"] = _map_digests(layouts.map.single(i))
+    return values
+
+
+def _present(layouts: Layouts, names: Sequence[str], i: int) -> dict[str, np.ndarray]:
     """The rows of a layout's arrays, without those of NaN, by which spheres, boxes or gates are absent."""
     held = {name: value[i] for name in names if (value := getattr(layouts, name)) is not None}
     if not held:

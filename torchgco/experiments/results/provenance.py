@@ -40,7 +40,7 @@ import torch
 from torchgco.base.files import regular
 from torchgco.base.version import PACKAGE, VERSION
 from torchgco.experiments.config.build import Setup
-from torchgco.experiments.flying.flight import Plan
+from torchgco.experiments.flying.flight import Schedule
 from torchgco.experiments.results.files import write
 from torchgco.native.compiler import find_compiler
 
@@ -50,7 +50,7 @@ GIT_PATIENCE = 10.0  # s, for git
 
 
 @contextmanager
-def recorded(folder: Path, setup: Setup, plan: Plan, command: Sequence[str]) -> Iterator[list[str]]:
+def recorded(folder: Path, setup: Setup, plan: Schedule, command: Sequence[str]) -> Iterator[list[str]]:
     """Record a start in the study's folder, and how it ended: the last word that the block appends, or "finished"."""
     path = folder / (RECORD if plan.job is None else f"run-{plan.job}-of-{plan.jobs}.json")
     began, used = time.perf_counter(), _processor_seconds()
@@ -74,7 +74,7 @@ def recorded(folder: Path, setup: Setup, plan: Plan, command: Sequence[str]) -> 
             _keep(path, entries)
 
 
-def _entry(setup: Setup, plan: Plan, command: Sequence[str]) -> dict[str, Any]:
+def _entry(setup: Setup, plan: Schedule, command: Sequence[str]) -> dict[str, Any]:
     return {
         "command": shlex.join(["torchgco", *command]),
         "torchgco": _or_none(_source),

@@ -179,7 +179,7 @@ def _rasterised(cloud: PointCloud, which: int, side: float) -> OccupancyGrid:
 def _bodies(part: Obstacles) -> tuple[np.ndarray, Motion]:
     """The boxes (M, 16) of obstacles, and how they move, of one problem, without the absent ones."""
     shapes = part.shapes(0)
-    if shapes is None:
+    if shapes is None or shapes.track is not None:
         raise InputError("scenario", "spheres, boxes, capsules or a map for a sensor", type(part).__name__)
     M, radius = len(shapes.center), np.where(shapes.radius < 1e-12, 0.0, shapes.radius)  # of a sharp box: rounding
     boxes = np.concatenate([shapes.center, shapes.sides.reshape(M, 9), shapes.half, radius[:, None]], axis=1)

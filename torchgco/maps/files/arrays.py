@@ -68,11 +68,11 @@ def _array(source: Source) -> np.ndarray:
         if version not in HEADERS:
             source.refuse(f"{NPY}, version 1.0 or 2.0", version)
         shape, fortran, dtype = HEADERS[version](file)
-        count, at = _count(source, shape), file.tell()
+        count, head = _count(source, shape), file.tell()
         if dtype.hasobject or dtype.kind not in "biuf":
             source.refuse(NPY, dtype)
-        if count * dtype.itemsize != size - at:
-            source.refuse(f"{count * dtype.itemsize:,} bytes of numbers from byte {at:,}", f"{size - at:,} bytes")
+        if count * dtype.itemsize != size - head:
+            source.refuse(f"{count * dtype.itemsize:,} bytes of numbers from byte {head:,}", f"{size - head:,} bytes")
         flat = np.fromfile(file, dtype, count)
     return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
 

@@ -86,8 +86,8 @@ def read_world(source: Source, resolution: float | None) -> OccupancyGrid:
         for k in range(begin[2], end[2] + 1):  # layer by layer: a large shape would take much memory
             axes = [resolution * (np.arange(a, b + 1) + 0.5) for a, b in zip(begin[:2], end[:2], strict=True)]
             points = np.stack(np.meshgrid(*axes, [resolution * (k + 0.5)], indexing="ij"), axis=-1)[:, :, 0]
-            at = tuple(slice(a, b + 1) for a, b in zip((begin - low)[:2], (end - low)[:2], strict=True))
-            cells[(*at, k - low[2])] |= shape.distance(points) <= near
+            columns = tuple(slice(a, b + 1) for a, b in zip((begin - low)[:2], (end - low)[:2], strict=True))
+            cells[(*columns, k - low[2])] |= shape.distance(points) <= near
     return made(source, cells, low * resolution, resolution)
 
 
@@ -118,9 +118,9 @@ def _shapes(source: Source, root: Element) -> Iterator[Shape]:
 def _state(source: Source, world: Element) -> Element | None:
     """What a saved world says of where its models were by then."""
     state = world.find("state")
-    for part in () if state is None else state:
-        if part.tag in ("insertions", "deletions") and len(part):
-            source.refuse("a world whose models stand in the file", f"{part.tag} in its state")
+    for element in () if state is None else state:
+        if element.tag in ("insertions", "deletions") and len(element):
+            source.refuse("a world whose models stand in the file", f"{element.tag} in its state")
     return state
 
 
@@ -136,28 +136,28 @@ def _of_models(
         scaled = kept is not None and kept.find("scale") is not None
         if kept is not None and scaled and any(scale != 1.0 for scale in _numbers(source, kept, "scale", 3)):
             source.refuse("models of the size in which they were saved", f"<scale> {shown(kept.findtext('scale'))}")
-        at = _placed(source, model, frame, kept)
+        model_frame = _placed(source, model, frame, kept)
         fixed = static or (model.findtext("static") or "").strip().lower() in ("1", "true")
-        yield from _of_models(source, model, at, kept, fixed, depth + 1)
+        yield from _of_models(source, model, model_frame, kept, fixed, depth + 1)
         for link in model.findall("link") if fixed else ():
-            here = _placed(source, link, at, _kept(kept, link))
+            here = _placed(source, link, model_frame, _kept(kept, link))
             for collision in link.findall("collision"):
                 shape = _shape(source, collision.find("geometry"), here.then(_pose(source, collision)))
                 if shape is not None:
                     yield shape
 
 
-def _kept(state: Element | None, part: Element) -> Element | None:
+def _kept(state: Element | None, element: Element) -> Element | None:
     """What a state says of a model or link; None where it says nothing."""
-    found = () if state is None else state.findall(part.tag)
-    return next((kept for kept in found if kept.get("name") == part.get("name")), None)
+    states = () if state is None else state.findall(element.tag)
+    return next((kept for kept in states if kept.get("name") == element.get("name")), None)
 
 
-def _placed(source: Source, part: Element, around: Frame, kept: Element | None) -> Frame:
+def _placed(source: Source, element: Element, around: Frame, kept: Element | None) -> Frame:
     """The frame of a model or link in the world: its own pose is one in `around`, that of a state in the world."""
     if kept is not None and (kept.findtext("pose") or "").strip():
         return _pose(source, kept)
-    return around.then(_pose(source, part))
+    return around.then(_pose(source, element))
 
 
 def _shape(source: Source, geometry: Element | None, frame: Frame) -> Shape | None:
@@ -196,9 +196,9 @@ def _pose(source: Source, element: Element) -> Frame:
 def _numbers(source: Source, element: Element, name: str, count: int) -> list[float]:
     text = (element.findtext(name) or "").strip()
     try:
-        found = [float(word) for word in text.split()]
+        numbers = [float(word) for word in text.split()]
     except ValueError:
-        found = []
-    if len(found) != count or not all(abs(number) <= FARTHEST_AT for number in found):
+        numbers = []
+    if len(numbers) != count or not all(abs(number) <= FARTHEST_AT for number in numbers):
         source.refuse(f"<{name}> of {count} numbers", shown(text[:60]))
-    return found
+    return numbers

@@ -101,15 +101,15 @@ def above_ground(
     if not known.any():
         source.refuse("at least one finite height", f"{heights.size:,}, none of them finite")
     check_far(source, heights[known])
-    place = np.zeros(2) if origin is None else origin
-    floor = place[2] if len(place) == 3 else math.floor(heights[known].min() / resolution) * resolution
+    anchor = np.zeros(2) if origin is None else origin
+    floor = anchor[2] if len(anchor) == 3 else math.floor(heights[known].min() / resolution) * resolution
     layers = max(math.ceil((heights[known].max() - floor) / resolution), 0) + 1
     source.limit(layers * heights.size, MOST_CELLS, "cells")
     bottoms = floor + resolution * np.arange(layers)
     with np.errstate(invalid="ignore"):
         below = bottoms < heights[:, :, None]
     below[..., -1] = False  # rounding
-    corner = np.array([*place[:2], floor])
+    corner = np.array([*anchor[:2], floor])
     if known.all():
         return made(source, below, corner, resolution)
     return made(source, np.where(known[:, :, None], below.astype(np.float32), np.float32("nan")), corner, resolution)

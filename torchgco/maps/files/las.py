@@ -23,7 +23,7 @@ def read_las(source: Source) -> np.ndarray:
         source.refuse("las with the extra maps: pip install 'torchgco[maps]'", "no laspy")
     with source.library(LAS_FILE), laspy.open(source.path) as file:
         source.limit(file.header.point_count, MOST_POINTS, "points")
-        parts = [np.stack([part.x, part.y, part.z], axis=-1) for part in file.chunk_iterator(RECORDS_AT_ONCE)]
+        parts = [np.stack([chunk.x, chunk.y, chunk.z], axis=-1) for chunk in file.chunk_iterator(RECORDS_AT_ONCE)]
     points = np.concatenate([np.empty((0, 3)), *parts])
     if len(points) != file.header.point_count:
         source.refuse(f"{LAS_FILE} with {file.header.point_count:,} of them", f"{len(points):,}")

@@ -29,19 +29,19 @@ def beside(source: Source) -> Source | None:
     Raises:
         InputError: several do, none of them with the image's stem.
     """
-    found = [path for path in sorted(source.path.parent.glob("*.y*ml")) if _names(replace(source, path=path), source)]
-    own = [path for path in found if path.stem == source.path.stem] or found
-    if len(own) > 1:
-        source.refuse("an image that one yaml file describes, or that file", f"{', '.join(path.name for path in own)}")
-    return replace(source, path=own[0]) if own else None
+    yamls = [path for path in sorted(source.path.parent.glob("*.y*ml")) if _names(replace(source, path=path), source)]
+    fit = [path for path in yamls if path.stem == source.path.stem] or yamls
+    if len(fit) > 1:
+        source.refuse("an image that one yaml file describes, or that file", f"{', '.join(path.name for path in fit)}")
+    return replace(source, path=fit[0]) if fit else None
 
 
-def _names(found: Source, source: Source) -> bool:
+def _names(by: Source, source: Source) -> bool:
     """Whether a yaml file is small, and a mapping whose image is this one."""
     try:
-        if found.size(YAML) > MOST_YAML or source.path.name.encode() not in found.bytes(YAML, MOST_YAML):
+        if by.size(YAML) > MOST_YAML or source.path.name.encode() not in by.bytes(YAML, MOST_YAML):
             return False
-        image = _mapping(found).get("image")
+        image = _mapping(by).get("image")
     except InputError:  # of another program
         return False
     return isinstance(image, str) and Path(image).name == source.path.name
@@ -54,9 +54,9 @@ def read_described(source: Source, by: Source, resolution: float | None, origin:
         InputError: another resolution or origin than the file's, and as `read_map_server`.
     """
     keys = _keys(by)
-    own = _number(by, keys, "resolution")
-    if resolution is not None and not math.isclose(resolution, own, rel_tol=1e-9):
-        raise InputError(f"{source.name}.resolution", f"{own:g}, as {by.path} says of this image", resolution)
+    side = _number(by, keys, "resolution")
+    if resolution is not None and not math.isclose(resolution, side, rel_tol=1e-9):
+        raise InputError(f"{source.name}.resolution", f"{side:g}, as {by.path} says of this image", resolution)
     grid = read_map_server(by, source.path)
     there = keys["origin"][:2]
     if origin is not None and not np.allclose(origin[:2], np.array(there, float), rtol=1e-9, atol=1e-9):

@@ -81,8 +81,8 @@ def _declared(kind: str, raw: bytes) -> float:
     """How many faces a file has, before trimesh divides those with more corners into fans of triangles."""
     if kind == "obj":
         return len(re.findall(rb"(?m)^[ \t]*f[ \t]", raw))
-    found = re.search(rb"(?m)^element[ \t]+face[ \t]+(\d+)", raw) if kind == "ply" else None
-    return int(found[1]) if found else math.inf
+    match = re.search(rb"(?m)^element[ \t]+face[ \t]+(\d+)", raw) if kind == "ply" else None
+    return int(match[1]) if match else math.inf
 
 
 def _is_folded(vertices: np.ndarray, faces: np.ndarray, angles: np.ndarray) -> bool:
@@ -117,8 +117,8 @@ def _enclosed(source: Source, cells: np.ndarray, corners: np.ndarray) -> np.ndar
     _, first = np.unique(regions, return_index=True)
     inside = np.zeros(count + 1, bool)
     inside[regions.ravel()[first]] = [
-        bool(cell) and abs(_turns(corners - (np.array(np.unravel_index(place, cells.shape)) + 0.5))) > 0.5
-        for cell, place in zip(regions.ravel()[first], first, strict=True)
+        bool(cell) and abs(_turns(corners - (np.array(np.unravel_index(index, cells.shape)) + 0.5))) > 0.5
+        for cell, index in zip(regions.ravel()[first], first, strict=True)
     ]
     return inside[regions]
 

@@ -44,9 +44,9 @@ def read_octomap(source: Source, box: Box) -> OccupancyGrid:
     """
     expected = f"an OctoMap file, which begins with '{FIRST_LINES[source.path.suffix.lower()]}'"
     raw = source.bytes(expected)
-    kind, size, resolution, at = _header(source, raw, expected)
+    kind, size, resolution, offset = _header(source, raw, expected)
     source.limit(size, MOST_NODES, "nodes of a tree")
-    cursor = Cursor(source, raw, expected, at)
+    cursor = Cursor(source, raw, expected, offset)
     binary = source.path.suffix.lower() == ".bt"
     leaves, nodes = _binary_tree(cursor, size) if binary else _tree(cursor, NODE_BYTES[kind])
     if nodes != size:
@@ -56,10 +56,10 @@ def read_octomap(source: Source, box: Box) -> OccupancyGrid:
     middle, begin, end = 2 ** (DEPTH - 1), leaves.lowest, leaves.lowest + leaves.sides[:, None]
     first, last = (np.clip(cells + middle, 0, 2**DEPTH) for cells in box.cells(resolution))
     begin, end = np.maximum(begin, first), np.minimum(end, last)
-    held = (begin < end).all(-1)
-    if not held.any():
+    inside = (begin < end).all(-1)
+    if not inside.any():
         source.refuse(f"known cells in {box}", "none")
-    begin, end, values = begin[held], end[held], leaves.values[held]
+    begin, end, values = begin[inside], end[inside], leaves.values[inside]
     low, high = begin.min(0), end.max(0)
     count = f"cells ({' x '.join(map(str, high - low))}): read a part by `box` or `layer`"
     source.limit(int(np.prod(high - low, dtype=np.float64)), MOST_CELLS, count)
@@ -77,33 +77,33 @@ def _fill(cells: np.ndarray, begin: np.ndarray, end: np.ndarray, values: np.ndar
 
 def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float, int]:
     """Kind of tree, number of nodes, side of a cell, and the byte after the header."""
-    found: dict[str, str] = {}
-    at = 0
+    fields: dict[str, str] = {}
+    offset = 0
     for line in range(OCTOMAP_LINES):
-        end = raw.find(b"\n", at, at + OCTOMAP_LETTERS)
-        text = raw[at : max(end, at)].decode("utf-8", "replace").strip()
+        end = raw.find(b"\n", offset, offset + OCTOMAP_LETTERS)
+        text = raw[offset : max(end, offset)].decode("utf-8", "replace").strip()
         if end < 0 or (line == 0 and not text.startswith(FIRST_LINES[source.path.suffix.lower()])):
-            source.refuse(expected, f"{shown(raw[at : at + 40])} at byte {at:,}")
-        at = end + 1
+            source.refuse(expected, f"{shown(raw[offset : offset + 40])} at byte {offset:,}")
+        offset = end + 1
         if text == "data":
             break
         if text and not text.startswith("#"):
             key, _, value = text.partition(" ")
-            if key not in ("id", "size", "res") or key in found:
+            if key not in ("id", "size", "res") or key in fields:
                 source.refuse(f"{expected}, then id, size, res and data", f"{shown(text[:60])} in line {line + 1}")
-            found[key] = value.strip()
-    if set(found) != {"id", "size", "res"}:
-        source.refuse(f"{expected}, then id, size, res and data", f"only {', '.join(found) or 'none of them'}")
-    if found["id"] not in NODE_BYTES:
-        source.refuse(f"a tree of {', '.join(NODE_BYTES)}", shown(found["id"]))
-    size = whole(source, found["size"], "size")
+            fields[key] = value.strip()
+    if set(fields) != {"id", "size", "res"}:
+        source.refuse(f"{expected}, then id, size, res and data", f"only {', '.join(fields) or 'none of them'}")
+    if fields["id"] not in NODE_BYTES:
+        source.refuse(f"a tree of {', '.join(NODE_BYTES)}", shown(fields["id"]))
+    size = whole(source, fields["size"], "size")
     try:
-        resolution = float(found["res"])
+        resolution = float(fields["res"])
     except ValueError:
         resolution = np.nan
     if not 0.0 < resolution < np.inf:
-        source.refuse("res, a length > 0 m", shown(found["res"]))
-    return found["id"], size, resolution, at
+        source.refuse("res, a length > 0 m", shown(fields["res"]))
+    return fields["id"], size, resolution, offset
 
 
 def _binary_tree(cursor: Cursor, size: int) -> tuple[Leaves, int]:
@@ -129,13 +129,13 @@ def _tree(cursor: Cursor, more: int) -> tuple[Leaves, int]:
     bits = rows["children"].tolist()
     nodes = _walked(cursor, count, row.itemsize, lambda i: [c for c in range(8) if bits[i] >> c & 1] or None)
     leaves = rows["children"] == 0
-    found = nodes[leaves]
+    cells = nodes[leaves]
     with np.errstate(invalid="ignore"):  # some kinds of NaN, refused below
         odds = rows["log_odds"][leaves].astype(np.float64)
     if not np.isfinite(odds).all():
         cursor.source.refuse("finite log-odds of leaves", f"{odds[~np.isfinite(odds)][0]}")
     probabilities = (1.0 / (1.0 + np.exp(-np.clip(odds, -50.0, 50.0)))).astype(np.float32)
-    return Leaves(found[:, :3], 1 << found[:, 3], probabilities), count
+    return Leaves(cells[:, :3], 1 << cells[:, 3], probabilities), count
 
 
 def _walked(cursor: Cursor, most: int, size: int, children: Callable[[int], list[int] | None]) -> np.ndarray:
@@ -149,12 +149,12 @@ def _walked(cursor: Cursor, most: int, size: int, children: Callable[[int], list
     open_ = [(0, 0, 0, DEPTH)] if most else []
     while open_ and len(nodes) < most:
         x, y, z, level = open_.pop()
-        own, half = children(len(nodes)), 1 << level >> 1
-        if own is not None and level == 0:
-            at = cursor.at + size * len(nodes)
-            cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {at:,}")
+        octants, half = children(len(nodes)), 1 << level >> 1
+        if octants is not None and level == 0:
+            offset = cursor.at + size * len(nodes)
+            cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {offset:,}")
         nodes.append((x, y, z, level))
-        for child in reversed(own or []):  # the first is read first, from the end of the list
+        for child in reversed(octants or []):  # the first is read first, from the end of the list
             open_.append((x + half * (child & 1), y + half * (child >> 1 & 1), z + half * (child >> 2), level - 1))
     if open_ or size * len(nodes) < cursor.left:
         expected, how = f"{cursor.expected}, and ends with its tree's last node", "is cut" if open_ else "ends"

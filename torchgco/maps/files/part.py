@@ -61,25 +61,25 @@ def checked_box(value: Any, field: str) -> Box:
 
 
 def part(
-    source: Source, found: OccupancyGrid | np.ndarray, box: Box, radius: float | None
+    source: Source, whole: OccupancyGrid | np.ndarray, box: Box, radius: float | None
 ) -> OccupancyGrid | np.ndarray:
     """The cells of a grid that a box touches, or those of some points (P, d) whose balls do.
 
     Raises:
         InputError: a box of another space than the map's, or nothing in it.
     """
-    box.of(source, found.d if isinstance(found, OccupancyGrid) else found.shape[1])
-    if isinstance(found, OccupancyGrid):
-        first, last = (np.clip(cells, 0, found.shape) for cells in box.cells(found.resolution, found.origin))
+    box.of(source, whole.d if isinstance(whole, OccupancyGrid) else whole.shape[1])
+    if isinstance(whole, OccupancyGrid):
+        first, last = (np.clip(cells, 0, whole.shape) for cells in box.cells(whole.resolution, whole.origin))
         if not (first < last).all():
-            source.refuse(f"a cell in {box}", f"cells from {found.origin.tolist()} to {found.upper.tolist()}")
-        cells = found.occupied[tuple(map(slice, first, last))]
-        return made(source, np.ascontiguousarray(cells), found.origin + found.resolution * first, found.resolution)
+            source.refuse(f"a cell in {box}", f"cells from {whole.origin.tolist()} to {whole.upper.tolist()}")
+        cells = whole.occupied[tuple(map(slice, first, last))]
+        return made(source, np.ascontiguousarray(cells), whole.origin + whole.resolution * first, whole.resolution)
     reach = radius or 0.0
-    held = ((found >= box.low - reach) & (found <= box.high + reach)).all(-1)
-    if not held.any():
-        source.refuse(f"a point in {box}", f"points from {found.min(0).tolist()} to {found.max(0).tolist()}")
-    return found[held]
+    inside = ((whole >= box.low - reach) & (whole <= box.high + reach)).all(-1)
+    if not inside.any():
+        source.refuse(f"a point in {box}", f"points from {whole.min(0).tolist()} to {whole.max(0).tolist()}")
+    return whole[inside]
 
 
 def checked_layer(value: Any, field: str) -> tuple[float, float]:
@@ -91,7 +91,7 @@ def checked_layer(value: Any, field: str) -> tuple[float, float]:
 
 
 def flat(
-    source: Source, found: OccupancyGrid | np.ndarray, layer: tuple[float, float], radius: float | None
+    source: Source, whole: OccupancyGrid | np.ndarray, layer: tuple[float, float], radius: float | None
 ) -> OccupancyGrid | np.ndarray:
     """What of a map in space lies in the layer, seen from above.
 
@@ -101,24 +101,24 @@ def flat(
     Raises:
         InputError: a map of the plane, or one without a cell or point in the layer.
     """
-    d = found.d if isinstance(found, OccupancyGrid) else found.shape[1]
+    d = whole.d if isinstance(whole, OccupancyGrid) else whole.shape[1]
     if d != 3:
         raise InputError(f"{source.name}.layer", f"none, as {source.path} is a map of the plane", layer)
     low, high = layer
-    if isinstance(found, OccupancyGrid):
-        bottoms = found.origin[2] + found.resolution * np.arange(found.shape[2])
-        held = (bottoms < high) & (bottoms + found.resolution > low)
-        if not held.any():
-            source.refuse(f"cells between {low:g} m and {high:g} m", f"{found.origin[2]:g} m to {found.upper[2]:g} m")
-        cells = found.occupied[..., held]
+    if isinstance(whole, OccupancyGrid):
+        bottoms = whole.origin[2] + whole.resolution * np.arange(whole.shape[2])
+        inside = (bottoms < high) & (bottoms + whole.resolution > low)
+        if not inside.any():
+            source.refuse(f"cells between {low:g} m and {high:g} m", f"{whole.origin[2]:g} m to {whole.upper[2]:g} m")
+        cells = whole.occupied[..., inside]
         if cells.dtype == np.bool_:
-            return made(source, cells.any(-1), found.origin[:2], found.resolution)
+            return made(source, cells.any(-1), whole.origin[:2], whole.resolution)
         worst = np.where(np.isnan(cells), UNKNOWN_CELL, cells.astype(np.float32)).max(-1)
         worst[worst == UNKNOWN_CELL] = np.nan
-        return made(source, worst, found.origin[:2], found.resolution)
+        return made(source, worst, whole.origin[:2], whole.resolution)
     reach = radius or 0.0
-    points = found[(found[:, 2] >= low - reach) & (found[:, 2] <= high + reach), :2]
+    points = whole[(whole[:, 2] >= low - reach) & (whole[:, 2] <= high + reach), :2]
     if not len(points):
-        got = f"{found[:, 2].min():g} m to {found[:, 2].max():g} m"
+        got = f"{whole[:, 2].min():g} m to {whole[:, 2].max():g} m"
         source.refuse(f"points between {low:g} m and {high:g} m", got)
     return np.ascontiguousarray(points)

@@ -62,42 +62,42 @@ def read_pcd(source: Source) -> np.ndarray:
 
 
 def _header(source: Source, raw: bytes) -> Header:
-    found: dict[str, list[str]] = {}
-    at = lines = 0
-    while "DATA" not in found:
-        end = raw.find(b"\n", at, at + PCD_LETTERS)
+    header: dict[str, list[str]] = {}
+    offset = lines = 0
+    while "DATA" not in header:
+        end = raw.find(b"\n", offset, offset + PCD_LETTERS)
         if end < 0 or lines >= PCD_LINES:
-            source.refuse(f"{PCD} with a header that ends with DATA", f"none in line {lines + 1}, byte {at:,}")
-        words = raw[at:end].decode("utf-8", "replace").split()
-        at, lines = end + 1, lines + 1
+            source.refuse(f"{PCD} with a header that ends with DATA", f"none in line {lines + 1}, byte {offset:,}")
+        words = raw[offset:end].decode("utf-8", "replace").split()
+        offset, lines = end + 1, lines + 1
         if words and not words[0].startswith("#"):
-            if words[0] not in PCD_KEYS or words[0] in found:
+            if words[0] not in PCD_KEYS or words[0] in header:
                 source.refuse(f"{PCD}: a line of each of {', '.join(PCD_KEYS)}", f"{shown(words[0])} in line {lines}")
-            found[words[0]] = words[1:]
-    if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT") if key not in found]:
+            header[words[0]] = words[1:]
+    if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT") if key not in header]:
         source.refuse(f"{PCD} with {' and '.join(missing)}", "a header without")
-    names = found["FIELDS"]
-    lists = (names, found["SIZE"], found["TYPE"], found.get("COUNT", ["1"] * len(names)))
+    names = header["FIELDS"]
+    lists = (names, header["SIZE"], header["TYPE"], header.get("COUNT", ["1"] * len(names)))
     if len({len(values) for values in lists}) > 1 or not 0 < len(names) <= FIELDS:
         source.refuse("FIELDS, SIZE, TYPE and COUNT of one length", [len(values) for values in lists])
-    sizes = [whole(source, size, "SIZE", 1) for size in found["SIZE"]]
+    sizes = [whole(source, size, "SIZE", 1) for size in header["SIZE"]]
     counts = [whole(source, count, "COUNT", 0) for count in lists[3]]
     if sum(counts) > FIELDS:
         source.refuse(f"at most {FIELDS} numbers per point", sum(counts))
     fields = []
-    for pair, count in zip(zip(found["TYPE"], sizes, strict=True), counts, strict=True):
+    for pair, count in zip(zip(header["TYPE"], sizes, strict=True), counts, strict=True):
         if pair not in PCD_TYPES:
             source.refuse("TYPE F, U or I of 1, 2, 4 or 8 bytes", f"{shown(pair[0])} of {pair[1]}")
         fields.append((f"{len(fields)}", PCD_TYPES[pair], (count,)))
-    sides = [whole(source, " ".join(found[key]), key) for key in ("WIDTH", "HEIGHT")]
+    sides = [whole(source, " ".join(header[key]), key) for key in ("WIDTH", "HEIGHT")]
     points = sides[0] * sides[1]
-    if "POINTS" in found and whole(source, " ".join(found["POINTS"]), "POINTS") != points:
-        source.refuse(f"POINTS {points} as WIDTH and HEIGHT say", " ".join(found["POINTS"]))
+    if "POINTS" in header and whole(source, " ".join(header["POINTS"]), "POINTS") != points:
+        source.refuse(f"POINTS {points} as WIDTH and HEIGHT say", " ".join(header["POINTS"]))
     source.limit(points, MOST_POINTS, "points")
-    data = " ".join(found["DATA"])
+    data = " ".join(header["DATA"])
     if data not in ("ascii", "binary", "binary_compressed"):
         source.refuse("DATA ascii, binary or binary_compressed", shown(data))
-    return Header(names, counts, np.dtype(fields), points, data, at, lines)
+    return Header(names, counts, np.dtype(fields), points, data, offset, lines)
 
 
 def _binary(cursor: Cursor, header: Header, wanted: list[int]) -> list[np.ndarray]:
@@ -112,14 +112,14 @@ def _compressed(cursor: Cursor, header: Header, wanted: list[int]) -> list[np.nd
     if size != (due := header.points * header.point.itemsize):
         cursor.source.refuse(f"{due:,} bytes of {header.points:,} points", f"{size:,}")
     cursor.source.limit(size, MOST_BYTES, "bytes of points")
-    at = cursor.at
-    data = unpack(cursor.source, cursor.take(packed, "compressed points"), size, at)
+    offset = cursor.at
+    data = unpack(cursor.source, cursor.take(packed, "compressed points"), size, offset)
     starts = np.cumsum([0, *(header.points * header.point[i].itemsize for i in range(len(header.names)))]).tolist()
     return [np.frombuffer(data, header.point[i].base, header.points, starts[i]) for i in wanted]
 
 
-def unpack(source: Source, data: memoryview, size: int, at: int = 0) -> bytearray:
-    """`size` bytes that were packed by LZF; `at` is where they lie in the file, for errors.
+def unpack(source: Source, data: memoryview, size: int, offset: int = 0) -> bytearray:
+    """`size` bytes that were packed by LZF; `offset` is where they lie in the file, for errors.
 
     A first byte c < 32 begins c + 1 bytes as they are. Others copy c >> 5 bytes and two more (with 7, the next byte is
     added) that were unpacked before: their distance less one are the last 5 bits of c and the byte that follows.
@@ -150,7 +150,7 @@ def unpack(source: Source, data: memoryview, size: int, at: int = 0) -> bytearra
             if len(out) > size:
                 raise IndexError
     except IndexError:
-        source.refuse(f"{size:,} bytes packed by LZF", f"damage at byte {at + min(i, len(packed)):,}")
+        source.refuse(f"{size:,} bytes packed by LZF", f"damage at byte {offset + min(i, len(packed)):,}")
     if len(out) != size:
         source.refuse(f"{size:,} bytes packed by LZF", f"{len(out):,}")
     return out

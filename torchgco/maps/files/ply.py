@@ -51,8 +51,8 @@ def read_ply(source: Source, resolution: float | None, solid: bool | None) -> np
     trimesh = library_of_meshes(source)
     with source.library(PLY), limited(PLY_MEMORY), warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy's, of text that holds no numbers
-        held = trimesh.exchange.ply.load_ply(BytesIO(raw), skip_materials=True)
-        points = np.asarray(held.get("vertices", np.empty((0, 3))), np.float64)
+        loaded = trimesh.exchange.ply.load_ply(BytesIO(raw), skip_materials=True)
+        points = np.asarray(loaded.get("vertices", np.empty((0, 3))), np.float64)
     if len(points) != count:
         source.refuse(f"{count:,} vertices", f"{len(points):,}")
     return finite_points(source, points)

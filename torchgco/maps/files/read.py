@@ -140,32 +140,32 @@ def read(
             range, or not for this kind of file.
     """
     source, format = _find(path, field)
-    given = {"resolution": resolution, "origin": origin, "height": height, "topic": topic, "solid": solid}
-    for name, value in given.items():
+    options = {"resolution": resolution, "origin": origin, "height": height, "topic": topic, "solid": solid}
+    for name, value in options.items():
         if value is not None and name not in format.options:
             raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
     cell = ("resolution", resolution, LEAST_CELL)
     _check_lengths(field, cell, ("radius", radius, 0.0), ("height", height, LEAST_CELL))
     if origin is not None:
-        given["origin"] = origin = coordinates(origin, f"{field}.origin")
+        options["origin"] = origin = coordinates(origin, f"{field}.origin")
         if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST_AT).all():
             raise InputError(f"{field}.origin", f"2 or 3 coordinates within {FARTHEST_AT:g} m", shown(origin.tolist()))
     if solid is not None and not isinstance(solid, bool):
         raise InputError(f"{field}.solid", "True, False or None", shown(solid))
     check_value(outside, Unknown | None, f"{field}.outside")
-    given["layer"] = layer = None if layer is None else checked_layer(layer, f"{field}.layer")
-    given["box"] = box = None if box is None else checked_box(box, f"{field}.box")
-    found = format.reader(source, **{name: given[name] for name in format.options})
-    found = found if box is None else part(source, found, box, radius)
-    found = found if layer is None else flat(source, found, layer, radius)
-    if isinstance(found, OccupancyGrid):
+    options["layer"] = layer = None if layer is None else checked_layer(layer, f"{field}.layer")
+    options["box"] = box = None if box is None else checked_box(box, f"{field}.box")
+    content = format.reader(source, **{name: options[name] for name in format.options})
+    content = content if box is None else part(source, content, box, radius)
+    content = content if layer is None else flat(source, content, layer, radius)
+    if isinstance(content, OccupancyGrid):
         if radius is not None:
             raise InputError(f"{field}.radius", f"none: {source.path} holds cells, no points", radius)
-        return found.enclosed() if (outside or usual_outside(path, height, field)) == "occupied" else found
+        return content.enclosed() if (outside or usual_outside(path, height, field)) == "occupied" else content
     if outside == "occupied":
         raise InputError(f"{field}.outside", "free: a cloud of points has no edge", outside)
     source.needs("radius", radius, "the radius of the ball around each point, m")
-    return PointCloud(found, radius)
+    return PointCloud(content, radius)
 
 
 def _check_lengths(field: str, *lengths: tuple[str, Any, float]) -> None:

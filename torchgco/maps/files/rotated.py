@@ -55,6 +55,6 @@ def _worst(padded: np.ndarray, turn: np.ndarray, low: np.ndarray, shape: tuple[i
     worst = np.zeros(shape, np.float32)
     for a in range(3):
         for b in range(3):
-            at = np.clip(np.minimum(from_ + np.array([a, b]), to), 0, limit)
-            np.maximum(worst, padded[at[..., 0], at[..., 1]], out=worst)
+            index = np.clip(np.minimum(from_ + np.array([a, b]), to), 0, limit)
+            np.maximum(worst, padded[index[..., 0], index[..., 1]], out=worst)
     return worst

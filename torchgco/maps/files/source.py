@@ -59,12 +59,12 @@ class Source:
             InputError: it isn't there, or is a folder, a pipe or a device.
         """
         try:
-            found = os.stat(self.path)
+            status = os.stat(self.path)
         except (OSError, ValueError) as error:
             self.refuse(expected, _reason(error))
-        if not stat.S_ISREG(found.st_mode):
-            self.refuse(expected, "a folder" if stat.S_ISDIR(found.st_mode) else "no regular file")
-        return found.st_size
+        if not stat.S_ISREG(status.st_mode):
+            self.refuse(expected, "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file")
+        return status.st_size
 
     def bytes(self, expected: str, most: int = MOST_BYTES) -> bytes:
         """The whole file; InputError where it has more than `most` bytes."""
@@ -119,9 +119,9 @@ class FileBytes:
     def __len__(self) -> int:
         return self.size
 
-    def __getitem__(self, part: slice) -> memoryview:
-        self.file.seek(part.start)
-        return memoryview(self.file.read(part.stop - part.start))
+    def __getitem__(self, span: slice) -> memoryview:
+        self.file.seek(span.start)
+        return memoryview(self.file.read(span.stop - span.start))
 
 
 class Cursor:
@@ -155,8 +155,8 @@ class Cursor:
         return taken
 
     def _cut(self, count: int, what: str, left: int) -> NoReturn:
-        at = f"at byte {self.before + self.at:,}"
-        self.source.refuse(f"{self.expected} with {count:,} bytes of {what} {at}", f"{left:,} bytes there")
+        where = f"at byte {self.before + self.at:,}"
+        self.source.refuse(f"{self.expected} with {count:,} bytes of {what} {where}", f"{left:,} bytes there")
 
     def number(self, kind: str, what: str) -> Any:
         """The next number, by a letter of `struct`, little-endian."""

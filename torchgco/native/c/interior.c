@@ -10,7 +10,7 @@
 static void settle(Barrier *t, Track *k, I of, int anew) {
     const Interior *how = t->how;
     Lanes *s = &t->lanes;
-    V cost = values(t, s->X, s->U, t->c, t->gap);
+    V cost = values(t, t->live, s->X, s->U, t->c, t->gap);
     if (anew) {
         sort_rows(t, of);
         EACH_ROW(t, 0, q) {
@@ -65,8 +65,10 @@ static void infer_sizes(const Barrier *t, V *size) {
     }
 }
 
-/* The largest slope or curvature of the cost in any one variable, in units in which none of these is small, and `plain`
-   in its own: eager/sizes.py says how. */
+/* The largest slope or curvature of the cost in any one variable, and `plain` in its own units. The cost is scaled by it.
+   In a variable of small units, a length in tens of kilometres, curvatures are large though it moves little: the scaled
+   cost would be tiny beside barrier and multipliers. So a variable whose numbers are all small counts in units of the
+   largest of them: in the guess, in its bounds, and in the step to the minimum of the cost alone. */
 static V steepest(const Barrier *t, V *plain) {
     const Lanes *s = &t->lanes;
     V largest = SET(0.0), zero = SET(0.0), one = SET(1.0), g[S], H[S * S], slope[S], bend[S], size[S];
@@ -100,7 +102,10 @@ static double first_barrier(const Barrier *t, int l) {
     return own > end ? own : end;
 }
 
-/* Multipliers of bounds begin at 1 where the cost hardly holds a step back: eager/loose.py says why. */
+/* Multipliers of bounds begin at 1 where the cost hardly holds a step back. Those of the central path, mu / s, are tiny at
+   a bound far away: in a linear programme, and with tiny weights, steps leave the bounds a hundredfold, as little of them
+   is taken, and iterations grow with the horizon. Elsewhere 1 would bend the model for nothing. What moving a variable
+   leads to counts, too, and a slack as 1 at least: at a bound nearby small slacks hold a step. */
 static void hold_loose(Barrier *t, I of) {
     const Lanes *s = &t->lanes;
     I some = of & ~of;
@@ -146,6 +151,7 @@ static void begin(Barrier *t, Track *k, I of) {
             for (int l = 0; l < LANES; l++)
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
+    ask(t, DERIVATIVES, t->live, t->lanes.X, t->lanes.U);
     largest = steepest(t, &plain);
     V scale = SET(how->nlp_scaling_obj_target_gradient) / largest;
     I scaled = of & tgco_finite(scale) & (largest > zero);
@@ -187,7 +193,7 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
         lowered |= low;
     }
     if (!any(lowered)) return;
-    V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn);
+    V cost = values(t, lowered, t->lanes.X, t->lanes.U, t->cn, t->gapn);
     k->phi = tgco_choose(lowered, cost - t->mu * logarithms(t, t->s), k->phi);
     for (int l = 0; l < LANES; l++) if (lowered[l]) k->pairs[l] = 0;
 }
@@ -266,7 +272,7 @@ static I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
     if (t->how->smoothing > 0) return of & ~of; /* it is to stay */
     if (!any(of)) return of;
-    V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
+    V cost = values(t, of, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
     EACH_ROW(t, 0, q) *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]);
     EACH_ROW(t, 1, q) *left += tgco_fabs(t->z[q] * t->r[q]);
     for (int l = 0; l < LANES; l++) {
@@ -447,18 +453,20 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
     memset(k, 0, sizeof *k);
     I running = SET(0.0) == SET(0.0), fresh = running;
     int64_t next = first;
-    double until = seconds_now() + how->seconds;
+    double begun = seconds_now();
     int64_t own = last - first < LANES ? last - first : LANES;
     for (int l = 0; l < LANES; l++) { /* lanes without a problem repeat the first problem: its networks are computed once */
         enter_barrier(t, l, l < own ? first + l : first);
         if (l < own) next++;
+        else if (how->ask) running[l] = 0;
     }
+    t->live = running;
     begin(t, k, fresh);
     while (any(running)) {
         int32_t status[LANES];
         V error;
         I ended = iterate(t, k, running, status, &error);
-        int late = seconds_now() > until;
+        int late = seconds_now() - begun > how->seconds; /* which Python makes shorter where a function has failed */
         if (late) for (int l = 0; l < LANES; l++) if (running[l] && !ended[l]) { status[l] = TIME_LIMIT; ended[l] = -1; }
         fresh &= ~fresh;
         I falls = how->minimum && any(ended) ? find_falls(t, ended) : fresh & ~fresh;
@@ -473,6 +481,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
             if (next < last && !late) { enter_barrier(t, l, next++); fresh[l] = -1; }
             else running[l] = 0;
         }
+        t->live = running;
         if (any(fresh)) begin(t, k, fresh);
     }
     for (; next < last; next++) how->of->status[next] = TIME_LIMIT; /* not begun */

@@ -20,7 +20,7 @@ typedef struct {
     double admitted; /* violation of rows outside, up to which they stay there */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are, also at its end */
     V *across[3]; /* (widest): numbers of the rows of one constraint at one knot */
-    I *moves;
+    I *moves; /* (rows) */
     int64_t widest; /* rows of a constraint at a knot, at most */
     V mu, shift, scale;
     V raised;    /* how many times larger the scale is than it would be in the units of the problem */
@@ -28,6 +28,8 @@ typedef struct {
     V *gives;    /* (rows): by how much more than `soft` says */
     V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */
     V *kept; /* the iterate before the steps on trial */
+    I live; /* lanes whose problem isn't over */
+    double **rows_asked; /* of each constraint: the numbers of its rows, where Python computes them */
     V *memory;
 } Barrier;
 

@@ -5,10 +5,7 @@
    at its end: what is feasible there, with no multiplier, is optimal with the row, too. Of two bounds that coincide, the
    upper one becomes an equality, and the lower one stays out. */
 #pragma once
-#include <float.h>
 #include "interior_memory.h"
-
-/* NUDGE, GOLDEN and ROUNDINGS are those of eager/fixed.py, which says what they mean. */
 
 /* A number in [1, 2) for variable i: no row and no model is likely to let a sum of these cancel. */
 static inline double uneven(int64_t i) {
@@ -52,28 +49,21 @@ static void vary_controls(const Barrier *t, int64_t k, V *du) {
     }
 }
 
-/* States and controls of a knot (S), and how a change of all free variables changes them (S). */
-typedef struct { V *x, *z; } Response;
-
-/* The rows of constraint i at knot k that a change moves in one of two trajectories close together: a row
-   may be flat in one point alone. A change that is within rounding of its terms is none. */
-static I *find_moved(const Barrier *t, int64_t i, int64_t k, const Response *at) {
+/* The rows of constraint i at knot k that z, a change of the knot's variables, moves: they join `moves`. A change that is
+   within rounding of its terms is none. */
+static void find_moved(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z) {
     int rows = t->lanes.of->constraint[i].rows;
-    I *moves = t->moves;
+    I *moves = t->moves + row_of(t, i, k);
     V *change = t->across[0], *part = t->across[1], *terms = t->across[2], own[S];
-    for (int j = 0; j < rows; j++) moves[j] = SET(0.0) != SET(0.0);
-    for (int near = 0; near < 2; near++, at++) {
-        const V *u = k < t->lanes.of->N ? at->x + NX : 0;
-        along(t, i, k, at->x, u, at->z, change);
-        for (int j = 0; j < rows; j++) terms[j] = SET(0.0);
-        for (int v = 0; v < (u ? S : NX); v++) {
-            for (int w = 0; w < S; w++) own[w] = w == v ? at->z[v] : SET(0.0);
-            along(t, i, k, at->x, u, own, part);
-            for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
-        }
-        for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= SET(ROUNDINGS * DBL_EPSILON) * terms[j]);
+    along(t, i, k, x, u, z, change);
+    for (int j = 0; j < rows; j++) terms[j] = SET(0.0);
+    for (int v = 0; v < (u ? S : NX); v++) {
+        for (int w = 0; w < S; w++) own[w] = w == v ? z[v] : SET(0.0);
+        along(t, i, k, x, u, own, part);
+        for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
     }
-    return moves;
+    V rounding = SET(ROUNDINGS * t->how->last_bit);
+    for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= rounding * terms[j]);
 }
 
 /* Rows j of constraint i at knot k, in the lanes `of`, with less room than a slack is given at first, or than a guess is
@@ -96,57 +86,77 @@ static int has_tight(const Barrier *t, I of, int64_t i, int64_t k) {
     return any(tight);
 }
 
-/* What to do with the rows of constraint i at knot k in the lanes `of`, which respond in two trajectories as it says. */
-typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const Response *at);
+/* What to do with the rows of constraint i at knot k in the lanes `of`, where z is how the knot's variables change. */
+typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const V *z);
 
-/* The next states of the trajectory nearby, and of both how they respond. */
-static void respond(Barrier *t, int64_t k, Response *at) {
-    V f[NJ + 1], next[NX], moved[NX];
-    const V *parameters = model_at(&t->lanes, k);
-    const double *w = t->lanes.of->shared;
-    model_jacobian(at[1].x, at[1].x + NX, parameters, w, f);
-    model_push(f, at[1].z, next);
-    model_step(at[1].x, at[1].x + NX, parameters, w, moved);
-    for (int i = 0; i < NX; i++) at[1].z[i] = next[i];
-    model_step(at->x, at->x + NX, parameters, w, next);
-    for (int i = 0; i < NX; i++) at[1].x[i] = t->lanes.X[(k + 1) * NX + i] + (moved[i] - next[i]);
-    model_jacobian(at->x, at->x + NX, parameters, w, f);
-    model_push(f, at->z, next);
-    for (int i = 0; i < NX; i++) at->z[i] = next[i];
+/* Whether rows of constraint i at knot k are visited: those that are tight, or `all`. */
+static int is_visited(const Barrier *t, I of, int all, int64_t i, int64_t k) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    return !con->equality && con->place[k] != NOWHERE && (all || has_tight(t, of, i, k));
 }
 
-/* Visits the tight rows of all knots, or `all`. */
+/* How a change of all free variables, each by a number of its own, changes the start. */
+static void vary_start(const Barrier *t, V *dx) {
+    for (int i = 0; i < NX; i++) dx[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]), SET(uneven(~i))) : SET(0.0);
+}
+
+/* A trajectory close to the iterate, with the same gaps, into Xn and Un. */
+static void find_nearby(Barrier *t) {
+    const Lanes *s = &t->lanes;
+    int64_t N = s->of->N;
+    V step[NX], moved[NX], du[NU];
+    vary_start(t, step);
+    for (int i = 0; i < NX; i++) s->Xn[i] = s->X[i] + SET(NUDGE) * step[i];
+    for (int64_t k = 0; k < N; k++) {
+        vary_controls(t, k, du);
+        for (int j = 0; j < NU; j++) s->Un[k * NU + j] = s->U[k * NU + j] + SET(NUDGE) * du[j];
+    }
+    ask(t, NEARBY, t->live, s->X, s->U);
+    for (int64_t k = 0; k < N && !t->how->ask; k++) {
+        model_step(s->Xn + k * NX, s->Un + k * NU, model_at(s, k), s->of->shared, moved);
+        model_step(s->X + k * NX, s->U + k * NU, model_at(s, k), s->of->shared, step);
+        for (int i = 0; i < NX; i++) s->Xn[(k + 1) * NX + i] = s->X[(k + 1) * NX + i] + (moved[i] - step[i]);
+    }
+}
+
+/* Visits the tight rows of all knots, or `all`. Which of them a change of all free variables moves, `moves`, is seen in two
+   trajectories close together: a row may be flat in one point alone. */
 static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
     const Lanes *s = &t->lanes;
     const Problem *p = s->of;
-    V memory[4 * S];
-    Response at[2] = {{memory, memory + S}, {memory + 2 * S, memory + 3 * S}};
-    for (int i = 0; i < NX; i++) {
-        at->z[i] = at[1].z[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]), SET(uneven(~i))) : SET(0.0);
-        at[1].x[i] = s->X[i] + SET(NUDGE) * at->z[i];
-    }
-    for (int64_t k = 0; k <= p->N; k++) {
-        memcpy(at->x, s->X + k * NX, NX * sizeof(V));
-        for (int j = NX; j < S; j++) at->x[j] = at->z[j] = at[1].x[j] = at[1].z[j] = SET(0.0);
-        if (k < p->N) {
-            memcpy(at->x + NX, s->U + k * NU, NU * sizeof(V));
-            vary_controls(t, k, at->z + NX);
-            for (int j = NX; j < S; j++) { at[1].z[j] = at->z[j]; at[1].x[j] = at->x[j] + SET(NUDGE) * at->z[j]; }
+    int some = 0;
+    for (int64_t k = 0; k <= p->N; k++) for (int64_t i = 0; i < p->constraints; i++) some |= is_visited(t, of, all, i, k);
+    if (!some) return;
+    memset(t->moves, 0, t->rows * sizeof(I));
+    find_nearby(t);
+    for (int near = 1; near >= 0; near--) {
+        const V *X = near ? s->Xn : s->X, *U = near ? s->Un : s->U;
+        V z[S], f[NJ + 1];
+        ask(t, DERIVATIVES, t->live, X, U);
+        vary_start(t, z);
+        for (int64_t k = 0; k <= p->N; k++) {
+            const V *x = X + k * NX, *u = k < p->N ? U + k * NU : 0;
+            for (int j = NX; j < S; j++) z[j] = SET(0.0);
+            if (u) vary_controls(t, k, z + NX);
+            for (int64_t i = 0; i < p->constraints; i++) {
+                if (!is_visited(t, of, all, i, k)) continue;
+                find_moved(t, i, k, x, u, z);
+                if (!near) visit(t, of, i, k, z);
+            }
+            if (!u) continue;
+            V next[NX];
+            model_jacobian(x, u, model_at(s, k), p->shared, f);
+            model_push(f, z, next);
+            memcpy(z, next, sizeof next);
         }
-        for (int64_t i = 0; i < p->constraints; i++) {
-            const Constraint *con = p->constraint + i;
-            if (con->equality || con->place[k] == NOWHERE) continue;
-            if (all || has_tight(t, of, i, k)) visit(t, of, i, k, at);
-        }
-        if (k < p->N) respond(t, k, at);
     }
 }
 
 /* Rows that nothing moves leave the barrier, and so do bounds that coincide but that nothing moves. */
-static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
+static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    const I *moves = find_moved(t, i, k, at);
+    const I *moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I tight = is_tight(t, of, i, k, j), is_state = of & ~of;
         if (con->kind == BOUNDS && con->variable[j] < NX) is_state = ~is_state;
@@ -162,10 +172,10 @@ static inline I is_broken(const Barrier *t, int64_t q) {
 }
 
 /* Violated rows that were left out, but that something moves now, come into the barrier. */
-static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
+static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    const I *moves = find_moved(t, i, k, at);
+    const I *moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I in = of & is_broken(t, q + j) & moves[j];
         t->out[q + j] &= ~in;
@@ -175,11 +185,12 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) 
 
 /* Rows are relaxed by a share of the violation tolerance, and by less where bounds leave less room or the controls change
    them little. */
-static void loosen(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
+static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
+    const Lanes *s = &t->lanes;
     V *change = t->across[0], most_room = SET(t->how->relaxes * t->how->constr_viol_tol);
-    along(t, i, k, at->x, k < t->lanes.of->N ? at->x + NX : 0, at->z, change);
+    along(t, i, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, z, change);
     for (int j = 0; j < con->rows; j++, q++) {
         V room = most_room * least(tgco_fabs(change[j]), t->room[q]);
         room = tgco_if(of & ~t->out[q] & tgco_finite(room), room);
@@ -270,8 +281,11 @@ static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, const V *acti
     return hold;
 }
 
-/* Rows of the lanes `of` that hold as equalities give way more where units are small: eager/softness.py says why, and what
-   `moves` are. The slopes f are those of the iterate. */
+/* Rows of the lanes `of` that hold as equalities give way more where units are small: their stiffness is added to the
+   curvature of the cost, of which rounding would leave nothing where that is many times smaller. The cost lets a row give
+   way by about J^2 `moves`; of that, a `share` is enough. `moves` is how far the cost lets a variable move, squared, the
+   inverse of its curvature: of controls that of all they lead to, of states no farther than what controls lead to them.
+   Products of different variables don't count, so it is right but for a factor. The slopes f are those of the iterate. */
 static void soften_rows(Barrier *t, I of, V share, const V *active) {
     const Problem *p = t->lanes.of;
     int some = active != 0;

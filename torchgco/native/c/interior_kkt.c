@@ -185,7 +185,8 @@ static V *start_system(System *of, int64_t N, int64_t rows) {
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
     Interior options = {
-        .of = how->of, .free_start = how->free_start, .pivot = how->pivot, .constr_mult_init_max = INFINITY};
+        .of = how->of, .free_start = how->free_start, .ask = how->ask, .pivot = how->pivot,
+        .constr_mult_init_max = INFINITY};
     Barrier barrier, *t = &barrier;
     System system, *of = &system;
     if (!start_barrier(t, &options)) return 0;
@@ -194,7 +195,10 @@ int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
     if (!memory) { finish_barrier(t); return 0; }
     for (int64_t at = first; at < last; at += LANES) {
         int own = last - at < LANES ? last - at : LANES; /* lanes without a problem repeat the first one */
-        for (int l = 0; l < LANES; l++) enter_system(t, of, how, l, l < own ? at + l : at);
+        for (int l = 0; l < LANES; l++) {
+            enter_system(t, of, how, l, l < own ? at + l : at);
+            t->live[l] = l < own ? -1 : 0;
+        }
         I good = factor_kkt(t, of, how);
         for (int l = 0; l < own; l++) {
             p->status[at + l] = good[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;

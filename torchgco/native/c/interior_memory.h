@@ -34,14 +34,17 @@ static int64_t shape(Barrier *t, V *memory) {
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
     for (int i = 0; i < 3; i++) t->across[i] = cut(&m, t->widest);
-    t->moves = (I *)cut(&m, t->widest);
+    t->moves = (I *)cut(&m, rows);
     t->room = cut(&m, rows); t->relaxed = cut(&m, rows); t->gives = cut(&m, rows);
     t->out = (I *)cut(&m, rows); t->fixes = (I *)cut(&m, rows);
     t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
     return m - memory;
 }
 
-static void finish_barrier(Barrier *t) { free(t->memory); free(t->first); finish(&t->lanes); }
+static void finish_barrier(Barrier *t) {
+    free(t->memory); free(t->first); free(t->rows_asked);
+    finish(&t->lanes);
+}
 
 static int start_barrier(Barrier *t, const Interior *how) {
     const Problem *p = how->of;
@@ -49,11 +52,13 @@ static int start_barrier(Barrier *t, const Interior *how) {
     t->how = how;
     if (!start(&t->lanes, p)) return 0;
     t->first = calloc(p->constraints + 1, sizeof *t->first);
-    if (!t->first) { finish(&t->lanes); return 0; }
+    t->rows_asked = calloc(p->constraints + 1, sizeof *t->rows_asked);
+    if (!t->first || !t->rows_asked) { finish_barrier(t); return 0; }
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         t->first[i + 1] = t->rows += con->knots * con->rows;
         if (con->rows > t->widest) t->widest = con->rows;
+        t->rows_asked[i] = (double *)t->lanes.rows[i].bound;
     }
     int64_t count = shape(t, 0);
     t->memory = aligned_alloc(sizeof(V), (count + 1) * sizeof(V));

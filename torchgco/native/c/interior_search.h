@@ -1,7 +1,6 @@
 /* The interior point's filter and its line search (Waechter and Biegler 2006), with second-order corrections and a
    watchdog. */
 #pragma once
-#include <float.h>
 #include "interior_memory.h"
 
 /* The filter ------------------------------------------------------------------------------------------------------ */
@@ -33,7 +32,7 @@ static void remember(const Barrier *t, Track *k, int l) {
 static int is_good(
     const Barrier *t, const Track *k, int l, double alpha, double slope, double theta, double phi, int *descends) {
     const Interior *how = t->how;
-    double old = k->theta[l], noise = how->noise * DBL_EPSILON * fabs(k->phi[l]);
+    double old = k->theta[l], noise = how->noise * how->last_bit * fabs(k->phi[l]);
     *descends = 0;
     if (!(theta - theta == 0) || !(phi - phi == 0)) return 0;
     if (k->restoring[l]) return theta <= (1 - how->eta_phi * alpha) * old;
@@ -61,13 +60,13 @@ static void longest(const Barrier *t, V tau, V *primal, V *dual) {
     }
 }
 
-/* The trial at step lengths alpha: its theta and phi. */
-static void attempt(Barrier *t, V alpha, V *theta, V *phi) {
+/* The trial of the lanes `of` at step lengths alpha: its theta and phi. */
+static void attempt(Barrier *t, I of, V alpha, V *theta, V *phi) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
     for (int64_t i = 0; i < (N + 1) * NX; i++) s->Xn[i] = s->X[i] + alpha * t->dx[i];
     for (int64_t i = 0; i < N * NU; i++) s->Un[i] = s->U[i] + alpha * t->du[i];
-    V cost = values(t, s->Xn, s->Un, t->cn, t->gapn);
+    V cost = values(t, of, s->Xn, s->Un, t->cn, t->gapn);
     /* A slack that the row leaves more room for takes it: theta and phi fall both. */
     EACH_ROW(t, 0, q) {
         V moved = t->s[q] + alpha * t->ds[q], roomy = tgco_choose(-t->cn[q] > moved, -t->cn[q], moved);
@@ -180,7 +179,7 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
     alpha = full;
     watch(t, k, moving, slope, full);
     for (int tries = 0; any(open); tries++) {
-        attempt(t, alpha, &theta, &phi);
+        attempt(t, open, alpha, &theta, &phi);
         I good = none, again = none, undo = none, back = none;
         for (int l = 0; l < LANES; l++) {
             int descends, watching = k->watching[l] != 0;

@@ -3,9 +3,23 @@
 #pragma once
 #include "interior_rows.h"
 
-/* Values along X, U into c and gap; returns the cost. */
-static V values(const Barrier *t, const V *X, const V *U, V *c, V *gap) {
+/* Has Python compute the functions of the lanes `of` at X, U, where C doesn't. */
+static void ask(const Barrier *t, int asked, I of, const V *X, const V *U) {
     const Lanes *s = &t->lanes;
+    if (!t->how->ask) return;
+    Request request = {
+        .asked = asked, .element = s->element, .X = (double *)X, .U = (double *)U, .Xn = (double *)s->Xn,
+        .Un = (double *)s->Un, .y = (double *)t->y, .z = (double *)t->z, .objective = (double *)&t->objective,
+        .step = (double *)s->parameters, .stage = (double *)s->cost_data[STAGE],
+        .last = (double *)s->cost_data[LAST], .rows = t->rows_asked};
+    for (int l = 0; l < LANES; l++) if (of[l]) request.lanes |= (int64_t)1 << l;
+    if (request.lanes) t->how->ask(&request);
+}
+
+/* Values of the lanes `of` along X, U into c and gap; returns the cost. */
+static V values(const Barrier *t, I of, const V *X, const V *U, V *c, V *gap) {
+    const Lanes *s = &t->lanes;
+    ask(t, VALUES, of, X, U);
     const Problem *p = s->of;
     V total = SET(0.0);
     for (int64_t k = 0; k <= p->N; k++) {
@@ -38,6 +52,7 @@ static void expand(Barrier *t) {
     Lanes *s = &t->lanes;
     const Problem *p = s->of;
     V weight = t->scale * t->objective;
+    ask(t, DERIVATIVES, t->live, s->X, s->U);
     for (int64_t k = 0; k <= p->N; k++) {
         const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
         V *H = t->H + k * S * S, *slope = t->cost_slope + k * S;

@@ -40,7 +40,7 @@ TGCO_INLINE V spheres_terms(
 static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V *centers, int64_t *near) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
-    const V *lam = rows->lam + con->place[k] * con->rows;
+    const V *lam = rows->lam + con->place[k] * con->rows, *o = at(rows->bound, &con->bound, con->place[k]);
     int64_t P = con->balls, each = con->rows / P, count = 0;
     int pushed = any(rows->pushed[con->place[k]]);
     V middle[DIM], reach = SET(0.0);
@@ -60,7 +60,7 @@ static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V
     for (int64_t j = 0; j < each; j++) {
         V square = SET(0.0), limit = SET(SAFE) * (rows->widest[j] + reach);
         for (int a = 0; a < DIM; a++) {
-            V away = middle[a] - rows->bound[j * DIM + a];
+            V away = middle[a] - o[j * DIM + a];
             if (con->velocities.data) SUBTRACT(away, SET(k * con->dt), rows->velocities[j * DIM + a]);
             ADD(square, away, away);
         }

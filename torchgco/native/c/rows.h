@@ -19,7 +19,7 @@ static inline V square_at(const Constraint *con, const Rows *rows, int64_t j, in
 
 /* Row j of spheres at knot k, and the vector from the centre to the position (DIM); an absent sphere is c = -1. */
 static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
-    const V *o = rows->bound + j * DIM;
+    const V *o = at(rows->bound, &con->bound, con->place[k]) + j * DIM;
     V square = SET(0.0), limit = square_at(con, rows, j, k);
     I here = limit >= SET(0.0);
     for (int a = 0; a < DIM; a++) {

@@ -17,8 +17,8 @@ typedef struct {
     double *lam, *best; /* (E, knots, rows): multipliers, NULL where all are 0; and those of an outer loop's best */
     const int32_t *variable; /* BOUNDS: (rows) index into [x, u] */
     const double *sign; /* BOUNDS: (rows) +1 for an upper bound, -1 for a lower one */
-    /* BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES, FIELD: see
-       boxes.h, field.h. */
+    /* BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM), or (E, knots, rows * DIM) where they are `moved`;
+       FUNCTION: p (E, knots, ...); BOXES, FIELD: see boxes.h, field.h. */
     Array bound;
     Array squares; /* SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none */
     Array velocities; /* SPHERES: as centres, or NULL */
@@ -33,6 +33,7 @@ typedef struct {
     /* BODY: its balls, each with an equal share of rows and numbers, and the kind that all of them are; the function
        that places them is traced, with p as of a FUNCTION (E, knots, ...). */
     int32_t balls, kind_of_balls;
+    int32_t moved; /* SPHERES: whether centres are those of the constraint's knots */
     Array lift;
 } Constraint;
 
@@ -96,6 +97,19 @@ typedef struct {
     double *mean; /* (E, N, NU) in and out */
 } Sampling;
 
+/* What the interior point asks Python, where C can't call a problem's functions, of all knots of LANES lanes: the numbers
+   that called.c gives at a knot, of those lanes whose bit is set in `lanes`. R rows. */
+typedef struct {
+    int32_t asked; /* VALUES or DERIVATIVES at X, U; NEARBY: those states in Xn that follow from Un, with the gaps of X */
+    int64_t lanes;
+    const int64_t *element; /* (LANES): the problems in them */
+    double *X, *U, *Xn, *Un; /* (N+1, NX, LANES), (N, NU, LANES) */
+    const double *y, *z, *objective; /* (N+1, NX, LANES), (R, LANES), (LANES): y and z count so many times */
+    double *step, *stage, *last; /* (N, ...), (N, ...), (1, ...): where numbers go */
+    const void *rows; /* (constraints): pointers to those of each, (knots, ..., LANES) */
+} Request;
+typedef void Ask(const Request *request);
+
 /* The interior point; what its options mean stands in lagrangian/barrier.py. */
 typedef struct {
     const Problem *of;
@@ -104,13 +118,14 @@ typedef struct {
     double *falls; /* (E): 1 where the cost falls to second order from where the conditions hold: of `minimum` */
     const double *constant, *least_cost; /* (E): what of the cost does not count, and its least size */
     const double *free_start; /* (E, NX): 1 where a component of the start is a variable; NULL: nowhere */
+    Ask *ask; /* Python, where it computes the functions; else NULL */
     int64_t max_iter, acceptable_iter, watchdog_shortened_iter_trigger, watchdog_trial_iter_max, failures;
     int32_t warm, minimum, max_soc;
     double tol, constr_viol_tol, acceptable_tol, bound_push, counts, smoothing, seconds;
     double nlp_scaling_obj_target_gradient, constr_mult_init_max, held;
     double barrier_tol_factor, mu_linear_decrease_factor, mu_floor, mu_min, s_max, rounding;
     double tau_min, tau_max, kappa_sigma, theta_max_fact, theta_min_fact, gamma_theta, gamma_phi, eta_phi, delta;
-    double s_theta, s_phi, noise, alpha_min;
+    double s_theta, s_phi, noise, last_bit, alpha_min;
     double first_hessian_perturbation, min_hessian_perturbation, max_hessian_perturbation;
     double perturb_dec_fact, perturb_inc_fact, perturb_inc_fact_first;
     double pivot, crawl, shift_crawl, recovery_growth, recovery_decay;
@@ -124,6 +139,7 @@ typedef struct {
     const double *free_start, *active; /* as in Interior; (E, R): 1 where a row holds */
     const double *give; /* (E, R): by which rows that hold give way to their multipliers; NULL: 0 */
     const double *K; /* (E, N, NU, NX): gains; NULL: 0 */
+    Ask *ask; /* as in Interior */
     double *a, *b, *c; /* (C, E, N+1, S), (C, E, N, NX), (C, E, R): right hand sides in, z, y, v out */
     double *y, *left; /* (E, N+1, NX): costates; (C, E): largest of what active rows leave open */
     int64_t problems, count, rounds; /* E, C */

@@ -73,6 +73,8 @@ SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c"))
 SAMPLER = Library(("model.c",), (), ("mppi.c",))
 # The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
 INTERIOR = Library(PASS_SOURCES, ("riccati.c",), ("interior.c", "interior_kkt.c"))
+# The same where Python computes the functions.
+CALLED = Library(("called.c",), INTERIOR.curvature, INTERIOR.shared)
 SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
 
 
@@ -112,24 +114,53 @@ class Form:
             "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]), "QUADRATIC_FULL": int(self.dense),
         }  # fmt: skip
-        space = {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
-        read = {name: f"tgco_{name.lower()}" for name in SIZES} | space
         cost = "quadratic.c" if self.cost is None else "traced.c"
-        units = [Unit(self._text(vectors | sizes, self._model_code(), cost, *library.model), own=True)]
+        units = [Unit(_text(vectors | sizes, self._model_code(), cost, *library.model), own=True)]
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
-            units.append(Unit(self._text(vectors | sizes, generated, *library.curvature), own=True))
-        return (*units, Unit(self._text(vectors | read, [], *library.shared)))
-
-    def _text(self, sizes: dict[str, Any], generated: list[str], *files: str) -> str:
-        """The C file of a unit."""
-        given = {"constants.h": constants(), "code.h": "\n".join(generated)}
-        return joined(defines(sizes) + included(*files), given=given) + HEADER.layout
+            units.append(Unit(_text(vectors | sizes, generated, *library.curvature), own=True))
+        return (*units, _shared_unit(vectors, at, library))
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
         code = dict.fromkeys(rows.code for _, rows in self.functions)
         return [*generated, *code, _switches(self.functions, self.lifted)]
+
+
+@dataclass(frozen=True)
+class CalledForm:
+    """What the code of a problem depends on of which Python computes the functions: sizes."""
+
+    n: int
+    m: int
+    rows: int  # of a function at a knot, at most
+    position: slice | None  # that obstacles which C knows read
+    dense: bool | None  # of a quadratic cost, whether its weights are matrices; None: Python computes the cost
+
+    def units(self, lanes: int) -> tuple[Unit, ...]:
+        """The units of `CALLED`."""
+        n, S = self.n, self.n + self.m
+        sizes = {
+            "NX": n, "NU": self.m, "NP": n + n * S + S * S, "NJ": n * S, "MAX_ROWS": max(1, self.rows),
+            "QUADRATIC_FULL": int(bool(self.dense)),
+        }  # fmt: skip
+        vectors, dense = {"REAL": "double", "LANES": lanes}, [included("dense.h")]
+        cost = "called_cost.c" if self.dense is None else "quadratic.c"
+        units = [_text(vectors | sizes, dense, *files) for files in ((cost, *CALLED.model), CALLED.curvature)]
+        return (*(Unit(text, own=True) for text in units), _shared_unit(vectors, self.position, CALLED))
+
+
+def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
+    """The C file of a unit."""
+    given = {"constants.h": constants(), "code.h": "\n".join(generated)}
+    return joined(defines(sizes) + included(*files), given=given) + HEADER.layout
+
+
+def _shared_unit(vectors: dict[str, Any], at: slice | None, library: Library) -> Unit:
+    """The unit that reads sizes from the model."""
+    space = {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
+    read = {name: f"tgco_{name.lower()}" for name in SIZES} | space
+    return Unit(_text(vectors | read, [], *library.shared))
 
 
 def _products(model: DynamicsSource) -> str:

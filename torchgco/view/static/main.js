@@ -6,7 +6,7 @@ import { Orbit } from "./camera.js";
 import { DARK, LIGHT, aim, lights, spaceOf, surroundings } from "./scenery.js";
 import { PARTS } from "./missions.js";
 import { Flights } from "./flights.js";
-import { Search } from "./search.js";
+import { Search } from "./searches.js";
 import { linesOf, pick, showHover } from "./hover.js";
 import { build, by, showLayout, showParts, showSearch, showTime, showUnknown } from "./panel.js";
 

@@ -1,6 +1,6 @@
 // The controls beside and below the picture. All text is set as text: nothing that the data says becomes HTML.
 import { PARTS } from "./missions.js";
-import { LAYERS, classColour } from "./search.js";
+import { LAYERS, classColour } from "./searches.js";
 
 export const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 const VIEWS = { "3-D": "perspective", Above: "above", Side: "side", Behind: "behind" };

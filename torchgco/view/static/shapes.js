@@ -178,11 +178,15 @@ export function obstacles(parts, space, colours, still) {
   return {
     group,
     setCeiling: (z) => (uniforms.ceiling.value = z ?? NONE),
-    setTime: (t) => (uniforms.time.value = Math.min(t, until)),
+    setTime: (t) => {
+      uniforms.time.value = Math.min(t, until);
+      [...meshes, ...shells].forEach((mesh) => mesh.geometry.follow?.(uniforms.time.value));
+    },
     setGrown: (on) => {
       if (on && !shells.length) {
         const counted = parts.filter((part) => part.unknown !== "free");
         shells.push(...counted.map((part) => new THREE.Mesh(geometryOf(part, space, still, true), hull)));
+        shells.forEach((mesh) => mesh.geometry.follow?.(uniforms.time.value));
         add(...shells);
       }
       shells.forEach((shell) => (shell.visible = on));
@@ -226,7 +230,21 @@ function geometryOf(part, space, still, grown) {
   for (const [name, size] of Object.entries({ middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3, rise: 2 })) {
     geometry.setAttribute(name, new THREE.InstancedBufferAttribute(rows[name], size));
   }
+  if (part.track) geometry.follow = (t) => follow(geometry.attributes.middle, part, space.flat ? 2 : 3, t);
   return geometry;
+}
+
+/** Moves shapes along their track to where they are at time t. */
+export function follow(middle, part, dimension, t) {
+  const at = Math.min(Math.max(t / part.step, 0), part.knots - 1);
+  const before = Math.min(Math.floor(at), part.knots - 2);
+  for (let k = 0; k < part.count; k++) {
+    for (let i = 0; i < dimension; i++) {
+      const [from, to] = [before, before + 1].map((knot) => part.track.data[(knot * part.count + k) * part.track.width + i]);
+      middle.array[3 * k + i] = from + (at - before) * (to - from) + part.middle[i];
+    }
+  }
+  middle.needsUpdate = true;
 }
 
 /** Numbers per shape, in space also where they are given in the plane. */

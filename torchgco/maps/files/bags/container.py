@@ -53,8 +53,8 @@ def choose(source: Source, topics: dict[str, str], wanted: str | None) -> str:
     return wanted
 
 
-def unpack(source: Source, data: memoryview, compression: str, size: int, at: int) -> bytes | memoryview:
-    """`size` bytes that were packed by bz2, lz4, zstd or not at all; `at` is where they lie, for errors."""
+def unpack(source: Source, data: memoryview, compression: str, size: int, offset: int) -> bytes | memoryview:
+    """`size` bytes that were packed by bz2, lz4, zstd or not at all; `offset` is where they lie, for errors."""
     source.limit(size, MOST_MESSAGE, "bytes of a chunk")
     if compression in ("", "none"):
         unpacked: Any = data
@@ -62,12 +62,12 @@ def unpack(source: Source, data: memoryview, compression: str, size: int, at: in
         source.refuse("chunks packed by bz2, lz4, zstd or not at all", repr(compression[:40]))
     else:
         decompressor = _decompressor(source, compression)
-        with source.library(f"a chunk packed by {compression} at byte {at:,}"):
+        with source.library(f"a chunk packed by {compression} at byte {offset:,}"):
             # One byte more shows that there are more.
             unpacked = decompressor.decompress(bytes(data), max_length=size + 1)
     if len(unpacked) != size:
         got = f"{len(unpacked):,}" if len(unpacked) < size else "more"
-        source.refuse(f"{size:,} bytes in the chunk at byte {at:,}", got)
+        source.refuse(f"{size:,} bytes in the chunk at byte {offset:,}", got)
     return unpacked
 
 

@@ -59,8 +59,8 @@ def last_message(source: Source, topic: str | None) -> Message:
         name = choose(source, topics, topic)
         ids = {id for id, (other, _, _) in contents.channels.items() if other == name}
         indexed = [
-            (max(times[id] for id in ids & times.keys()), at)
-            for at, times in contents.chunks.items()
+            (max(times[id] for id in ids & times.keys()), offset)
+            for offset, times in contents.chunks.items()
             if ids & times.keys()
         ]
         if indexed:
@@ -68,10 +68,10 @@ def last_message(source: Source, topic: str | None) -> Message:
         if not (places := [(contents.last[id].time, id) for id in ids & contents.last.keys()]):
             source.refuse(f"{MCAP} with messages of {name}", "none")
         id = max(places)[1]
-        place = contents.last[id]
-        inside = cursor if place.chunk is None else _chunk(cursor, place.chunk)
-        inside.at = place.at
-        return Message(topics[name], bytes(inside.take(place.length, "a message")), contents.channels[id][2])
+        entry = contents.last[id]
+        inside = cursor if entry.chunk is None else _chunk(cursor, entry.chunk)
+        inside.at = entry.at
+        return Message(topics[name], bytes(inside.take(entry.length, "a message")), contents.channels[id][2])
 
 
 def _walk(cursor: Cursor, contents: Contents, chunk: int | None = None) -> None:
@@ -94,9 +94,9 @@ def _walk(cursor: Cursor, contents: Contents, chunk: int | None = None) -> None:
             _name(Cursor(cursor.source, cursor.take(length, "a schema"), MCAP, 0, first), kind, contents)
         elif kind == MCAP_MESSAGE and length >= 22:
             id, _, time, _ = (cursor.number(letter, "a message") for letter in "HIQQ")
-            place = Place(time, cursor.at, length - 22, chunk)
+            entry = Place(time, cursor.at, length - 22, chunk)
             if id not in contents.last or contents.last[id].time <= time:
-                contents.last[id] = place
+                contents.last[id] = entry
         elif kind == MCAP_CHUNK and chunk is None:
             latest = contents.chunks[first] = {}
         elif kind == MCAP_INDEX and chunk is None and length >= 22:
@@ -109,12 +109,12 @@ def _walk(cursor: Cursor, contents: Contents, chunk: int | None = None) -> None:
 def _walk_chunks(cursor: Cursor, contents: Contents) -> None:
     """Note what is in every chunk, of a file that has no summary or no indices."""
     total = 0
-    for at in list(contents.chunks):
-        inside = _chunk(cursor, at)
+    for offset in list(contents.chunks):
+        inside = _chunk(cursor, offset)
         total += inside.left
         cursor.source.limit(total, MOST_UNPACKED, "bytes in the chunks of a file without an index")
-        _walk(inside, contents, at)
-        contents.chunks[at] = {}
+        _walk(inside, contents, offset)
+        contents.chunks[offset] = {}
 
 
 def _chunk(cursor: Cursor, at: int) -> Cursor:

@@ -76,29 +76,29 @@ def _walk(cursor: Cursor) -> tuple[dict[int, tuple[str, str]], list[Chunk]]:
             cursor.source.limit(length, MOST_CONNECTION, "bytes of a connection")
             fields = _fields(cursor, bytes(cursor.take(length, "a connection")))
             topic, type = (
-                held.get(key, b"").decode("utf-8", "replace") for held, key in ((header, b"topic"), (fields, b"type"))
+                info.get(key, b"").decode("utf-8", "replace") for info, key in ((header, b"topic"), (fields, b"type"))
             )
             connections[_number(cursor, header, b"conn")] = (topic, type)
         cursor.at = after
     cursor.source.refuse(f"at most {MOST_RECORDS:,} records", "more")
 
 
-def _last(source: Source, chunk: bytes | memoryview, ids: set[int], at: int) -> memoryview:
+def _last(source: Source, chunk: bytes | memoryview, ids: set[int], offset: int) -> memoryview:
     """The last message of these connections in an unpacked chunk."""
-    inside = Cursor(source, chunk, f"a sound chunk at byte {at:,}")
-    found = None
+    inside = Cursor(source, chunk, f"a sound chunk at byte {offset:,}")
+    message = None
     for _ in range(MOST_INSIDE):
         if not inside.left:
             break
         header = _header(inside)
         data = inside.take(inside.number("I", "a record's length"), "a record")
         if header.get(b"op") == bytes([MESSAGE]) and _number(inside, header, b"conn") in ids:
-            found = data
+            message = data
     else:
-        source.refuse(f"at most {MOST_INSIDE:,} records in the chunk at byte {at:,}", "more")
-    if found is None:
-        source.refuse("the message that the index names", f"none in the chunk at byte {at:,}")
-    return found
+        source.refuse(f"at most {MOST_INSIDE:,} records in the chunk at byte {offset:,}", "more")
+    if message is None:
+        source.refuse("the message that the index names", f"none in the chunk at byte {offset:,}")
+    return message
 
 
 def _header(cursor: Cursor) -> dict[bytes, bytes]:
@@ -109,18 +109,18 @@ def _header(cursor: Cursor) -> dict[bytes, bytes]:
 
 def _fields(cursor: Cursor, data: bytes) -> dict[bytes, bytes]:
     """Values by name: each has a length, then `name=value`."""
-    found: dict[bytes, bytes] = {}
-    at = 0
-    while at < len(data):
-        length = int.from_bytes(data[at : at + 4], "little")
-        name, sign, value = data[at + 4 : at + 4 + length].partition(b"=")
-        if at + 4 + length > len(data) or not sign:
+    values: dict[bytes, bytes] = {}
+    offset = 0
+    while offset < len(data):
+        length = int.from_bytes(data[offset : offset + 4], "little")
+        name, sign, value = data[offset + 4 : offset + 4 + length].partition(b"=")
+        if offset + 4 + length > len(data) or not sign:
             cursor.source.refuse(
                 f"{cursor.expected} with fields name=value", f"{shown(name[:40])} before byte {cursor.at:,}"
             )
-        found[name] = value
-        at += 4 + length
-    return found
+        values[name] = value
+        offset += 4 + length
+    return values
 
 
 def _number(cursor: Cursor, header: dict[bytes, bytes], name: bytes) -> int:

@@ -32,14 +32,14 @@ def last_message(source: Source, topic: str | None) -> Message:
         rows = [tuple(row) for row in database.execute(query, (MOST_TOPICS,))]
         if not all([type(value) for value in row] == [int, str, str, str] for row in rows):
             source.refuse(DB3, "topics of other types")
-        found = choose(source, {name: kind for _, name, kind, _ in rows}, topic)
+        chosen = choose(source, {name: kind for _, name, kind, _ in rows}, topic)
         best = None
         for id, name, kind, encoding in rows:
             query = "SELECT timestamp, id FROM messages WHERE topic_id = ? ORDER BY timestamp DESC, id DESC LIMIT 1"
-            if name == found and (last := database.execute(query, (id,)).fetchone()) and (not best or last > best[0]):
+            if name == chosen and (last := database.execute(query, (id,)).fetchone()) and (not best or last > best[0]):
                 best = (last, kind, encoding)
         if best is None:
-            source.refuse(f"{DB3}, and messages of {found}", "none")
+            source.refuse(f"{DB3}, and messages of {chosen}", "none")
         (data,) = database.execute("SELECT data FROM messages WHERE id = ?", (best[0][1],)).fetchone()
     if not isinstance(data, bytes):
         source.refuse(f"{DB3}, and bytes of messages", type(data).__name__)

@@ -22,3 +22,4 @@ enum { RUNNING = 0, CONVERGED = 1, MAX_ITERATIONS = 2, LINE_SEARCH_FAILED = 3, N
 enum { ENDED = -1 };
 enum { Q = 0, R = 1, Q_LAST = 2, X_REF = 3, X_REF_LAST = 4, U_REF = 5, Q_LINEAR = 6, R_LINEAR = 7, Q_LINEAR_LAST = 8, CROSS = 9 };
 enum { FACTOR = 0, STAGE = 1, LAST = 2 };
+enum { VALUES = 0, DERIVATIVES = 1, NEARBY = 2 };

@@ -1,4 +1,4 @@
-"""The search of the roadmap in PyTorch: the counterpart of c/search.c for every device and precision.
+"""The search of the roadmap in PyTorch: the counterpart of c/cheapest.c for every device and precision.
 
 Both return the same paths, even where several cost the same. Ties are broken by the lowest index, and no comparison
 depends on rounding: sums have a fixed order (there is no matrix product), clearance and nearness are compared as

@@ -7,7 +7,7 @@
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#include "search.h"
+#include "cheapest.h"
 #if BOXES
 #include "boxes.h"
 #endif

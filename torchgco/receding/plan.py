@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import measured
 from torchgco.base.shapes import CPU, computing_on
-from torchgco.compiled.numbers import measured
+from torchgco.base.tree import Rows, copied, put, take
 from torchgco.constraints.bounds import Bounds
 from torchgco.dynamics.base import Dynamics
+from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.between import between
 
 KNOT_ROUNDING = 1e-9  # of a stage: a time this close before a knot is the knot's
+STAGE_ROUNDING = 1e-6  # of the stages between two steps: times are sums of periods
 
 
 class Instant(NamedTuple):
@@ -26,7 +29,7 @@ class Instant(NamedTuple):
     u: Tensor  # (B, m)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """Trajectories with feedback u = U + K (x - X), each from a time of its own on.
 
@@ -42,35 +45,49 @@ class Plan:
     X: Tensor
     U: Tensor
     K: Tensor
-    start: np.ndarray
+    start: Tensor
     dt: float
     dynamics: Dynamics
-    bounds: Bounds | None
+    bounds: Bounds | None = None
     knots: Tensor | None = None
+
+    trajectory: ClassVar[tuple[str, ...]] = ("X", "U", "K", "start", "knots")  # what `put` gives to other vehicles
 
     @property
     def t(self) -> Tensor:
         """Times of the knots, (B, N+1), s."""
-        from_start = self.dt * np.arange(self.X.shape[1]) if self.knots is None else self.knots.numpy()
-        return torch.from_numpy(self.start[:, None] + from_start)
+        if self.knots is not None:
+            return self.start.unsqueeze(-1) + self.knots
+        return self.start.unsqueeze(-1) + self.dt * torch.arange(self.X.shape[1], dtype=self.start.dtype)
 
     @property
     def end(self) -> Tensor:
         """Times of the last knots, (B,), s."""
         return self.t[:, -1]
 
-    def take(self, rows: Tensor) -> Plan:
-        """The plans of some vehicles (b,), without their bounds, which are of all."""
-        X, U, K = (part[rows] for part in (self.X, self.U, self.K))
-        knots = None if self.knots is None else self.knots[rows]
-        return replace(self, X=X, U=U, K=K, start=self.start[rows.numpy()], bounds=None, knots=knots)
+    def take(self, rows: Rows) -> Self:
+        """The plans of some vehicles (b,)."""
+        return take(self, rows)
 
-    def with_rows(self, rows: Tensor, *new: Tensor) -> Plan:
-        """The same, but for some vehicles (b,) with these states, controls and gains."""
-        parts = self.X.clone(), self.U.clone(), self.K.clone()
-        for part, own in zip(parts, new, strict=True):
-            part[rows] = own
-        return replace(self, X=parts[0], U=parts[1], K=parts[2])
+    def put(self, rows: Tensor, other: Self) -> None:
+        """Give some vehicles (b,) the trajectories of other plans (b, ...), in place."""
+        for name in self.trajectory:
+            put(getattr(self, name), rows, getattr(other, name))
+
+    def with_rows(self, rows: Tensor, other: Self) -> Self:
+        """The same, but for some vehicles (b,) with the trajectories of other plans (b, ...)."""
+        plan = replace(self, **{name: copied(getattr(self, name)) for name in self.trajectory})
+        plan.put(rows, other)
+        return plan
+
+    def moved_to(self, now: float) -> Self:
+        """The plans from a time on, s: every knot as many stages later as are over by then; see `shifted`."""
+        X, U, K = self.X.clone(), self.U.clone(), self.K.clone()
+        for start in self.start.unique().tolist():
+            rows, stages = self.start == start, stages_between((now - start) / self.dt)
+            for part in (X, U, K):
+                part[rows] = shifted(part[rows], stages)
+        return replace(self, X=X, U=U, K=K, start=torch.full_like(self.start, now))
 
     def at(self, t: float, x: Any = None) -> Instant:
         """States (B, n) and controls (B, m) at a time, s.
@@ -124,9 +141,9 @@ class Plan:
         """How many stages are over at a time, s, (B,) from 0 to N."""
         N = self.U.shape[1]
         if self.knots is None:
-            return np.asarray(np.clip((t - self.start) / self.dt, 0.0, N))
+            return np.asarray(np.clip((t - self.start.numpy()) / self.dt, 0.0, N))
         over = []
-        for since, knots in zip(t - self.start, self.knots.numpy(), strict=True):
+        for since, knots in zip(t - self.start.numpy(), self.knots.numpy(), strict=True):
             k = int(np.clip(np.searchsorted(knots, since, side="right") - 1, 0, N - 1))
             over.append(k + np.clip((since - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0))
         return np.array(over)
@@ -146,3 +163,9 @@ class Plan:
                 some = torch.from_numpy((k == stage) & (share == part) & (lengths == length))
                 states[some] = between(self.dynamics, self.X, self.U, *at)[some, 0]
         return states if self.knots is None else self.dynamics.settled(states)
+
+
+def stages_between(count: float) -> float:
+    """A number of stages, whole where it is but for rounding."""
+    whole = round(count)
+    return whole if abs(count - whole) <= STAGE_ROUNDING * max(1.0, count) else count

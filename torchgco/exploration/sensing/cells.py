@@ -16,7 +16,7 @@ COSTLY = 20.0  # by which share a step into an avoided cell costs more
 
 
 @dataclass
-class Search:
+class CellSearch:
     """Cheapest paths on a map, by A* over the 26 neighbours of each cell.
 
     Args:

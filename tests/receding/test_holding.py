@@ -26,8 +26,8 @@ from torchgco import (
     Status,
     Unicycle,
 )
-from torchgco.compiled.stopping import stopping
 from torchgco.native.compiler import find_compiler
+from torchgco.receding.stopping import stopping
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 N, DT, RADIUS = 30, 0.1, 0.5

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.compiled.plan import Plan
-from torchgco.compiled.stages import moved, stages_between
-from torchgco.compiled.stopping import clamped, limits, stopping
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import rates_of
 from torchgco.constraints.norms import within_norms
@@ -19,6 +15,8 @@ from torchgco.lagrangian.quality import has_arrived, ranks_arrival, violation
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
+from torchgco.receding.plan import Plan
+from torchgco.receding.stopping import clamped, limits, stopping
 
 
 class Held(NamedTuple):
@@ -40,9 +38,10 @@ def held(problem: Problem, plan: Plan | None, now: float) -> Held:
     """
     whole, before, found = current(for_solvers(problem)), None, None
     if plan is not None:
-        X, before, K = _moved_on(plan, now)
+        later = plan.moved_to(now)
+        before, K = later.U, later.K
         lifted = rates_of(problem.constraints) is not None  # feedback could break the bounds of rates
-        ways = [before] if lifted else [followed(whole, X, before, K)[1], before]
+        ways = [before] if lifted else [followed(whole, later.X, before, K)[1], before]
         found = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
     if found is None:
         return _best(problem, whole, stopping(problem, None))
@@ -123,13 +122,3 @@ def _sum_of_violations(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 def _but_goal(problem: Problem) -> list[Constraint]:
     return [part for part in problem.constraints if not part.bare.is_goal]
-
-
-def _moved_on(plan: Plan, now: float) -> tuple[Tensor, Tensor, Tensor]:
-    """States, controls and feedback of plans that begin now."""
-    parts = [part.clone() for part in (plan.X, plan.U, plan.K)]
-    for start in np.unique(plan.start).tolist():
-        rows = torch.from_numpy(plan.start == start)
-        for part in parts:
-            part[rows] = moved(part[rows], stages_between((now - start) / plan.dt))
-    return parts[0], parts[1], parts[2]

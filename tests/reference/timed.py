@@ -1,0 +1,92 @@
+"""The least cost of ways through space and time, state by state in plain Python: cells, moves and layers are tuples."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Place = tuple[int, ...]
+
+
+@dataclass
+class Ways:
+    """A lattice of `counts` cells and moves from `least` to `most`, with arrays over layers, cells and moves."""
+
+    counts: Place
+    least: Place
+    most: Place
+    parts: int
+    margin: float
+    clearance: Array  # (layers * parts + 1, *counts)
+    cell_cost: Array  # (layers + 1, *counts); infinite where barred
+    move_cost: dict[Place, float]
+    last_cost: dict[Place, float]
+    change: Place | tuple[float, ...]
+
+    @property
+    def layers(self) -> int:
+        return len(self.cell_cost) - 1
+
+    @property
+    def moves(self) -> list[Place]:
+        return list(itertools.product(*(range(a, b + 1) for a, b in zip(self.least, self.most, strict=True))))
+
+    def between(self, row: int, point: Array) -> float:
+        """The clearance at a point between cells, multilinear."""
+        low = np.minimum(np.floor(point).astype(int), np.array(self.counts) - 1)
+        share, total = point - low, 0.0
+        for corner in itertools.product((0, 1), repeat=len(self.counts)):
+            weight = np.prod([s if c else 1 - s for s, c in zip(share, corner, strict=True)])
+            if weight > 0:
+                total += weight * self.clearance[(row, *(low + corner))]
+        return total
+
+    def leads(self, layer: int, cell: Place, move: Place) -> Place | None:
+        """The cell to which a move leads clear of obstacles; None where it doesn't."""
+        to = tuple(c + m for c, m in zip(cell, move, strict=True))
+        if any(not 0 <= c < n for c, n in zip(to, self.counts, strict=True)):
+            return None
+        for s in range(1, self.parts + 1):
+            point = np.array(cell) + s / self.parts * np.array(move)
+            if self.between(layer * self.parts + s, point) < self.margin:
+                return None
+        return to if np.isfinite(self.cell_cost[(layer + 1, *to)]) else None
+
+    def changed(self, before: Place, after: Place) -> float:
+        more = [abs(a - b) for a, b in zip(after, before, strict=True)]
+        return np.inf if max(more) > 1 else float(sum(c * n for c, n in zip(self.change, more, strict=True)))
+
+    def through(self, start: Place, first: Place) -> Array:
+        """The least cost of a way through every cell at every layer, (layers + 1, *counts); infinite without one."""
+        there: list[dict[tuple[Place, Place], float]] = [{(start, first): 0.0}]
+        for layer in range(self.layers):
+            new: dict[tuple[Place, Place], float] = {}
+            for (cell, before), cost in there[-1].items():
+                for move in self.moves:
+                    more = self.changed(before, move) + self.move_cost[move]
+                    to = self.leads(layer, cell, move) if np.isfinite(more) else None
+                    if to is not None:
+                        total = cost + more + self.cell_cost[(layer + 1, *to)]
+                        new[to, move] = min(new.get((to, move), np.inf), total)
+            there.append(new)
+        onward: list[dict[tuple[Place, Place], float]] = [{state: self.last_cost[state[1]] for state in there[-1]}]
+        for layer in reversed(range(self.layers)):
+            new = {}
+            for cell, before in there[layer]:
+                for move in self.moves:
+                    more = self.changed(before, move) + self.move_cost[move]
+                    to = self.leads(layer, cell, move) if np.isfinite(more) else None
+                    if to is not None and (to, move) in onward[0]:
+                        total = more + self.cell_cost[(layer + 1, *to)] + onward[0][to, move]
+                        new[cell, before] = min(new.get((cell, before), np.inf), total)
+            onward.insert(0, new)
+        found = np.full(self.cell_cost.shape, np.inf)
+        for layer in range(self.layers + 1):
+            for (cell, move), cost in there[layer].items():
+                total = cost + onward[layer].get((cell, move), np.inf)
+                found[(layer, *cell)] = min(found[(layer, *cell)], total)
+        return found

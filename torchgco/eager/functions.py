@@ -1,0 +1,158 @@
+"""A batch of problems along trajectories: values, and derivatives of first and second order, of all knots at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.tree import is_users
+from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.costs.base import Cost, ShiftedCost
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.eager.curvature import Expansion, expansion_of
+from torchgco.obstacles.base import OwnKind
+from torchgco.problem.border import ONE_KNOT
+from torchgco.problem.joined import scattered
+from torchgco.problem.problem import Problem
+
+STATE_OFFSET = 1e-3  # of the states at which rows are looked at, as a share of 1 + |x|
+
+
+@dataclass(frozen=True)
+class Functions:
+    """The dynamics, the cost and some constraints of b problems with K knots; z = [x, u] are the S variables of a knot.
+
+    Derivatives by the controls of the last knot, which has none, are 0.
+
+    Attributes:
+        rows: the constraints, by their number, with how PyTorch differentiates them.
+        expansion: the same of the dynamics.
+    """
+
+    problem: Problem
+    rows: dict[int, Expansion]
+    expansion: Expansion
+
+    @classmethod
+    def of(cls, problem: Problem, called: Iterable[int]) -> Functions:
+        """The functions of a form of problems, with the constraints of these numbers.
+
+        Raises:
+            InputError: rows of a constraint that join knots.
+        """
+        one = problem.take(slice(0, 1))
+        n, (X, U) = problem.n, one.at_rest
+        for i in called:
+            if is_users(part := one.constraints[i]) and not is_function(part) and joins_knots(part, one):
+                raise InputError(f"constraints[{i}].value", ONE_KNOT, "rows that change with other knots")
+        rows = {i: expansion_of(*_by_knots(one.constraints[i], X, U)[:2]) for i in called}
+        step = lambda z: one.along.step(z[..., :n], z[..., n:])
+        return cls(problem, rows, expansion_of(step, torch.cat((X[:, :-1], U), dim=-1)))
+
+    def among(self, problem: Problem) -> Functions:
+        """Those of other problems of the same form."""
+        return self if problem is self.problem else replace(self, problem=problem)
+
+    def cost(self, X: Tensor, U: Tensor) -> Tensor:
+        """Costs of whole trajectories (b,)."""
+        return self.problem.cost.total(X, U)
+
+    def step(self, X: Tensor, U: Tensor) -> Tensor:
+        """The next states (b, N, n)."""
+        return self.problem.along.step(X[:, :-1], U)
+
+    def row(self, i: int, X: Tensor, U: Tensor) -> Tensor:
+        """Rows (b, K, p) of constraint i."""
+        return self.problem.constraints[i].value(X, U)
+
+    def expand_cost(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """Slopes (b, N+1, S) and Hessians (b, N+1, S, S) of the cost."""
+        n, s = self.problem.n, self.problem.n + 1 + self.problem.m
+        blocks = X.new_empty(*X.shape[:2], s, s)
+        _expand_exactly(self.problem.cost, X, U, blocks)
+        z = [i for i in range(s) if i != n]
+        return blocks[..., z, n], blocks[..., z, :][..., z]
+
+    def expand_step(self, X: Tensor, U: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Slopes (b, N, n, S) of the step, and Hessians (b, N, S, S) of y' step, for y (b, N, n)."""
+        model, n = self.problem.along, self.problem.n
+        z = torch.cat((X[:, :-1], U), dim=-1)
+        return self.expansion(lambda z: model.step(z[..., :n], z[..., n:]), z, y)
+
+    def expand_row(self, i: int, X: Tensor, U: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
+        """Slopes (b, K, p, S) of constraint i, and Hessians (b, K, S, S) of lam' c, for lam (b, K, p)."""
+        part, S = self.problem.constraints[i], X.shape[-1] + U.shape[-1]
+        function, w, columns = _by_knots(part, X, U)
+        parts = self.rows[i](function, w, lam)
+        J, H = (found if found.shape[1] == lam.shape[1] else found[:, part.knots] for found in parts)
+        slopes, curvature = J.new_zeros(*J.shape[:3], S), H.new_zeros(*J.shape[:2], S, S)
+        slopes[..., columns], curvature[..., columns, columns] = J, H
+        return slopes, curvature
+
+    def nearby(self, X: Tensor, U: Tensor, start: Tensor, controls: Tensor) -> Tensor:
+        """States (b, N+1, n) that follow from others than X, U, with the same gaps."""
+        ahead, found = self.step(X, U), [start]
+        for k in range(U.shape[1]):
+            step = self.problem.dynamics.at(k).step(found[-1], controls[:, k])
+            found.append(X[:, k + 1] + (step - ahead[:, k]))
+        return torch.stack(found, dim=1)
+
+
+def joined(X: Tensor, U: Tensor) -> Tensor:
+    """z = [x, u] of all knots (b, N+1, S), with zeros for the controls of the last one."""
+    return torch.cat((X, torch.nn.functional.pad(U, (0, 0, 0, 1))), dim=-1)
+
+
+def joins_knots(part: Constraint, problem: Problem) -> bool:
+    """Whether rows of a constraint of one problem change with another knot than their own.
+
+    Any two knots differ in a digit of their numbers: knots with that digit change, and rows of the others are looked
+    at.
+    """
+    z = joined(*problem.at_rest)
+    z = z + STATE_OFFSET * (1.0 + z.abs()) * (1.0 + 0.5 * scattered(z))
+    value, n = lambda z: part.value(z[..., :n], z[:, :-1, n:]), problem.n
+    place = torch.arange(problem.N + 1, device=z.device)
+    for digit in range(problem.N.bit_length()):
+        for moves in ((place >> digit & 1).bool(), ~(place >> digit & 1).bool()):
+            tangent = moves.to(z.dtype).view(1, -1, 1) * (1.0 + 0.5 * scattered(z))
+            change = torch.func.jvp(value, (z,), (tangent,))[1]
+            if bool((change[:, ~moves[part.knots]] != 0).any()):
+                return True
+    return False
+
+
+def is_function(part: Constraint) -> bool:
+    """Whether rows are a function of their own knot's x, u or both."""
+    return isinstance(part, FunctionConstraint) and type(part).value is FunctionConstraint.value
+
+
+def _by_knots(part: Constraint, X: Tensor, U: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor, slice]:
+    """Rows (b, K, p) as a function of w, columns of z at their knots or at all; w, and which columns these are."""
+    n, S = X.shape[-1], X.shape[-1] + U.shape[-1]
+    if is_function(part):
+        assert isinstance(part, FunctionConstraint)
+        k = torch.arange(X.shape[1], device=X.device)[part.knots]
+        read = [(X if of == "x" else U)[:, part.knots] for of in part.of]
+        sizes = [z.shape[-1] for z in read]
+        columns = slice(n if part.of == "u" else 0, n if part.of == "x" else S)
+        return lambda w: part.rows_at(k, *w.split(sizes, dim=-1)), torch.cat(read, dim=-1), columns
+    if isinstance(part, OwnKind) and not is_users(part):  # which reads nothing but the position
+        at = part.position
+        before, after = X[..., : at.start], X[..., at.stop :]
+        return lambda w: part.value(torch.cat((before, w, after), dim=-1), U), X[..., at], at
+    return lambda w: part.value(w[..., :n], w[:, :-1, n:]), joined(X, U), slice(0, S)
+
+
+def _expand_exactly(cost: Cost, X: Tensor, U: Tensor, H: Tensor) -> None:
+    """Write gradient and exact Hessian into homogeneous blocks; a cost's own `expand` may leave parts of it out."""
+    if isinstance(cost, ShiftedCost):
+        _expand_exactly(cost.cost, X, U, H)
+    elif isinstance(cost, BoundQuadratic) or type(cost).total is not Cost.total:
+        cost.expand(X, U, H)
+    else:
+        Cost.expand(cost, X, U, H)

@@ -1,0 +1,216 @@
+"""The cheapest ways among obstacles that move: a lattice in space and time, searched in C (c/timed.c).
+
+A state is a layer of time, a cell of space and the move that led there. A move differs from the one before by at most
+one unit along each axis, which bounds speed and acceleration. Two sweeps of dynamic programming give the least cost
+through every state; where that is least among the cells beside, a way of its own may begin. Two ways are of one class
+where at all equal times the segment between them is clear: so windows of time count apart, which winding numbers don't
+tell (compare de Groot et al., Topology-driven parallel trajectory optimization in dynamic environments, 2024).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchgco.base.tree import cast, is_users, moved
+from torchgco.kernels import EagerWarning, native
+from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
+from torchgco.native.declarations import Header, Structure, defines
+from torchgco.native.engine import run
+from torchgco.native.includes import included, joined
+from torchgco.roadmap.lattice import Array
+
+PARTS = 3  # of a move, at whose ends it is looked at
+LOOKS = 16  # layers, about, in which ways of their own are sought
+TRIES = 400  # ways that are looked at for them
+FAR = 1e30  # costs that stand for none
+C = Path(__file__).parent / "c"
+
+
+class Timed(Structure): ...
+
+
+TIMED_HEADER = Header((C / "timed.h").read_text())
+TIMED_HEADER.declare(Timed)
+
+
+@dataclass(frozen=True, eq=False)
+class TimedLattice:
+    """Cells of space at layers of time, of one problem.
+
+    Args:
+        origin: the first cell, (d,), m.
+        counts: cells along each axis, (d,).
+        spacing: of the cells, m.
+        tau: between layers, s.
+        layers: after the first.
+        least, most: the smallest and the largest move along each axis, (d,), in cells.
+    """
+
+    origin: Array
+    counts: NDArray[np.int64]
+    spacing: float
+    tau: float
+    layers: int
+    least: NDArray[np.int64]
+    most: NDArray[np.int64]
+
+    @property
+    def d(self) -> int:
+        return len(self.origin)
+
+    @property
+    def cells(self) -> int:
+        return int(self.counts.prod())
+
+    @property
+    def states(self) -> int:
+        """How many there are: 8 bytes each while it is searched."""
+        return (self.layers + 1) * self.cells * int((self.most - self.least + 1).prod())
+
+    @property
+    def points(self) -> Array:
+        """The cells (cells, d), m."""
+        return self.origin + self.spacing * np.indices(self.counts.tolist()).reshape(self.d, -1).T
+
+    @property
+    def velocities(self) -> Array:
+        """Of all moves, (moves, d), m/s."""
+        size = (self.most - self.least + 1).tolist()
+        return (self.least + np.indices(size).reshape(self.d, -1).T) * (self.spacing / self.tau)
+
+    def cell(self, point: Array) -> int:
+        """The cell nearest to a point (d,), m."""
+        at = np.clip(np.rint((point - self.origin) / self.spacing), 0, self.counts - 1).astype(np.int64)
+        return int(np.ravel_multi_index(tuple(at), self.counts.tolist()))
+
+    def move(self, velocity: Array) -> int:
+        """The move whose velocity is nearest to one (d,), m/s."""
+        at = np.clip(np.rint(velocity * (self.tau / self.spacing)), self.least, self.most) - self.least
+        return int(np.ravel_multi_index(tuple(at.astype(np.int64)), (self.most - self.least + 1).tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class TimedScene:
+    """What a lattice is searched for.
+
+    Args:
+        clearance: distances to the obstacles at `PARTS` times a layer, (layers PARTS + 1, cells), float32, m.
+        cell_cost: of being at a cell at a layer, (layers + 1, cells), float32; `FAR` where nobody may be. That of the
+            last layer is the cost of ending there.
+        move_cost, last_cost: of each move, and of the last one, (moves,), float32; `FAR` for what is too fast.
+        change: of one unit more or less along each axis, (3,), float32.
+        start: the cell at the first layer.
+        first: the move before it.
+        margin: the clearance that ways keep, m.
+    """
+
+    lattice: TimedLattice
+    clearance: Tensor
+    cell_cost: Tensor
+    move_cost: Tensor
+    last_cost: Tensor
+    change: Tensor
+    start: int
+    first: int
+    margin: float
+
+    def arguments(self, most: int, dearer: float) -> Timed:
+        """What C reads and writes of up to `most` ways."""
+        a = self.lattice
+        three = [np.ones(3, np.int64), np.zeros(3, np.int64), np.ones(3, np.int64)]
+        for whole, part in zip(three, (a.counts, a.least, a.most - a.least + 1), strict=True):
+            whole[: a.d] = part
+        counts, least, moves = map(torch.from_numpy, three)
+        return Timed(
+            counts=counts, least=least, moves=moves, layers=a.layers, parts=PARTS, start=self.start, first=self.first,
+            spacing=a.spacing, margin=self.margin, dearer=dearer, clearance=self.clearance, cell_cost=self.cell_cost,
+            move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most, tries=TRIES,
+            way=torch.empty(most, a.layers + 1, dtype=torch.int32), cost=torch.empty(most), found=0, states=0,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class TimedWays:
+    """Ways of one problem, each of a class of its own, the cheapest first.
+
+    Args:
+        points: at the layers, (W, layers + 1, d), m.
+        costs: (W,).
+        tau: between the layers, s.
+    """
+
+    points: Array
+    costs: Array
+    tau: float
+
+
+def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[TimedWays]:
+    """Up to `most` ways of each scene that cost at most a share `dearer` more than its cheapest.
+
+    There must be a library (`library_for`). As many threads as PyTorch uses search; what is found in one scene doesn't
+    depend on the others.
+
+    Raises:
+        MemoryError: C could not allocate 8 bytes for each state.
+    """
+    if not scenes:
+        return []
+    library = library_for(scenes[0].lattice.d)
+    assert library is not None
+    own = [scene.arguments(most, dearer) for scene in scenes]
+    every: Any = (Timed * len(own))(*own)
+    run(library.tgco_timed, len(own), 1, every)
+    found = []
+    for scene, one, end in zip(scenes, own, every, strict=True):
+        way, cost = one.kept[-2:]
+        cells = way[: end.found].numpy()
+        found.append(TimedWays(scene.lattice.points[cells], cost[: end.found].double().numpy(), scene.lattice.tau))
+    return found
+
+
+def clearances(parts: Sequence[Any], lattice: TimedLattice) -> Tensor:
+    """Distances (layers PARTS + 1, cells), float32, m, of a lattice's cells at its times from the obstacles of one
+    problem: infinite where there is none.
+
+    Args:
+        parts: of a batch of one; those of a body stand for the ball about the position that it holds.
+    """
+    count = lattice.layers * PARTS + 1
+    parts = moved(cast(list(parts), torch.float32), torch.device("cpu"))
+    points = torch.from_numpy(lattice.points).float().unsqueeze(0)
+    times = torch.arange(count, dtype=torch.float32) * (lattice.tau / PARTS)
+    found = torch.full((count, lattice.cells), torch.inf)
+    for part in parts:
+        if part.absent.numel() > 0:
+            for row, t in zip(found, times[: None if part.moving else 1].split(1), strict=False):
+                # A user's kind may need as many times as there are points.
+                away = part.signed_distance(points, t.expand(points.shape[1]) if is_users(part) else t)[0].amin(-1)
+                torch.minimum(row if part.moving else found, away, out=row if part.moving else found)
+    return found
+
+
+def library_for(d: int) -> ctypes.CDLL | None:
+    """The library for space of this dimension; None without a compiler, or where the process uses PyTorch's kernels."""
+    compiler = find_compiler()
+    return None if compiler is None or not native() else _library(d, compiler)
+
+
+@functools.cache
+def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
+    try:
+        text = defines({"DIM": d, "LOOKS": LOOKS, "FAR": f"{FAR:g}f"}) + included("timed.c")
+        return build(joined(text, C) + TIMED_HEADER.layout)
+    except NativeError as error:
+        warnings.warn(f"no ways are sought among what moves: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)
+        return None

@@ -1,0 +1,89 @@
+"""What was sound before isn't lost at the end of a search: trajectories that others have replaced, and the given guess.
+
+Passes choose by cost at the knots, and what is found last may touch an obstacle between two of them. Nor does a search
+have to find the way of its guess again, as all passes but the first begin elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.kernels import measured, open_loop
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import leaves_goal, outside_goal
+from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.problem.problem import Problem
+from torchgco.search.best import is_sound
+from torchgco.search.chords import ClearChords, clear_further
+from torchgco.search.converge import WORTH, Converge, solved_nearby
+from torchgco.search.search import Search
+from torchgco.search.solved_candidates import SOLVER
+
+
+def settle(search: Search, chords: ClearChords | None) -> None:
+    """Clear what touches at the end of all passes, then fall back on what was sound before, and go on from there.
+
+    Args:
+        chords: the row that clears; None: there is none.
+    """
+    if chords is not None and not search.call.late:
+        chords.run(search)
+    search.best.settle()
+    rows, guess = _better_guesses(search)
+    if rows.numel() == 0:
+        return
+    none = torch.zeros_like(rows)
+    ended = SolveEnd(guess, guess, torch.full_like(rows, int(Status.MAX_ITERATIONS)), none, none, none)
+    search.best.replace(rows, torch.ones_like(rows, dtype=torch.bool), guess, ended)
+    if not search.call.late and Converge.worth(search.call.problem):
+        _go_on(search, rows, guess)
+
+
+def _better_guesses(search: Search) -> tuple[Tensor, Iterate]:
+    """The problems (b,) whose guess is better than the best trajectory, and these guesses.
+
+    That is a sound guess: where the best trajectory isn't sound, doesn't arrive as the guess does, or costs more, by
+    more than the solver's tolerance, or by more than what a smaller violation is worth.
+    """
+    call, end, limit = search.call, search.best.end, search.solver.violation_tolerance
+    problem, best = call.problem, end.best
+    X, sound = open_loop(problem, call.U0), is_sound(problem, best, limit)
+    rows = ((~sound | ~_falls_short(problem, X, best.X)) & (end.status != Status.INVALID_START)).nonzero().flatten()
+    part, X, U = problem.take(rows), X[rows], call.U0[rows]
+    cost, violation, old = part.cost.total(X, U), measured(part, X, U), take(best, rows)
+    cheaper = cost < old.cost - _worth(search, violation, old.violation) * old.cost.abs()
+    better = ~sound[rows] | _falls_short(part, old.X, X) | cheaper
+    better &= (violation <= limit) & torch.isfinite(cost)
+    some = better.nonzero().flatten()
+    none = Multipliers(tuple(torch.zeros_like(lam[some]) for lam in old.multipliers.lam), old.multipliers.mu[some])
+    guess = Iterate(X[some], U[some], none, cost[some], violation[some])
+    some = is_sound(part.take(some), guess, limit).nonzero().flatten()
+    return rows[better.nonzero().flatten()[some]], take(guess, some)
+
+
+def _falls_short(problem: Problem, X: Tensor, other: Tensor) -> Tensor:
+    """Whether states (B, N+1, n) end farther from a stated goal than others, by its tolerance or its ball, (B,)."""
+    return leaves_goal(problem, X, other) | (outside_goal(problem, X) & ~outside_goal(problem, other))
+
+
+def _worth(search: Search, violation: Tensor, other: Tensor) -> Tensor:
+    """The share (B,) of the cost by which a trajectory has to be cheaper than another one, by their violations."""
+    loose = violation > other.clamp(min=search.interior.admitted(search.call.problem))
+    return torch.where(loose, WORTH, search.interior.tolerance)
+
+
+def _go_on(search: Search, rows: Tensor, guess: Iterate) -> None:
+    """The interior point from sound guesses; what is sound, too, and costs no more takes their places."""
+    call = replace(search.call.take(rows), callback=None, warm=None)
+    solver = replace(search.interior, initial_barrier=SOLVER.initial_barrier)
+    end = solved_nearby(solver, call, guess.X)
+    clear_further(search, call, end)
+    new, share = end.best, _worth(search, guess.violation, end.best.violation)
+    serves = is_sound(call.problem, new, search.solver.violation_tolerance) & torch.isfinite(new.cost)
+    serves &= ~_falls_short(call.problem, new.X, guess.X) & (new.cost <= guess.cost + share * guess.cost.abs())
+    search.best.replace(rows, serves, new, end)

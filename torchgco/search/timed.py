@@ -1,0 +1,242 @@
+"""Problems among obstacles that move, solved from ways through a lattice in space and time.
+
+A solve from the guess alone mostly waits before what passes: waiting is a minimum there. Each way waits, or hurries, in
+a manner of its own, and the interior point starts close to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import scipy
+import torch
+from torch import Tensor
+
+from torchgco.base.options import Count
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.kernels import measured, path_clearance
+from torchgco.lagrangian.quality import has_arrived, ranks_arrival
+from torchgco.lagrangian.state import SolveEnd
+from torchgco.problem.problem import Problem
+from torchgco.roadmap.lattice import Array
+from torchgco.roadmap.timed import TimedWays, library_for, timed_ways
+from torchgco.search.chords import EXTRA
+from torchgco.search.converge import solved_nearby
+from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
+from torchgco.search.search import Search
+from torchgco.search.solved_candidates import SOLVER
+from torchgco.search.table import Row
+from torchgco.search.timed_scenes import can_search, scene_in_time
+from torchgco.search.velocity import Velocity
+from torchgco.solvers.contracts import Call
+
+PROBLEMS_AT_ONCE = 16  # searched together: bounds the memory
+FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the lattice is made finer once
+GAP = 0.02  # share by which what has arrived may cost more than without obstacles, and is left as it is
+DEARER = 0.5  # share by which ways that are solved may cost more than the cheapest, on the lattice
+SMALL = 1e-4  # change of a control by which its effect is looked at
+ROUNDS = 4  # of solves, at most, each among larger obstacles: what is clear at knots may touch between them
+
+
+@dataclass(frozen=True)
+class Timed(Row):
+    """Searches a lattice in space and time where obstacles move, and solves by the interior point along its ways.
+
+    A lattice's cells are as wide as the vehicle's radius, and its layers as far apart as the acceleration of the model
+    lets moves differ by a cell. Its costs are the problem's own, as far as they can be read from its states. The
+    cheapest way of each class is solved, among larger obstacles where it touches one between the knots; the cheapest
+    result that is clear there, too, competes with the best so far.
+
+    Args:
+        ways: classes of ways that are solved, at most.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    ways: Count = 8
+
+    label: ClassVar[str] = "timed"
+    kinds: ClassVar[tuple[str, ...]] = ("moving",)
+
+    @property
+    def problems(self) -> str:
+        return f"among obstacles that move, not arrived or over {GAP:.0%} more expensive than without obstacles"
+
+    @property
+    def does(self) -> str:
+        return (
+            f"up to {self.ways} ways through space and time, each of a class of its own; interior point from each, "
+            "also among larger obstacles where the cheapest touch between knots"
+        )
+
+    def run(self, search: Search) -> None:
+        """Search and solve; see the class."""
+        problem = search.call.problem
+        if search.has_paths or not can_search(problem) or library_for(_dimension(problem)) is None:
+            return
+        open_ = torch.isfinite(problem.x0).all(-1) & (search.best.end.status != Status.INVALID_START)
+        for rows in open_.nonzero().flatten().split(PROBLEMS_AT_ONCE):
+            if search.call.late:
+                return
+            self._solve(search, rows)
+
+    def _solve(self, search: Search, rows: Tensor) -> None:
+        """The same for the problems in `rows`."""
+        X, bound = _free(search, rows)
+        best = search.best.of(rows).best
+        limit = search.solver.violation_tolerance
+        good = (best.violation <= limit) & (best.cost <= bound + GAP * bound.abs())
+        if ranks_arrival(search.call.problem):
+            good &= search.best.arrived()[rows]
+        left = (~good).nonzero().flatten()
+        if left.numel() == 0:
+            return
+        rows, X = rows[left], X[left]
+        search.best.worked[rows] = True
+        for finer in FINER:
+            found = self._ways(search.call.problem.take(rows), X, finer)
+            arrived = _solve_along(search, rows, found)
+            rows, X = rows[~arrived], X[~arrived]
+            if rows.numel() == 0 or search.call.late:
+                return
+
+    def _ways(self, problem: Problem, X: Tensor, finer: float) -> list[TimedWays]:
+        """The ways of every problem."""
+        each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
+        scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
+        return timed_ways(scenes, self.ways, DEARER)
+
+
+def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Trajectories (b, N+1, n) without obstacles and their costs (b,): minus infinity where there is none."""
+    call = replace(search.call.take(rows), callback=None, warm=None)
+    bare = without_obstacles(call.problem)
+    none = torch.full_like(call.problem.x0[:, 0], -torch.inf)
+    if bare is None:
+        return call.problem.at_rest[0], none
+    end = WITHOUT_OBSTACLES.solved(replace(call, problem=bare, U0=call.problem.at_rest[1]))
+    search.best.end.iterations[rows] += end.iterations
+    good = (end.best.violation <= search.solver.violation_tolerance) & torch.isfinite(end.best.cost)
+    X = torch.where(good.view(-1, 1, 1), end.best.X, call.problem.at_rest[0])
+    return X, torch.where(good, end.best.cost, none)
+
+
+def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor:
+    """Solve along the ways of the problems in `rows`; whether each has a trajectory that arrives now, (b,).
+
+    Where the cheapest of a problem touch an obstacle between two knots, they are solved again among larger ones.
+    """
+    each = torch.tensor([b for b, ways in enumerate(found) for _ in ways.points])
+    done = torch.zeros_like(rows, dtype=torch.bool)
+    if each.numel() == 0:
+        return done
+    each = each.to(rows.device)
+    X, U = _guesses(search.call.problem.take(rows), each, found)
+    call = replace(search.call.take(rows[each]), U0=U, warm=None, callback=None)
+    grown, made, left = (
+        torch.zeros_like(X[:, 0, 0]),
+        torch.zeros_like(each),
+        torch.arange(len(each), device=each.device),
+    )
+    least = torch.full_like(search.best.end.best.cost[rows], torch.inf)
+    for _ in range(ROUNDS):
+        part = call.take(left)
+        end = _solved(part, X[left], grown[left])
+        made[left] = end.iterations
+        good, clearance = _rated(search, part.problem, end)
+        clear = good & (clearance >= 0.0)
+        found_now = _keep(search, rows, each[left], torch.where(clear, end.best.cost, torch.inf), end)
+        done |= found_now
+        least = least.scatter_reduce(0, each[left], torch.where(clear, end.best.cost, torch.inf), "amin")
+        again = good & ~clear & (end.best.cost < least[each[left]])
+        grown[left] += torch.where(again, -EXTRA * clearance, 0.0).nan_to_num(0.0)
+        left = left[again]
+        if left.numel() == 0 or search.call.late:
+            break
+    return done
+
+
+def _solved(call: Call, X: Tensor, grown: Tensor) -> SolveEnd:
+    """Solves of a call from X (C, N+1, n) among obstacles that have grown (C,), m, rated among those as they are."""
+    if not bool(grown.any()):
+        return solved_nearby(SOLVER, call, X)
+    end = solved_nearby(SOLVER, replace(call, problem=call.problem.grown(grown)), X)
+    return replace(end, best=replace(end.best, violation=measured(call.problem, end.best.X, end.best.U)))
+
+
+def _rated(search: Search, problem: Problem, end: SolveEnd) -> tuple[Tensor, Tensor]:
+    """Whether solved candidates are feasible and arrive where that is wanted, (C,), and their clearances (C,), m."""
+    best = end.best
+    good = (best.violation <= search.solver.violation_tolerance) & torch.isfinite(best.cost)
+    if ranks_arrival(problem):
+        good &= has_arrived(problem, best.X)
+    clearance, some = torch.full_like(best.cost, -torch.inf), good.nonzero().flatten()
+    if some.numel() > 0:  # others may end anywhere
+        clearance[some] = path_clearance(problem.take(some), best.X[some], best.U[some])
+    return good, clearance
+
+
+def _keep(search: Search, rows: Tensor, each: Tensor, merit: Tensor, end: SolveEnd) -> Tensor:
+    """Keep the candidate of least merit (C,) of each problem in `rows` where it is finite; whether it is, (b,) bool.
+
+    Args:
+        each: the place (C,) among `rows` that each candidate belongs to.
+    """
+    made = torch.zeros_like(rows).index_add(0, each, end.iterations)
+    least = torch.full_like(search.best.end.best.cost[rows], torch.inf).scatter_reduce(0, each, merit, "amin")
+    done = torch.isfinite(least)
+    order = torch.where(merit == least[each], torch.arange(len(each), device=each.device), len(each))
+    first = torch.full_like(rows, len(each)).scatter_reduce(0, each, order, "amin")
+    kept = take(end, first[done])
+    kept.status[:] = int(Status.MAX_ITERATIONS)  # the last row brings it to its own tolerance
+    kept.iterations[:] = made[done]
+    search.best.end.iterations[rows[~done]] += made[~done]
+    if bool(done.any()):
+        search.best.keep(rows[done], kept)
+    return done
+
+
+def _guesses(problem: Problem, each: Tensor, found: list[TimedWays]) -> tuple[Tensor, Tensor]:
+    """States (C, N+1, n) and controls (C, N, m) along the ways of all problems in turn; `each` says whose way it is."""
+    states, t = [], float(problem.dynamics.dt) * np.arange(problem.N + 1.0)
+    for b, ways in enumerate(found):
+        if len(ways.points) == 0:
+            continue
+        velocity = Velocity.of(problem.take(torch.tensor([b], device=each.device)))
+        for points in ways.points:
+            p, v = _smooth(points, ways.tau, t, velocity.start)
+            states.append(velocity.states(v, problem.x0.new_tensor(p)))
+            states[-1][0] = problem.x0[b]
+    X, many = torch.stack(states), problem.take(each)
+    x, U, model = X[:, :-1], many.at_rest[1], many.along
+    then = model.step(x, U)
+    fu = torch.stack([model.step(x, U + SMALL * row) - then for row in torch.eye(many.m).to(U)], dim=-1) / SMALL
+    U = (U + (torch.linalg.pinv(fu) @ (X[:, 1:] - then).unsqueeze(-1)).squeeze(-1)).nan_to_num(0.0, 0.0, 0.0)
+    if many.control_bounds is not None:
+        lower, upper = many.control_bounds.over(problem.N)
+        U = torch.minimum(torch.maximum(U, lower), upper)
+    return X, U
+
+
+def _smooth(points: Array, tau: float, t: Array, first: Array) -> tuple[Array, Array]:
+    """Places and velocities (K, d) at times (K,) of the cubic spline through points (P, d) at times tau apart; at rest
+    after the last one.
+
+    Args:
+        first: the velocity (d,) at the beginning.
+    """
+    ends = (1, first), (2, np.zeros_like(first))
+    spline = scipy.interpolate.CubicSpline(tau * np.arange(len(points)), points, bc_type=ends)
+    last = tau * (len(points) - 1)
+    late = t > last + 1e-9
+    v = spline(np.minimum(t, last), 1)
+    v[late] = 0.0
+    return spline(np.minimum(t, last)), v
+
+
+def _dimension(problem: Problem) -> int:
+    return problem.position.stop - problem.position.start

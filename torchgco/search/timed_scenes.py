@@ -1,0 +1,203 @@
+"""Problems among obstacles that move as a lattice in space and time sees them: its size, and what being there costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.shapes import repeated
+from torchgco.constraints.gates import gates_of
+from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import Problem
+from torchgco.roadmap.lattice import Array
+from torchgco.roadmap.timed import FAR, TimedLattice, TimedScene, clearances
+from torchgco.search.reach import bounds_at_inner_knots, push_of
+from torchgco.search.velocity import Velocity
+
+STATES = 2**24  # of a lattice, at most: 128 MiB
+COARSER = 1.1  # times as wide cells, until there are so few
+PUSH_SHARE = 0.5  # share of the strongest acceleration by which the lattice changes its velocity at most
+ROOM = 0.1  # share of a cell's side that ways keep clear, as distances are interpolated between cells
+AROUND = 3.0  # sizes of the largest obstacle that the lattice extends beyond start, goal and the way without obstacles;
+# at most half of the distance, within which ways up to sqrt(2) times as long stay
+FASTER = 1.25  # times as fast as without obstacles, at most
+SIDEWAYS = 0.5  # share of that speed by which in space the velocity along an axis may leave its range there
+THIN = 0.25  # share of the smallest obstacle's size that a cell of a vehicle without a radius measures
+
+
+class Sizes(NamedTuple):
+    """What the lattice of a problem follows from."""
+
+    spacing: float  # m
+    push: float  # m/s^2
+    duration: float  # s
+    low: Array  # (d,), m
+    high: Array
+    slowest: Array  # (d,), m/s
+    fastest: Array
+
+
+def can_search(problem: Problem) -> bool:
+    """Whether there are obstacles that move, in two or three dimensions, and all of them have distances."""
+    at = problem.dynamics.position
+    if at is None or at.stop - at.start not in (2, 3) or not any(part.moving for part in problem.obstacles):
+        return False
+    return all(type(part.inscribed).signed_distance is not Obstacles.signed_distance for part in problem.obstacles)
+
+
+def _with_distances(problem: Problem) -> list[Any]:
+    """The obstacles and the maps of a batch of one; of a body those of the ball about the position that it holds."""
+    parts = (part.inscribed if isinstance(part, Obstacles) else part for part in problem.geometric)
+    return [part for part in parts if hasattr(part, "signed_distance")]
+
+
+def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedScene:
+    """The scene of a batch of one.
+
+    Args:
+        free: states (N+1, n) of the trajectory without obstacles.
+        finer: share of the usual spacing.
+    """
+    velocity, start = Velocity.of(problem), problem.x0[0, problem.position].double().cpu().numpy()
+    lattice = _lattice(_sizes(problem, free, finer), start, velocity)
+    stages = lattice.tau / float(problem.dynamics.dt)
+    move, last = velocity.cost_of(lattice.velocities, stages)
+    fast = ~velocity.admitted(lattice.velocities)
+    cell_cost, bend = _cell_costs(problem, lattice, stages)
+    change = np.zeros(3)
+    unit = lattice.spacing / lattice.tau
+    own = velocity.cost_of_change(unit / lattice.tau, stages)
+    # Without a control that accelerates at once: as much as being a cell away from where one wants to be.
+    change[: lattice.d] = np.where(np.isfinite(own), own, bend)
+    if not change.any() and not move.any():  # the way alone counts
+        move = (lattice.velocities**2).sum(1) * lattice.tau
+    return TimedScene(
+        lattice, clearances(_with_distances(problem), lattice), cell_cost,
+        _costs(np.where(fast, FAR, move)), _costs(last), _costs(change), lattice.cell(start),
+        lattice.move(velocity.start), ROOM * lattice.spacing,
+    )  # fmt: skip
+
+
+def _costs(values: Array) -> Tensor:
+    """Costs for C: those that aren't finite are `FAR`."""
+    return torch.from_numpy(np.nan_to_num(values, nan=FAR, posinf=FAR, neginf=FAR)).float().contiguous()
+
+
+def _sizes(problem: Problem, free: Tensor, finer: float) -> Sizes:
+    at, d = problem.position, problem.position.stop - problem.position.start
+    radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
+    present = [part.margins[~part.absent] for part in problem.obstacles]
+    margins = torch.cat([part for part in present if part.numel() > 0])
+    spacing = finer * (radius if radius > 0.0 else THIN * float(margins.min()))
+    p = free[:, at].double().cpu().numpy()
+    dt, stages = float(problem.dynamics.dt), int(problem.stages[0])
+    v = np.diff(p, axis=0)[:stages] / dt
+    push = float(push_of(problem)[0])
+    if not np.isfinite(push) or push <= 0.0:
+        push = float(np.abs(np.diff(v, axis=0)).max(initial=0.0)) / dt or 1.0
+    ends = [problem.x0[:, at].double().cpu().numpy(), p]
+    if problem.goal is not None:
+        ends.append(problem.goal.position.double().cpu().numpy())
+    gates = gates_of(problem)
+    if gates is not None:
+        ends.append(gates.centers[0].double().cpu().numpy())
+    points = np.concatenate(ends)
+    beyond = min(AROUND * (_largest(problem) + radius), 0.5 * float(np.linalg.norm(np.ptp(points, axis=0))))
+    low, high = (part[0, at].double().cpu().numpy() for part in bounds_at_inner_knots(problem))
+    speed = FASTER * np.linalg.norm(v, axis=1).max(initial=0.0)
+    slowest, fastest = np.full(d, -speed), np.full(d, speed)
+    if d == 3 and len(v) > 0:
+        slowest, fastest = v.min(0) - SIDEWAYS * speed, v.max(0) + SIDEWAYS * speed
+    low, high = np.maximum(low, points.min(0) - beyond), np.minimum(high, points.max(0) + beyond)
+    return Sizes(spacing, push, stages * dt, low, high, slowest, fastest)
+
+
+def _largest(problem: Problem) -> float:
+    """Half the length of the largest obstacle of a batch of one, m."""
+    found = 0.0
+    for part in problem.obstacles:
+        shapes = part.inscribed.shapes(0)
+        if shapes is None:
+            found = max(found, float(part.margins.amax()))
+        elif len(shapes.radius) > 0:
+            found = max(found, float((np.linalg.norm(shapes.half, axis=1) + shapes.radius).max()))
+    return found
+
+
+def _lattice(sizes: Sizes, start: Array, velocity: Velocity) -> TimedLattice:
+    """As fine as the sizes say, or as the memory allows; with the moves that the constraints admit."""
+    spacing = sizes.spacing
+    while True:
+        tau = np.sqrt(spacing / (PUSH_SHARE * sizes.push))
+        layers = max(2, round(sizes.duration / tau))
+        tau = sizes.duration / layers
+        before, behind = (
+            np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64)
+            for part in (start - sizes.low, sizes.high - start)
+        )
+        unit = spacing / tau
+        least, most = np.floor(sizes.slowest / unit + 0.5), np.ceil(sizes.fastest / unit - 0.5)
+        least, most = (part.astype(np.int64) for part in (np.minimum(least, -1), np.maximum(most, 1)))
+        lattice = TimedLattice(start - spacing * before, before + behind + 1, spacing, tau, layers, least, most)
+        v = lattice.velocities
+        some = np.rint(v[velocity.admitted(v)] / unit).astype(np.int64)
+        some = np.concatenate((some, np.zeros_like(some[:1])))
+        lattice = replace(lattice, least=some.min(0), most=some.max(0))
+        if lattice.states <= STATES:
+            return lattice
+        spacing *= COARSER
+
+
+def _cell_costs(problem: Problem, lattice: TimedLattice, stages: float) -> tuple[Tensor, Array]:
+    """What being at a cell at a layer costs, (layers + 1, cells), and what being a cell away from the best one does, by
+    axis (d,)."""
+    at, dt = problem.position, float(problem.dynamics.dt)
+    x = repeated(problem.x0, lattice.cells)
+    points = x.new_tensor(lattice.points)
+    x[..., at] = points
+    u = problem.at_rest[1][:, :1].expand(-1, lattice.cells, -1)
+    K = int(problem.stages[0])
+    found = torch.empty(lattice.layers + 1, lattice.cells, dtype=torch.float64)
+    for layer in range(lattice.layers):
+        k = min(K - 1, round(layer * lattice.tau / dt))
+        found[layer] = stages * problem.cost.stage(x, u, k)[0].double().cpu()
+        for part in problem.geometric:
+            if not hasattr(part, "signed_distance") and k > 0 and part.holds_at(k):
+                found[layer][(part.at(x, k)[0] > 0).any(-1).cpu()] = FAR
+    found[-1] = problem.cost.terminal(x)[0].double().cpu()
+    bend = _bend(found[0], lattice)
+    _bar(problem, lattice, points, found)
+    return found.nan_to_num(FAR, FAR, FAR).clamp(max=FAR).float(), bend
+
+
+def _bend(cost: Tensor, lattice: TimedLattice) -> Array:
+    """Half the mean second difference of a layer's costs along each axis, (d,)."""
+    grid, found = cost.numpy().reshape(lattice.counts), np.zeros(lattice.d)
+    for a in range(lattice.d):
+        if lattice.counts[a] > 2:
+            found[a] = max(0.0, 0.5 * float(np.diff(grid, 2, axis=a).mean()))
+    return found
+
+
+def _bar(problem: Problem, lattice: TimedLattice, points: Tensor, cost: Tensor) -> None:
+    """Bar all cells but those at a goal that counts, at the end, and at gates, at their times; in place."""
+    half = 0.5 * lattice.spacing * np.sqrt(lattice.d)  # the farthest that a place may be from a cell
+    if problem.goal is not None and ranks_arrival(problem):
+        near = goal_tolerance(problem)
+        assert near is not None
+        away = problem.goal.distance(points.unsqueeze(0))[0]
+        cost[-1, (away > max(float(near[0]), half)).cpu()] = FAR
+    gates = gates_of(problem)
+    if gates is not None and gates.places is not None:
+        dt = float(problem.dynamics.dt)
+        for center, size, place in zip(gates.centers[0], gates.sizes[0], gates.places[0], strict=True):
+            layer = min(lattice.layers, max(1, round(float(place) * dt / lattice.tau)))
+            away = (points - center).norm(dim=-1)
+            late = abs(float(place) * dt - layer * lattice.tau)
+            reach = max(float(size), half) + late * float(np.abs(lattice.velocities).max())
+            cost[layer, (away > reach).cpu()] = FAR
