@@ -173,7 +173,7 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
 def _check_cost_of_stages(cost: Cost, takes_k: bool, rows: Tensor, k: Tensor, X: Tensor, U: Tensor) -> None:
     """Check that the costs of all stages at once are those of each stage: of three, unless code takes their numbers."""
-    together = lambda i, k, *z: cost.take(i).stage(*z, k).unsqueeze(-1)
+    together = lambda i, k, x, u: cost.take(i).stage(x, u, k).unsqueeze(-1)
 
     def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         joint = together(i, k, *z).clone()
