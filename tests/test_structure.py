@@ -27,6 +27,7 @@ LAYERS = [
     ["view"],
     ["baselines"],
     ["presets"],
+    ["fleets"],
     ["api", "envs", "experiments"],
     ["compiled"],
 ]

@@ -59,6 +59,7 @@ from torchgco.dynamics import (
     RotorTracking,
     Unicycle,
 )
+from torchgco.fleets import Fleet, FleetSolution
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.judge import judge
@@ -90,6 +91,7 @@ __all__ = [  # noqa: RUF022
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
     "solve", "MPC", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets",
+    "Fleet", "FleetSolution",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result

@@ -7,18 +7,20 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, Never
+from typing import TYPE_CHECKING, Any, Never, overload
 
 import torch
 from torch import Tensor
 
 from torchgco.base import clock
 from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, StepWarning, shown
-from torchgco.base.options import check_value, option_places
+from torchgco.base.options import Positive, check_value, option_places
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints.bounds import bounds_of
 from torchgco.constraints.norms import within_norms
+from torchgco.fleets import Fleet, FleetSolution
+from torchgco.fleets.solve import solve_fleet
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
@@ -43,9 +45,11 @@ if TYPE_CHECKING:
 
     from torchgco.base.html import HtmlPage
 
+LEAST_SECONDS = 1e-3  # of a solve for whose fleet no time is left
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
 
 
+@overload
 def solve(
     problem: Problem,
     U0: Tensor | None = None,
@@ -59,8 +63,34 @@ def solve(
     verbose: bool | None = None,
     smoothing: float | None = None,
     **misplaced: Never,
-) -> Solution:
-    """Solve every problem of the batch.
+) -> Solution: ...
+@overload
+def solve(
+    problem: Fleet,
+    *,
+    solver: Solver | str | None = None,
+    seed: int = 0,
+    ids: Tensor | None = None,
+    max_seconds: float | None = None,
+    verbose: bool | None = None,
+) -> FleetSolution: ...
+
+
+def solve(
+    problem: Problem | Fleet,
+    U0: Tensor | None = None,
+    solver: Solver | str | None = None,
+    seed: int = 0,
+    ids: Tensor | None = None,
+    warm: Solution | None = None,
+    max_seconds: float | None = None,
+    X0: Tensor | None = None,
+    record: bool = False,
+    verbose: bool | None = None,
+    smoothing: float | None = None,
+    **misplaced: Never,
+) -> Solution | FleetSolution:
+    """Solve every problem of the batch; of a `Fleet` all vehicles, of which solver, seed, ids and max_seconds are.
 
     A ContactWarning names feasible trajectories that touch an obstacle between knots; a ScaleWarning those with a
     violation that is large beside its row; a StepWarning those with too long a `dt` for the model; a HorizonWarning
@@ -91,6 +121,9 @@ def solve(
             solve has no such argument, or a function that branches on values mixes knots or problems in what is found.
     """
     check_untransformed("solve")
+    if isinstance(problem, Fleet):
+        others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing} | misplaced
+        return _solve_fleet(problem, others, solver, seed, ids, max_seconds)
     asked = problem = current_problem(problem)
     warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
@@ -110,6 +143,28 @@ def solve(
     found = replace(found, account=found.account and found.account.asked(asked, name))
     _warn(problem, found, warm is None)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
+
+
+def _solve_fleet(
+    fleet: Fleet,
+    others: Mapping[str, Any],
+    solver: Solver | str | None,
+    seed: int,
+    ids: Tensor | None,
+    max_seconds: float | None,
+) -> FleetSolution:
+    if given := [name for name, value in others.items() if value is not None]:
+        raise InputError(f"solve.{given[0]}", "None of a fleet: it has solver, seed, ids and max_seconds", given[0])
+    check_value(max_seconds, Positive | None, "max_seconds")
+    if ids is not None:
+        check_shape(ids, (fleet.B,), "ids")
+    ends = None if max_seconds is None else clock.seconds() + max_seconds
+
+    def own(problem: Problem, **options: Any) -> Solution:
+        left = None if ends is None else max(LEAST_SECONDS, ends - clock.seconds())
+        return solve(problem, max_seconds=left, verbose=False, **options)
+
+    return solve_fleet(fleet, own, seed, ids, "gco" if solver is None else solver, ends)
 
 
 def compare(
@@ -297,8 +352,11 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None
         )
 
 
-def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
+def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | Sequence[int] | None = None) -> Figure:
     """The scene with the trajectories, then states and controls over time, with their bounds dashed.
+
+    Of a fleet a colour for each vehicle, with squares where they start and stars at their goals, then how far each is
+    from the nearest other one.
 
     In space obstacles are cut at the height, in the side view at the y, that the first trajectory has there; crosses
     mark contact, between the knots too. Bounds far from all values are left out. A notebook shows the figure;
@@ -307,14 +365,26 @@ def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = N
     Args:
         problem, solution: as solved.
         b: the place of a problem in the batch, or several; None: the first six. Those with the same obstacles and goal
-            share a scene.
+            share a scene. Of a fleet one place; None: the first.
 
     Raises:
         InputError: a place that isn't there, or a solution of other problems.
     """
+    if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
+        return _fleet_figure(problem, solution, b)
     from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
 
     return solution_figure(problem, solution.detach(), b)
+
+
+def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
+    from torchgco.plotting.fleets import fleet_figure  # matplotlib takes a second to load
+
+    if not isinstance(fleet, Fleet) or not isinstance(solution, FleetSolution) or len(solution) != fleet.V:
+        raise InputError("solution", "a fleet and its solution", type(solution).__name__)
+    arrays = [[part.detach().cpu().double().numpy() for part in (one.X, one.U)] for one in solution]
+    X, U = zip(*arrays, strict=True)
+    return fleet_figure(fleet.members, X, U, fleet.distances.cpu().double().numpy(), b)
 
 
 def show(problem: Problem, solution: Solution) -> HtmlPage:

@@ -25,7 +25,7 @@ class Separation(Distance):
 
     Args:
         positions: which states are the coordinates of each position, (P, d): P lists or ranges of d whole numbers.
-        min_distance: one number for all problems or (B,), m, above 0.
+        min_distance: one number for all problems or (B,), m, above 0; or (B|1, Q), one for each pair.
         pairs: which positions keep the distance, (Q, 2) whole numbers below P; None: all of them from each other.
         knots: default 1..N.
 
@@ -54,21 +54,28 @@ class Separation(Distance):
         if pairs.shape[1] != 2 or len(different) < len(pairs) or any(len(pair) < 2 for pair in different):
             raise InputError("separation.pairs", "pairs of two positions, none twice", pairs.tolist())
         distance = tensor(self.min_distance, "separation.min_distance", dims.like)
-        if distance.dim() > 1 or distance.numel() not in (1, dims.B):
-            expected = f"a number, or {dims.B} of them"
+        of_pairs = distance.dim() == 2 and tuple(distance.shape) in ((1, len(pairs)), (dims.B, len(pairs)))
+        if not of_pairs and (distance.dim() > 1 or distance.numel() not in (1, dims.B)):
+            expected = f"a number, {dims.B} of them, or ({dims.B} or 1, {len(pairs)}) of the pairs"
             raise InputError("separation.min_distance", expected, f"shape {tuple(distance.shape)}")
         if not bool((torch.isfinite(distance) & (distance > 0)).all()):
             raise InputError("separation.min_distance", "finite numbers above 0 m", distance.tolist())
         knots = resolve_knots(self.knots, dims.N, "separation.knots", distance.device)
         states, pairs = states.to(distance.device), pairs.to(distance.device)
-        return replace(self, positions=states, pairs=pairs, min_distance=distance.reshape(-1), knots=knots)
+        return replace(
+            self,
+            positions=states,
+            pairs=pairs,
+            min_distance=distance if of_pairs else distance.reshape(-1),
+            knots=knots,
+        )
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.min_distance.square().view(-1, 1, 1) - self.away(X[:, self.knots]).square().sum(-1)
+        return self.kept.square() - self.away(X[:, self.knots]).square().sum(-1)
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """By how much pairs are too close, m."""
-        return (self.min_distance.view(-1, 1, 1) - self.away(X[:, self.knots]).norm(dim=-1)).clamp(min=0.0)
+        return (self.kept - self.away(X[:, self.knots]).norm(dim=-1)).clamp(min=0.0)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         rows, (first, second) = torch.arange(len(self.pairs), device=X.device).unsqueeze(1), self.ends
@@ -81,11 +88,13 @@ class Separation(Distance):
         H[:, self.knots] += add
 
     def grown(self, by: Tensor) -> Self:
-        return replace(self, min_distance=self.min_distance + by)
+        return replace(
+            self, min_distance=self.min_distance + (by if self.min_distance.dim() == 1 else by.unsqueeze(-1))
+        )
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where bodies touch at the start, (B,)."""
-        return (self.away(x0).norm(dim=-1) >= CONTACT_FACTOR * self.min_distance.unsqueeze(-1)).all(-1)
+        return (self.away(x0).norm(dim=-1) >= CONTACT_FACTOR * self.kept[:, 0]).all(-1)
 
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """As of `Distance`, both on the straight lines between their knots at the same time."""
@@ -94,11 +103,16 @@ class Separation(Distance):
         length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(X.dtype).tiny)
         nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
         contact = 1.0 - (TOUCH if share is None else share)
-        return nearest.norm(dim=-1).flatten(1).amin(-1) - contact * self.min_distance
+        return (nearest.norm(dim=-1) - contact * self.kept).flatten(1).amin(-1)
 
     @property
     def contact_depths(self) -> Tensor:  # type: ignore[override]
-        return TOUCH * self.min_distance.unsqueeze(-1)
+        return TOUCH * self.kept[:, 0]
+
+    @property
+    def kept(self) -> Tensor:
+        """The distances (B|1, 1, Q|1), m, once bound."""
+        return self.min_distance.view(len(self.min_distance), 1, -1)
 
     def places(self, X: Tensor) -> Tensor:
         return self.away(X)
@@ -112,8 +126,7 @@ class Separation(Distance):
             share = (-(away[:, :-1] * along).sum(-1) / square).clamp(0.0, 1.0).unsqueeze(-1)
             at.append(away.norm(dim=-1))
             ways.append((away[:, :-1] + share * along).norm(dim=-1))
-        keep = self.min_distance.view(-1, 1, 1)
-        return torch.stack(at, dim=-1) - keep, torch.stack(ways, dim=-1) - keep
+        return torch.stack(at, dim=-1) - self.kept, torch.stack(ways, dim=-1) - self.kept
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:

@@ -47,15 +47,15 @@ def study_folder(_root_: Any) -> str:
 
 
 def _described(_root_: Any) -> str:
-    held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
-    solvers = {held["solver"]["name"]: settings_of(held)}
+    config = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
+    solvers = {config["solver"]["name"]: settings_of(config)}
     recompose = recomposer(_root_.hydra.overrides.task, _root_.hydra.runtime.config_sources)
-    for name in held["study"]["baselines"] or ():
+    for name in config["study"]["baselines"] or ():
         solvers.setdefault(name, settings_of(recompose(name)))
-    path = held["scenario"].get("path")
-    scenario = Path(path).stem if path else held["scenario"]["name"]
-    described = [VERSION, held["seed"], held["study"]["layouts"], decisive(held, solvers)]
-    return f"{scenario}-{held['model']['vehicle']['name']}-{held['solver']['name']}-{digest(described)[:8]}"
+    path = config["scenario"].get("path")
+    scenario = Path(path).stem if path else config["scenario"]["name"]
+    described = [VERSION, config["seed"], config["study"]["layouts"], decisive(config, solvers)]
+    return f"{scenario}-{config['model']['vehicle']['name']}-{config['solver']['name']}-{digest(described)[:8]}"
 
 
 register_resolver("torchgco.folder", study_folder)
@@ -105,10 +105,10 @@ def _stopped(error: Exception) -> str:
 def _remove_empty(folder: Path) -> None:
     """Remove the folder that Hydra made for a study that is refused, and empty ones around it in the current folder."""
     here = Path.cwd()
-    around = [place for place in folder.parents if here in place.parents]
-    for place in (folder, *around) if folder != here else ():
+    around = [candidate for candidate in folder.parents if here in candidate.parents]
+    for candidate in (folder, *around) if folder != here else ():
         try:
-            place.rmdir()
+            candidate.rmdir()
         except OSError:  # not empty, or of somebody else
             return
 

@@ -77,7 +77,7 @@ def raised() -> Iterator[Noted]:
     A signal that is ignored stays so, as in the background of a shell, and the handler of another program is kept.
     """
     noted = Noted()
-    with handled(noted, lambda held: held in OWN_HANDLERS or isinstance(held, Noted)):
+    with handled(noted, lambda handler: handler in OWN_HANDLERS or isinstance(handler, Noted)):
         yield noted
 
 

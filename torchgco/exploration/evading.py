@@ -71,10 +71,10 @@ def _costs(
 ) -> np.ndarray:
     """Costs (L, D, S) of nodes: at layer l, delayed by d layers, moved aside by sides (S, 3)."""
     count, S = len(layers), len(sides)
-    place = points[layers][:, None] + sides  # (L, S, 3)
-    rest = static(place.reshape(-1, 3)).reshape(count, S)
-    behind = np.maximum(np.arange(count)[:, None] - np.arange(DELAYS), 0)  # (L, D): which place
-    nodes = place[behind]  # (L, D, S, 3)
+    aside = points[layers][:, None] + sides  # (L, S, 3)
+    rest = static(aside.reshape(-1, 3)).reshape(count, S)
+    behind = np.maximum(np.arange(count)[:, None] - np.arange(DELAYS), 0)  # (L, D): which layer
+    nodes = aside[behind]  # (L, D, S, 3)
     times = np.repeat(dt * layers, DELAYS * S)
     gaps = moving.gaps(nodes.reshape(-1, 3), times).reshape(count, DELAYS, S)
     for t in np.linspace(0.0, hold, 4)[1:]:
@@ -105,11 +105,11 @@ def _cheapest(cost: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarr
         )
         came[layer] = ways.argmin(axis=0)
         total = ways.min(axis=0) + cost[layer].reshape(shape)
-    at = np.unravel_index(int(total.argmin()), shape)
+    node = np.unravel_index(int(total.argmin()), shape)
     delays, places = np.zeros(L, np.int64), np.zeros(L, np.int64)
     for layer in range(L - 1, -1, -1):
-        delays[layer], places[layer] = at[0], at[1] * shape[2] + at[2]
-        at = tuple(i - step for i, step in zip(at, moves[came[layer][at]], strict=True)) if layer else at
+        delays[layer], places[layer] = node[0], node[1] * shape[2] + node[2]
+        node = tuple(i - step for i, step in zip(node, moves[came[layer][node]], strict=True)) if layer else node
     return delays, places
 
 

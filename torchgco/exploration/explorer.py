@@ -213,8 +213,8 @@ def unflyable(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     Of a `PlanningForm`: bounds of the controls, rest at the end, and the first step; where it leads doesn't count.
     """
-    parts = [part.value(X, U) for i, part in enumerate(problem.constraints) if i not in PLACES]
-    return torch.stack([part.flatten(1).amax(-1) for part in parts]).amax(0).nan_to_num(nan=torch.inf)
+    values = [constraint.value(X, U) for i, constraint in enumerate(problem.constraints) if i not in PLACES]
+    return torch.stack([value.flatten(1).amax(-1) for value in values]).amax(0).nan_to_num(nan=torch.inf)
 
 
 def within_bounds(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:

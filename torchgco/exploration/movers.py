@@ -62,7 +62,7 @@ class Moving:
         """Some of the bodies."""
         names = ("centers", "motion", "radii", "half_sizes", "sides")
         parts = {name: getattr(self, name) for name in names}
-        parts = {name: part.take(rows) if name == "motion" else part[rows] for name, part in parts.items()}
+        parts = {name: value.take(rows) if name == "motion" else value[rows] for name, value in parts.items()}
         return replace(self, **parts)
 
     @property
@@ -80,8 +80,8 @@ class Moving:
 
     def gaps(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (K,), m, of points (K, 3) from the nearest surface at times t (K,), s; infinite without bodies."""
-        moments, at = np.unique(t, return_inverse=True)
-        centers, radii = (part[at] for part in self.at(moments))
+        moments, inverse = np.unique(t, return_inverse=True)
+        centers, radii = (array[inverse] for array in self.at(moments))
         square, deepest = np.zeros(radii.shape), np.full(radii.shape, -np.inf)
         away = [points[:, i, None] - centers[..., i] for i in range(3)]
         for i in range(3):
@@ -116,10 +116,10 @@ class Moving:
             first = apart.argmin(axis=0)
             gaps[-1], normals[-1] = apart.min(axis=0), away[first, np.arange(len(first))]
         offsets = (normals * points[:, None]).sum(-1) - gaps
-        found, order = np.zeros((len(points), most, 4)), np.argsort(gaps, axis=1)[:, :most]
+        planes, order = np.zeros((len(points), most, 4)), np.argsort(gaps, axis=1)[:, :most]
         rows = np.arange(len(points))[:, None]
-        found[:, : order.shape[1], :3], found[:, : order.shape[1], 3] = normals[rows, order], offsets[rows, order]
-        return found
+        planes[:, : order.shape[1], :3], planes[:, : order.shape[1], 3] = normals[rows, order], offsets[rows, order]
+        return planes
 
     def clear_of(self, point: np.ndarray, least: float) -> Self:
         """Estimated balls that are smaller where the vehicle at a point (3,) would be nearer than `least`, m, now.
@@ -262,10 +262,10 @@ class Tracks:
         loose = self._loose(seen, points)
         for track in sorted(self.tracks, key=lambda track: -track.scans):
             away = np.linalg.norm(points - track.expected(t), axis=1)
-            own = loose & (away <= track.radius + BESIDE)
-            if own.sum() >= LEAST_RETURNS:
-                self._follow(track, points[own], scan.origin, t)
-                loose &= ~own
+            near = loose & (away <= track.radius + BESIDE)
+            if near.sum() >= LEAST_RETURNS:
+                self._follow(track, points[near], scan.origin, t)
+                loose &= ~near
         for members in clusters(points[loose]):
             self._begin(points[loose][members], scan.origin, t)
         self.tracks = [track for track in self.tracks if t - track.last <= GIVEN_UP and not self._rests(track, seen, t)]
@@ -302,15 +302,15 @@ class Tracks:
     def _loose(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
         """Which points (R, 3) aren't in or beside occupied cells that never were free, (R,) bool."""
         cells = np.floor((points - seen.corner) / seen.resolution).astype(np.int64)
-        found = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
-        if self._was_free is None or not found.any():
+        loose = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
+        if self._was_free is None or not loose.any():
             return np.zeros(len(points), bool)
-        at = np.atleast_1d(np.ravel_multi_index(tuple(cells[found].T), seen.shape))
+        index = np.atleast_1d(np.ravel_multi_index(tuple(cells[loose].T), seen.shape))
         was, state = self._was_free, seen.state.ravel()
         steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-        around = at[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
-        found[found] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
-        return found
+        around = index[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
+        loose[loose] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
+        return loose
 
     def _begin(self, points: np.ndarray, origin: np.ndarray, t: float) -> None:
         """A cluster of returns (R, 3) that no track expects begins one, unless it is too large for a body."""
@@ -341,8 +341,8 @@ def clusters(points: np.ndarray) -> list[np.ndarray]:
     grid = np.zeros(cubes.max(axis=0) + 1, bool)
     grid[tuple(cubes.T)] = True
     names, count = label(grid, np.ones((3, 3, 3)))
-    own = names[tuple(cubes.T)]
-    return [rows for rows in (np.flatnonzero(own == n + 1) for n in range(count)) if len(rows) >= LEAST_RETURNS]
+    labels = names[tuple(cubes.T)]
+    return [rows for rows in (np.flatnonzero(labels == n + 1) for n in range(count)) if len(rows) >= LEAST_RETURNS]
 
 
 def seen_ball(points: np.ndarray, origin: np.ndarray, pitch: float) -> tuple[np.ndarray, float]:

@@ -176,12 +176,12 @@ class Exploration:
 
     def _reference(self, x: Tensor) -> Tensor:
         """States (B, N+1, 14) that the plans are to follow."""
-        N, found = self.explorer.stages, x.new_zeros(x.shape[0], self.explorer.stages + 1, 14)
-        found[..., 6], found[..., 13] = 1.0, airframe_of(self.whole.dynamics).gravity
+        N, reference = self.explorer.stages, x.new_zeros(x.shape[0], self.explorer.stages + 1, 14)
+        reference[..., 6], reference[..., 13] = 1.0, airframe_of(self.whole.dynamics).gravity
         for b, scout in enumerate(self.scouts):
             p, v = scout.motion(x[b, 3:6].numpy(), N)
-            found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
-        return found
+            reference[b, :, :3], reference[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
+        return reference
 
     def _evading(self, reference: Tensor) -> Tensor:
         """The states (B, N+1, 14) with ways around moving bodies."""
@@ -206,25 +206,25 @@ class Exploration:
             for b, scout in enumerate(self.scouts):
                 began, keep = clock.seconds(), scout.keep
                 knots = np.clip(seed[b].numpy(), *scout.seen.box(keep))
-                own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
+                close, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
                 if self.explorer.movers != "none":
                     times = self.dt * np.arange(1, N + 1)
-                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING, CLEAR_AFTER)], axis=1)
+                    close = np.concatenate([close, scout.moving.planes(knots, times, MOST_MOVING, CLEAR_AFTER)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 late = self.dt * (np.arange(1, N + 1) - EARLY).clip(0)
                 near = max(gap - MAP_ERROR, CONTACT_FACTOR * scout.radius) + 0.5 * ESCAPE_ACCELERATION * late**2
                 new = (
-                    (planes, own),
+                    (planes, close),
                     (room, far),
                     (inside, knots),
                     (allowed, near.clip(max=keep)),
                     (regions, self._region(scout, x[b].numpy())),
                 )
-                for parts, part in new:
-                    parts.append(part)
+                for parts, array in new:
+                    parts.append(array)
                 scout.seconds["field_seconds"] += clock.seconds() - began
         form = PlanningForm(self.explorer, self.planner, self.whole.take(torch.arange(self.whole.B).repeat(C)))
-        stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, inside, allowed, regions)]
+        stack = [torch.from_numpy(np.stack(arrays)) for arrays in (planes, room, inside, allowed, regions)]
         return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack)
 
     def _region(self, scout: Scout, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -240,8 +240,8 @@ class Exploration:
             least = CONTACT_FACTOR * scout.radius + SPARE
             blocked = np.flatnonzero(scout.seen.gaps(former[b].numpy(), least + MAP_ERROR, self.kinds) < least)
             if len(blocked):
-                at = max(0, int(blocked[0]) - WAITS)
-                former[b, at:] = former[b, at].clone()
+                knot = max(0, int(blocked[0]) - WAITS)
+                former[b, knot:] = former[b, knot].clone()
         return former
 
     def _chosen(self, problem: Problem, kept: MissionPlan, count: int) -> MissionPlan:
@@ -253,18 +253,18 @@ class Exploration:
         U = kept.U
         hover = problem.cost.rest_controls(torch.zeros_like(U.repeat(count, 1, 1)))[:B]
         U = torch.where(ends_at_rest(kept.X).view(-1, 1, 1), U, hover)  # one that doesn't end at rest is no start
-        found = self.local.solve(problem, U.repeat(count, 1, 1), seed=self.seed)
+        solution = self.local.solve(problem, U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
-        K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
-        excess = unflyable(problem, found.X, found.U)
-        best = [self._best(found.X[b::B], found.cost[b::B], excess[b::B], kept.X[b], b) for b in range(B)]
+        K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), solution.X, solution.U).K
+        excess = unflyable(problem, solution.X, solution.U)
+        best = [self._best(solution.X[b::B], solution.cost[b::B], excess[b::B], kept.X[b], b) for b in range(B)]
         for b, scout in enumerate(self.scouts):
             last = B * (count - 1) + b  # the plan that follows the reference
-            came_through = float(excess[last]) <= FLYABLE and self.spare(found.X[last].numpy(), b) >= 0
+            came_through = float(excess[last]) <= FLYABLE and self.spare(solution.X[last].numpy(), b) >= 0
             scout.slow_down(came_through)
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
         stay = torch.tensor([b for b, choice in enumerate(best) if choice is None], dtype=torch.int64)
-        plan = MissionPlan.of_solution(found.take(rows), problem.take(rows), 0.0)
+        plan = MissionPlan.of_solution(solution.take(rows), problem.take(rows), 0.0)
         plan = replace(plan, K=K[rows], start=kept.start, multipliers=kept.multipliers, penalty=kept.penalty)
         plan.put(stay, kept.take(stay))
         return plan
@@ -276,16 +276,16 @@ class Exploration:
         """
         order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]) & (excess[c] <= NEARLY))]
         spare = {c: self.spare(X[c].numpy(), b) for c in order}
-        own = self.spare(kept.numpy(), b, 3.0 * AT_REST)
-        asked = min(max(own, 0.0), DRIFT)
+        kept_spare = self.spare(kept.numpy(), b, 3.0 * AT_REST)
+        asked = min(max(kept_spare, 0.0), DRIFT)
         safe = next((c for c in order if excess[c] <= FLYABLE and spare[c] >= asked), None)
-        if safe is not None or own >= 0 or not order:
+        if safe is not None or kept_spare >= 0 or not order:
             return safe
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
         most = min(order, key=lambda c: (spare[c] < 0, float(excess[c]) if spare[c] >= 0 else -spare[c]))
-        if spare[most] >= 0 or spare[most] > own + BETTER:
+        if spare[most] >= 0 or spare[most] > kept_spare + BETTER:
             return most
-        if own == -np.inf:  # none stops as it should: better a plan that nearly does than one that doesn't
+        if kept_spare == -np.inf:  # none stops as it should: better a plan that nearly does than one that doesn't
             ends = X[:, -1, 3:6].norm(dim=-1)
             slowest = min(order, key=lambda c: float(ends[c]))
             return slowest if float(ends[slowest]) + SLOWER < float(kept[-1, 3:6].norm()) else None

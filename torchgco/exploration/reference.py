@@ -62,11 +62,11 @@ def lengths(corners: np.ndarray) -> np.ndarray:
 
 def along(corners: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points and unit directions (M, 3) of a polyline at the lengths s (M,), m."""
-    at = lengths(corners)
-    if at[-1] < 1e-9:
+    arc = lengths(corners)
+    if arc[-1] < 1e-9:
         return np.repeat(corners[:1], len(s), axis=0), np.zeros((len(s), 3))
-    points = np.column_stack([np.interp(s, at, corners[:, i]) for i in range(3)])
-    piece = np.clip(np.searchsorted(at, s, side="right") - 1, 0, len(corners) - 2)
+    points = np.column_stack([np.interp(s, arc, corners[:, i]) for i in range(3)])
+    piece = np.clip(np.searchsorted(arc, s, side="right") - 1, 0, len(corners) - 2)
     steps = np.diff(corners, axis=0)
     size = np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
     return points, (steps / size)[piece]
@@ -85,19 +85,19 @@ def motion(
     It starts with the vehicle's velocity (3,), and rests at the polyline's end, or shortly before the last of them.
     Turns miss the inner corners by `swing` (K-2,), m.
     """
-    at, last, slow = lengths(corners), count * dt - RESTS_BEFORE, _corner_speeds(corners, pace, swing)
-    steps = np.diff(corners, axis=0) / np.maximum(np.diff(at), 1e-9)[:, None]
+    arc, last, slow = lengths(corners), count * dt - RESTS_BEFORE, _corner_speeds(corners, pace, swing)
+    steps = np.diff(corners, axis=0) / np.maximum(np.diff(arc), 1e-9)[:, None]
     places, s = np.zeros(count + 1), 0.0
     v = max(0.0, float(steps[0] @ velocity)) if len(steps) else 0.0
     for k in range(count):
-        wanted = min(pace.speed, np.sqrt(2.0 * pace.deceleration * (at[-1] - s)), pace.deceleration * (last - k * dt))
-        ahead = at[1:-1] - s
+        wanted = min(pace.speed, np.sqrt(2.0 * pace.deceleration * (arc[-1] - s)), pace.deceleration * (last - k * dt))
+        ahead = arc[1:-1] - s
         if (ahead > 0).any():
             room = slow[ahead > 0] ** 2 + 2.0 * pace.deceleration * ahead[ahead > 0]
             wanted = min(wanted, float(np.sqrt(room.min())))
-        pull = _acceleration(steps[np.searchsorted(at[1:-1], s, side="right")], pace) if len(steps) else 0.0
+        pull = _acceleration(steps[np.searchsorted(arc[1:-1], s, side="right")], pace) if len(steps) else 0.0
         v = max(0.0, min(wanted, v + pull * dt), v - 2.0 * pace.deceleration * dt)
-        s = min(at[-1], s + v * dt)
+        s = min(arc[-1], s + v * dt)
         places[k + 1] = s
     return _smoothed(along(corners, places)[0], velocity, dt)
 
@@ -131,11 +131,11 @@ def swings(corners: np.ndarray, is_free) -> np.ndarray:
     """
     turn = _turns(corners)
     outward = -turn / np.maximum(np.linalg.norm(turn, axis=1, keepdims=True), 1e-9)
-    found, free = np.full(len(turn), TIGHT), np.ones(len(turn), bool)
+    reach, free = np.full(len(turn), TIGHT), np.ones(len(turn), bool)
     for far in SWERVE * np.array([0.25, 0.5, 0.75, 1.0]) if len(turn) else ():
         free &= is_free(corners[1:-1] + far * outward)
-        found[free] = far
-    return found
+        reach[free] = far
+    return reach
 
 
 def _turns(corners: np.ndarray) -> np.ndarray:
@@ -151,5 +151,5 @@ def _corner_speeds(corners: np.ndarray, pace: Pace, swing: np.ndarray | float) -
     """
     turn = _turns(corners)
     size = np.maximum(np.linalg.norm(turn, axis=1), 1e-6)
-    most = np.array([_acceleration(one, pace) for one in turn / size[:, None]])
+    most = np.array([_acceleration(direction, pace) for direction in turn / size[:, None]])
     return np.minimum(pace.speed, np.sqrt(8.0 * swing * most) / size)

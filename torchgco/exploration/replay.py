@@ -51,10 +51,10 @@ def replayed(
     (scout,), sought = exploration.scouts, []
     for step, state in enumerate(x):
         true = state.unsqueeze(0)
-        found = measured(true, noise[:, step])
-        exploration.sense(step, true, found)
-        exploration.seek(found)
-        path = np.concatenate([found[0, None, :3].numpy(), scout.path[1:]])
+        measurement = measured(true, noise[:, step])
+        exploration.sense(step, true, measurement)
+        exploration.seek(measurement)
+        path = np.concatenate([measurement[0, None, :3].numpy(), scout.path[1:]])
         near = np.linalg.norm(path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution
         sought.append(np.concatenate([path, scout.goal[None]]) if near else path)
         report()

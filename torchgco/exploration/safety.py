@@ -34,9 +34,9 @@ def safe_arrays(log: MissionLog, problem: Problem) -> dict[str, np.ndarray]:
         return {}
     safe = np.full(tuple(log.cost.shape), np.nan)
     for b, seen in enumerate(log.seen):
-        radius = max((float(part.vehicle_radius[b]) for part in problem.obstacles), default=0.0)
-        found = safe_periods(seen, CONTACT_FACTOR * radius, log.period)
-        safe[b, : len(found)] = found
+        radius = max((float(obstacles.vehicle_radius[b]) for obstacles in problem.obstacles), default=0.0)
+        periods = safe_periods(seen, CONTACT_FACTOR * radius, log.period)
+        safe[b, : len(periods)] = periods
     return {"safe": safe}
 
 
@@ -46,12 +46,12 @@ def safe_periods(log: SeenLog, radius: float, dt: float) -> np.ndarray:
     Args:
         dt: between two positions of a plan, s.
     """
-    state, found = np.zeros(log.shape, np.uint8), []
+    state, safe = np.zeros(log.shape, np.uint8), []
     for (cells, new), plan in zip(log.changes, log.safe, strict=True):
         state.reshape(-1)[cells] = new
         rests = np.linalg.norm(plan[-1] - plan[-2]) <= AT_REST * dt
-        found.append(bool(rests and least_gap(log, state, plan, radius) >= radius))
-    return np.array(found, bool)
+        safe.append(bool(rests and least_gap(log, state, plan, radius) >= radius))
+    return np.array(safe, bool)
 
 
 def least_gap(log: SeenLog, state: np.ndarray, plan: Sequence[np.ndarray] | np.ndarray, reach: float) -> float:
@@ -70,8 +70,8 @@ def least_gap(log: SeenLog, state: np.ndarray, plan: Sequence[np.ndarray] | np.n
     near = np.stack(np.meshgrid(*[np.arange(-wide, wide + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     cells = np.floor((points - log.corner) / log.resolution).astype(int)[:, None] + near
     outside = ((cells < 0) | (cells >= log.shape)).any(axis=-1)
-    at = np.clip(cells, 0, np.array(log.shape) - 1)
-    blocked = outside | (state[at[..., 0], at[..., 1], at[..., 2]] != FREE)
+    index = np.clip(cells, 0, np.array(log.shape) - 1)
+    blocked = outside | (state[index[..., 0], index[..., 1], index[..., 2]] != FREE)
     centers = log.corner + (cells + 0.5) * log.resolution
     away = np.maximum(np.abs(points[:, None] - centers) - 0.5 * log.resolution, 0.0)
     gap = np.where(blocked, np.linalg.norm(away, axis=-1), np.inf).min()
@@ -92,7 +92,7 @@ def former_plans(problem: Problem, former: MissionPlan | None, t: float) -> Miss
         X, K = x0.unsqueeze(1).repeat(1, problem.N + 1, 1), x0.new_zeros(*U.shape, 14)
         penalty = torch.ones_like(x0[:, 0])
     else:
-        X, U, K = (part.repeat(C, *[1] * (part.dim() - 1)) for part in (former.X, former.U, former.K))
+        X, U, K = (tensor.repeat(C, *[1] * (tensor.dim() - 1)) for tensor in (former.X, former.U, former.K))
         X[:, -1] = resting(X[:, -1], airframe_of(problem.dynamics))
         U[:, -1] = problem.cost.rest_controls(U[:, -1:])[:, 0]
         X, U = within_bounds(problem, X, U, K)

@@ -104,12 +104,12 @@ class Scout:
         while True:
             self.search.radius, self.search.stride = self.keep, CAUTION_LEVELS[self.level][1]
             self.search.limit = max(left, 1)
-            found = self.search.path(position, self.goal)
+            result = self.search.path(position, self.goal)
             left -= self.search.expanded
-            if found is None:
+            if result is None:
                 self.path = _rest_of(self.path, position)
                 return
-            new, arrives = found
+            new, arrives = result
             self.path = self._steady(position, new) if arrives and self.arrives else new
             self.arrives = arrives
             if arrives or self.level + 1 == len(CAUTION_LEVELS):
@@ -158,9 +158,9 @@ class Scout:
 
 def _halved(points: np.ndarray) -> np.ndarray:
     """The points (K, 3) of a path, and those midway between them."""
-    found = np.repeat(points, 2, axis=0)[:-1]
-    found[1::2] = 0.5 * (points[:-1] + points[1:])
-    return found
+    halved = np.repeat(points, 2, axis=0)[:-1]
+    halved[1::2] = 0.5 * (points[:-1] + points[1:])
+    return halved
 
 
 def _rest_of(path: np.ndarray, position: np.ndarray) -> np.ndarray:

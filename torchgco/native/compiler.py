@@ -166,10 +166,10 @@ def _circumstances(compiler: Compiler, flags: tuple[str, ...]) -> tuple[str, ...
 
 def _load(compiler: Compiler, units: tuple[Unit, ...], flags: tuple[str, ...]) -> ctypes.CDLL:
     key = _key(compiler, units, flags)
-    held = store.read(key, ".so")
-    if held is not None:
+    content = store.read(key, ".so")
+    if content is not None:
         with suppress(OSError):  # a full disk, or one mounted without execution rights
-            return _own(held)
+            return _own(content)
         with suppress(OSError):
             return ctypes.CDLL(str(store.find(key, ".so")))
     try:
@@ -230,12 +230,12 @@ def _runs(key: str) -> bool:
 
 def _known(key: str, unit: Unit) -> bytes | None:
     """The object under a key, of this process or from the cache."""
-    found = _objects.get(key)
-    if found is None and not unit.own:
-        found = store.read(key, store.OBJECT)
-        if found is not None:
-            _remember(key, found)
-    return found
+    content = _objects.get(key)
+    if content is None and not unit.own:
+        content = store.read(key, store.OBJECT)
+        if content is not None:
+            _remember(key, content)
+    return content
 
 
 def _remember(key: str, content: bytes) -> None:
@@ -325,8 +325,8 @@ def _ending(started: Sequence[subprocess.Popen[str]]) -> Iterator[None]:
         with _ending_by_sigterm(started):
             yield
     except BaseException:
-        for one in _kill_all(started):
-            one.wait()
+        for process in _kill_all(started):
+            process.wait()
         _begun.clear()
         raise
 
@@ -336,7 +336,7 @@ def _held() -> Iterator[None]:
     """Ctrl-C and SIGTERM wait for the end of this block."""
     came: list[int] = []
     try:
-        with handled(lambda number, frame: came.append(number), lambda own: own not in (signal.SIG_IGN, None)):
+        with handled(lambda number, frame: came.append(number), lambda handler: handler not in (signal.SIG_IGN, None)):
             yield
     finally:
         for number in came:
@@ -346,10 +346,10 @@ def _held() -> Iterator[None]:
 def _kill_all(started: Sequence[subprocess.Popen[str]]) -> list[subprocess.Popen[str]]:
     """Kill what is started and the compilers that have begun, without waiting for their ends; returns them."""
     every = [*started, *(begun.process for begun in list(_begun.values()) if begun.owner == os.getpid())]
-    for one in every:
-        if one.returncode is None:
+    for process in every:
+        if process.returncode is None:
             with suppress(ProcessLookupError):
-                os.killpg(one.pid, signal.SIGKILL)
+                os.killpg(process.pid, signal.SIGKILL)
     return every
 
 
@@ -363,7 +363,7 @@ def _ending_by_sigterm(started: Sequence[subprocess.Popen[str]]) -> Iterator[Non
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
-    with handled(end, lambda own: own == signal.SIG_DFL, [signal.SIGTERM]):
+    with handled(end, lambda handler: handler == signal.SIG_DFL, [signal.SIGTERM]):
         yield
 
 
@@ -375,17 +375,17 @@ def _ended(returncode: int) -> str:
 @setting_up()
 def _find_compiler(named: str | None, usual: str | None, path: str | None, further: str | None) -> Compiler | None:
     for words in _candidates(named, usual):
-        place = shutil.which(words[0], path=path)
-        if place is None:
+        program = shutil.which(words[0], path=path)
+        if program is None:
             continue
         try:
-            asked, quiet = [place, *words[1:], "--version"], subprocess.DEVNULL
+            asked, quiet = [program, *words[1:], "--version"], subprocess.DEVNULL
             version = subprocess.run(asked, stdin=quiet, capture_output=True, text=True, errors="replace")
         except OSError:
             continue
         if version.returncode == 0:
-            identity = f"{os.path.realpath(place)}\n{version.stdout}{version.stderr}"
-            return Compiler((place, *words[1:]), identity, tuple(shlex.split(further or "")))
+            identity = f"{os.path.realpath(program)}\n{version.stdout}{version.stderr}"
+            return Compiler((program, *words[1:]), identity, tuple(shlex.split(further or "")))
     return None
 
 
@@ -422,8 +422,8 @@ def lanes(cpuinfo: str | None = None) -> int:
     Args:
         cpuinfo: the description of a processor; None: of this one.
     """
-    if given := os.environ.get("TORCHGCO_LANES"):
-        return 8 if given == "8" else 4
+    if wanted := os.environ.get("TORCHGCO_LANES"):
+        return 8 if wanted == "8" else 4
     if cpuinfo is None:
         try:
             with open("/proc/cpuinfo", errors="replace") as file:

@@ -124,8 +124,8 @@ class Header:
     def _type(self, field: Field) -> Any:
         if field.pointer:
             return ctypes.c_void_p
-        one = NUMBERS.get(field.kind) or self.made[field.kind]
-        return one * self._sizes[field.count] if field.count else one
+        ctype = NUMBERS.get(field.kind) or self.made[field.kind]
+        return ctype * self._sizes[field.count] if field.count else ctype
 
     @property
     def layout(self) -> str:
@@ -137,11 +137,11 @@ class Header:
 
 
 def _fields(body: str) -> dict[str, Field]:
-    found = dict[str, Field]()
+    fields = dict[str, Field]()
     for kind, names in _DECLARATION.findall(body):
         for pointer, name, count in _NAMED.findall(names):
-            found[name] = Field(kind, pointer == "*", count)
-    return found
+            fields[name] = Field(kind, pointer == "*", count)
+    return fields
 
 
 def enumerations(kinds: Iterable[type[IntEnum]]) -> str:

@@ -72,14 +72,14 @@ class Engine:
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
         self.measures = all(kind_of(part) is not Kind.FUNCTION or _measured(part) for part in parts)
-        at, functions = problem.dynamics.position, tuple(self.functions.items())
+        position, functions = problem.dynamics.position, tuple(self.functions.items())
         self.captured = Captured(self.model, self.cost, self.functions)
         first = self.captured.read()
         if first is None:  # changed since the functions were traced, by another thread
             raise InputError("problem", "functions whose tensors don't change while it is solved", "others")
         self.shared = first
         lifted = frozenset(i for i in self.functions if is_lifted(parts[i]))
-        self.form = Form(self.model, at, self.cost, dense, functions, lifted)
+        self.form = Form(self.model, position, self.cost, dense, functions, lifted)
         self._libraries: dict[Hashable, ctypes.CDLL] = {}
         if compiles:
             self.serve(problem.B, ahead)
@@ -117,11 +117,11 @@ class Engine:
 
     def _numbers(self, problem: Problem) -> list[Tensor]:
         """What the functions read of problems."""
-        found = [self.model.numbers(problem.B, problem.dynamics, self.shared.model)]
+        numbers = [self.model.numbers(problem.B, problem.dynamics, self.shared.model)]
         if self.cost is not None:
-            found += (part for array in cost_arrays(problem, self.cost, self.shared.cost) for part in array.kept)
+            numbers += (tensor for array in cost_arrays(problem, self.cost, self.shared.cost) for tensor in array.kept)
         functions = self.functions.items()
-        return found + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
+        return numbers + [rows_numbers(problem, i, rows, self.shared.rows[i]) for i, rows in functions]
 
     def replicas_of(self, B: int) -> int:
         """How many lanes share the line search of each of B problems."""
@@ -163,23 +163,23 @@ class Engine:
     def _summed(self, lagrangian: Lagrangian, best: Multipliers | None = None) -> c.Problem:
         """The problem with multipliers, penalties and guide."""
         multipliers = lagrangian.multipliers
-        own: dict[str, Any] = {"mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
+        fields: dict[str, Any] = {"mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
         if best is not None or not multipliers.blank:
-            own["constraint"] = rows = [constraint.copy() for constraint in self._rows(lagrangian.problem)[1]]
+            fields["constraint"] = rows = [constraint.copy() for constraint in self._rows(lagrangian.problem)[1]]
             for row, lam in zip(rows, () if multipliers.blank else multipliers.lam, strict=not multipliers.blank):
                 row.lam = lam.contiguous()
             for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
                 row.best = lam
-        return self.packed(lagrangian.problem, **own, **guide_of(lagrangian.penalty))
+        return self.packed(lagrangian.problem, **fields, **guide_of(lagrangian.penalty))
 
     def _fixed(self, problem: Problem) -> c.Problem:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
         return problem.derive("packed", lambda: self._fixed_made(problem))
 
     def _fixed_made(self, problem: Problem) -> c.Problem:
-        rows, one = self._rows(problem), problem.one
-        if one is not None and rows is self._rows(one):
-            return self._fixed(one)
+        rows, single = self._rows(problem), problem.one
+        if single is not None and rows is self._rows(single):
+            return self._fixed(single)
         packed = rows[0].copy()
         make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
         if problem.B > 0:
@@ -226,10 +226,10 @@ class Engine:
 
     def _row(self, problem: Problem, i: int) -> c.Constraint:
         """Constraint i without multipliers."""
-        part = problem.constraints[i]
-        place = part, problem.row_shapes[i], problem.N, kind_of(part)
+        constraint = problem.constraints[i]
+        described = constraint, problem.row_shapes[i], problem.N, kind_of(constraint)
         return _of_last(
-            problem, i, part, i in self.functions, lambda: constraint_of(*place, self.row_numbers(problem, i))
+            problem, i, constraint, i in self.functions, lambda: constraint_of(*described, self.row_numbers(problem, i))
         )
 
     def row_numbers(self, problem: Problem, i: int) -> dict[str, Any]:
@@ -238,8 +238,8 @@ class Engine:
         if source is None:
             return numbers_of(constraint, None, problem)
         shared = self.shared.rows[i]
-        own = numbers_of(constraint, rows_numbers(problem, i, source, shared), problem)
-        return {**own, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
+        fields = numbers_of(constraint, rows_numbers(problem, i, source, shared), problem)
+        return {**fields, "shared": shared, "radii": array(constraint.row_radii, knots=True)}
 
 
 def _of_last(problem: Problem, name: str | int, part: Any, of_each: bool, make: Callable[[], Any]) -> Any:
@@ -296,10 +296,10 @@ def _helpers(count: int) -> ThreadPoolExecutor:
 os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child has none of its parent's threads
 
 
-def _measured(part: Constraint) -> bool:
+def _measured(constraint: Constraint) -> bool:
     """Whether violations are what the base class says of rows, or C finds them from these."""
-    if part.row_radii is not None:
-        return type(part.bare).violation in (NormBounds.violation, SpheresInFreeTime.violation)
-    while isinstance(part, WrappedConstraint) and part.keeps_rows:
-        part = part.constraint
-    return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
+    if constraint.row_radii is not None:
+        return type(constraint.bare).violation in (NormBounds.violation, SpheresInFreeTime.violation)
+    while isinstance(constraint, WrappedConstraint) and constraint.keeps_rows:
+        constraint = constraint.constraint
+    return (type(constraint).violation, type(constraint).worst) == (Constraint.violation, Constraint.worst)

@@ -22,7 +22,7 @@ class Signature:
 
     def covers(self, traces: Sequence[Traced]) -> bool:
         """Whether traces hold as long as the key: code has branched on no tensor's values, and none is unknown."""
-        return all(not one.looked and all(map(self.facts.know, one.outside)) for one in traces)
+        return all(not trace.looked and all(map(self.facts.know, trace.outside)) for trace in traces)
 
 
 def signature(problem: Problem) -> Signature | None:
@@ -30,9 +30,9 @@ def signature(problem: Problem) -> Signature | None:
     cost: Any = problem.cost
     form = problem.N, problem.n, problem.m, str(problem.x0.dtype), str(problem.x0.device)
     quadratic = cost.diagonal if cost.kernel == "quadratic" else None
-    kinds = tuple(None if part.kernel in ("function", "body") else part.kernel for part in problem.constraints)
+    kinds = tuple(None if c.kernel in ("function", "body") else c.kernel for c in problem.constraints)
     parts: list[Any] = [problem.dynamics, *([] if quadratic is not None else [cost])]
-    parts += [part for part, kind in zip(problem.constraints, kinds, strict=True) if kind is None]
+    parts += [c for c, kind in zip(problem.constraints, kinds, strict=True) if kind is None]
     try:
         facts = Facts(*parts)
     except Unseen:

@@ -82,14 +82,14 @@ class Kept(KeptProblem):
 
     def begin_with(self, other: Kept) -> None:
         """Take over the iterates of another one of the same shapes."""
-        for own, its in zip(self._moving, other._moving, strict=True):
-            own[:] = its
+        for target, its in zip(self._moving, other._moving, strict=True):
+            target[:] = its
 
-    def take_over(self, rows: Tensor, found: Any) -> None:
+    def take_over(self, rows: Tensor, solution: Any) -> None:
         """Put the states, controls and multipliers of solutions in the places `rows` (b,)."""
-        self.X[rows], self.U[rows] = found.X, found.U
-        for lam, own in zip(self.lam, found.multipliers.lam, strict=True):
-            lam[rows] = own
+        self.X[rows], self.U[rows] = solution.X, solution.U
+        for lam, new in zip(self.lam, solution.multipliers.lam, strict=True):
+            lam[rows] = new
 
     def begin_at(self, rows: Tensor, X: Tensor, U: Tensor) -> None:
         """Put trajectories in the places `rows` (b,), without multipliers."""
@@ -132,21 +132,21 @@ class Kept(KeptProblem):
         whole = int(by)
         if whole:
             self._shift(whole)
-        if (part := by - whole) > 0:
+        if (share := by - whole) > 0:
             now = [numbers.copy() for numbers in self._moving]
             self._shift(1)
             for numbers, before in zip(self._moving, now, strict=True):
-                numbers *= part
-                numbers += (1 - part) * before
+                numbers *= share
+                numbers += (1 - share) * before
 
     def _shift(self, by: int) -> None:
         if by not in self._later:
             self._later[by] = [_moved(knots, by) for knots in self._knots]
-        for part, at in zip(self._moving, self._later[by], strict=True):
-            if at is None:
-                part[:, :-by], part[:, -by:] = part[:, by:], part[:, -1:]
+        for numbers, places in zip(self._moving, self._later[by], strict=True):
+            if places is None:
+                numbers[:, :-by], numbers[:, -by:] = numbers[:, by:], numbers[:, -1:]
             else:
-                part[:] = part[:, at]
+                numbers[:] = numbers[:, places]
 
 
 def _spans(rows: np.ndarray) -> list[tuple[int, int]]:
@@ -159,6 +159,6 @@ def _spans(rows: np.ndarray) -> list[tuple[int, int]]:
 
 def _moved(knots: Sequence[int], by: int) -> np.ndarray | None:
     """The places that numbers at these knots come from, `by` stages later; None: each from `by` places on."""
-    at = np.array(later(knots, by), dtype=np.intp)
-    last = len(at) - 1
-    return None if by <= last and np.array_equal(at, np.minimum(np.arange(by, by + len(at)), last)) else at
+    places = np.array(later(knots, by), dtype=np.intp)
+    last = len(places) - 1
+    return None if by <= last and np.array_equal(places, np.minimum(np.arange(by, by + len(places)), last)) else places

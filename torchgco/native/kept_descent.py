@@ -42,9 +42,9 @@ class KeptDescent(KeptProblem):
         self._measured = self.packed.copy()
         self._measured.fill({"merit": self.worst})
         # The same memory by NumPy, which takes a small share of PyTorch's time for a few numbers.
-        self._x0, self._X, self._U = (part.numpy() for part in (problem.x0, self.X, self.U))
-        self._lam, self._mu = [part.numpy() for part in self.lam], self.mu.numpy()
-        self._state = {name: part.numpy() for name, part in state.items()}
+        self._x0, self._X, self._U = (tensor.numpy() for tensor in (problem.x0, self.X, self.U))
+        self._lam, self._mu = [tensor.numpy() for tensor in self.lam], self.mu.numpy()
+        self._state = {name: tensor.numpy() for name, tensor in state.items()}
 
     def solve(self, U: torch.Tensor, multipliers: Multipliers) -> bool:
         """One inner solve of every problem from controls U (B, N, m), into `X` and `U`.
@@ -53,8 +53,8 @@ class KeptDescent(KeptProblem):
         """
         B, library, state = self.problem.B, self.engine.library, self._state
         self._X[:, 0], self._U[:], self._mu[:] = self._x0, U.numpy(), multipliers.mu.numpy()
-        for own, lam in zip(self._lam, multipliers.lam, strict=True):
-            own[:] = lam.numpy()
+        for target, lam in zip(self._lam, multipliers.lam, strict=True):
+            target[:] = lam.numpy()
         for name in ZEROED:
             state[name][:] = 0
         run(library.tgco_open_loop, B, self.engine.lanes, self.packed)

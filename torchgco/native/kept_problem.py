@@ -43,7 +43,7 @@ class KeptProblem:
         self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows, **shared_fields(engine.shared))
         self._model, self._cost = engine.model_numbers(problem), engine.cost_numbers(problem)
         self.packed.fill({"parameters": self._model, "cost_data": self._cost, "X": self.X, "U": self.U})
-        self._copied = {i: found for i in engine.functions if (found := self._copies(i)) is not None}
+        self._copied = {i: arrays for i in engine.functions if (arrays := self._copies(i)) is not None}
 
     @property
     def is_outdated(self) -> bool:
@@ -90,7 +90,7 @@ class KeptProblem:
         if picks is None or picks.numel() == 0 or kind_of(part) is not Kind.FUNCTION or part.row_radii is not None:
             return None
         first, every = 0, own_tensors(part)
-        for own in (every[place] for place in self.engine.functions[i].span.traced.named):
+        for own in (every[index] for index in self.engine.functions[i].span.traced.named):
             size = math.prod(own.shape[1:])
             if first <= int(picks.min()) and int(picks.max()) < first + size:
                 (there,) = self._numbers[i]["bound"].kept

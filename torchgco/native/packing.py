@@ -21,7 +21,7 @@ def quadratic_arrays(cost: Any) -> list[c.Array]:
 
 def is_bounded(cost: Any) -> bool:
     """Whether no stage of a quadratic cost can be below 0, rounding included; unknown of weights that are matrices."""
-    if not cost.diagonal or any(part is not None for part in (cost.q, cost.r, cost.qf, cost.H)):
+    if not cost.diagonal or any(term is not None for term in (cost.q, cost.r, cost.qf, cost.H)):
         return False
     return all(bool((weights.numpy() >= 0).all()) for weights in (cost.Q, cost.R, cost.Qf))
 
@@ -35,11 +35,11 @@ def shared_fields(shared: Shared) -> dict[str, Any]:
 def constraint_of(constraint: Any, shape: tuple[int, int], N: int, kind: Kind, own: dict[str, Any]) -> c.Constraint:
     """A constraint with rows of a shape (K, p) without multipliers, with the fields that `numbers_of` gives."""
     knots, rows = shape
-    place = torch.full((N + 1,), NOWHERE, dtype=torch.int32)
+    slots = torch.full((N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
-        place[constraint.knots] = torch.arange(knots, dtype=torch.int32)
+        slots[constraint.knots] = torch.arange(knots, dtype=torch.int32)
     equality, geometric = constraint.sense == "equality", constraint.geometric
-    return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
+    return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=slots, **own)
 
 
 def numbers_of(constraint: Any, numbers: Tensor | None, problem: Problem) -> dict[str, Any]:
@@ -48,11 +48,11 @@ def numbers_of(constraint: Any, numbers: Tensor | None, problem: Problem) -> dic
     if kind is Kind.FUNCTION:
         return {"bound": array(numbers, knots=True)}
     of = constraint.lowered(problem.n)
-    own = {name: array(value, knots=True) for name, value in of.by_knot.items()}
-    own |= {name: array(value, knots=False) for name, value in of.by_problem.items()} | of.plain
+    fields = {name: array(value, knots=True) for name, value in of.by_knot.items()}
+    fields |= {name: array(value, knots=False) for name, value in of.by_problem.items()} | of.plain
     if kind is Kind.BODY:
-        own |= {"lift": array(numbers, knots=True), "kind_of_balls": kind_of(constraint.balls[0])}
-    return own
+        fields |= {"lift": array(numbers, knots=True), "kind_of_balls": kind_of(constraint.balls[0])}
+    return fields
 
 
 def kind_of(constraint: Any) -> Kind:
@@ -69,7 +69,7 @@ def guide_of(guide: Penalty | None) -> dict[str, Any]:
     """The fields of a problem that hold the penalty of guidance."""
     if guide is None:
         return {}
-    own = {"center": array(guide.center, knots=True), "weight": array(guide.weight.unsqueeze(-1), knots=False)}
+    fields = {"center": array(guide.center, knots=True), "weight": array(guide.weight.unsqueeze(-1), knots=False)}
     if isinstance(guide, GuideRegion):
-        return {**own, "guide": Guide.REGION, "radius": array(guide.radius.unsqueeze(-1), knots=True)}
-    return {**own, "guide": Guide.PATH}
+        return {**fields, "guide": Guide.REGION, "radius": array(guide.radius.unsqueeze(-1), knots=True)}
+    return {**fields, "guide": Guide.PATH}

@@ -46,7 +46,7 @@ class Captured:
     def __init__(self, model: DynamicsSource, cost: CostSource | None, functions: Mapping[int, KnotSource]) -> None:
         self._places, self._has_cost = tuple(functions), cost is not None
         self.traces: list[Traced] = [model.traced]
-        self.traces += () if cost is None else (part.span.traced for part in cost.parts)
+        self.traces += () if cost is None else (source.span.traced for source in cost.parts)
         self.traces += (rows.span.traced for rows in functions.values())
         self._outside = list({id(tensor): tensor for traced in self.traces for tensor in traced.outside}.values())
         self._last: tuple[tuple[Hashable, ...] | None, Shared | None] = None, None
@@ -83,12 +83,12 @@ class Captured:
         return last
 
     def _read(self) -> Shared | None:
-        found = list[Tensor]()
+        shared = list[Tensor]()
         for traced in self.traces:
             numbers = traced.shared_numbers()
             if numbers is None:
                 return None
-            found.append(numbers)
-        own, *others = found
-        of_cost = (others.pop(0), others.pop(0)) if self._has_cost else (own[:0], own[:0])
-        return Shared(own, of_cost, dict(zip(self._places, others, strict=True)))
+            shared.append(numbers)
+        of_model, *others = shared
+        of_cost = (others.pop(0), others.pop(0)) if self._has_cost else (of_model[:0], of_model[:0])
+        return Shared(of_model, of_cost, dict(zip(self._places, others, strict=True)))

@@ -56,22 +56,22 @@ _made: dict[tuple[str, str], Made] = {}
 
 def made(parts: Sequence[str], make: Callable[[], dict[str, Any]], kin: str = "") -> Made:
     """What `make` generates for the key of `parts`: of this process, else from the folder, else made now and stored."""
-    key, place = key_of(parts, kin), str(folder())
-    if (key, place) not in _made:
+    key, root = key_of(parts, kin), str(folder())
+    if (key, root) not in _made:
         known = read(key, ".json")
         if known is None:
             known = json.dumps(make()).encode()
             save(key, ".json", known)
-        _made[key, place] = Made(key, json.loads(known))
+        _made[key, root] = Made(key, json.loads(known))
         trim(_made, FILES)
-    return _made[key, place]
+    return _made[key, root]
 
 
 def folder() -> Path:
     """TORCHGCO_CACHE, else torchgco in XDG_CACHE_HOME, else ~/.cache/torchgco; it need not exist."""
-    own, shared = os.environ.get("TORCHGCO_CACHE"), os.environ.get("XDG_CACHE_HOME")
-    if own:
-        return Path(own)
+    chosen, shared = os.environ.get("TORCHGCO_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    if chosen:
+        return Path(chosen)
     # Without a home, expanduser leaves the ~, which would become the name of a folder here.
     return Path(shared or os.path.expanduser("~/.cache")) / "torchgco"
 
@@ -79,11 +79,11 @@ def folder() -> Path:
 def key_of(parts: Iterable[str], kin: str = "") -> str:
     """A key that differs from that of any other sequence of texts; of the `kin` that a text names, or of none."""
     digest = hashlib.sha256()
-    for part in parts:
-        text = part.encode(errors="surrogateescape")
+    for piece in parts:
+        text = piece.encode(errors="surrogateescape")
         digest.update(f"{len(text)}:".encode() + text)
-    own = digest.hexdigest()[:32]
-    return key_of((kin,))[:_PREFIX] + own[_PREFIX:] if kin else own
+    digits = digest.hexdigest()[:32]
+    return key_of((kin,))[:_PREFIX] + digits[_PREFIX:] if kin else digits
 
 
 def find(key: str, suffix: str) -> Path | None:
@@ -98,11 +98,11 @@ def read(key: str, suffix: str) -> bytes | None:
 
 def _sound(key: str, suffix: str) -> Iterator[tuple[Path, bytes]]:
     """Files under a key that match their checksum, and their content; the others are removed."""
-    place, names = folder(), list[str]()
+    root, names = folder(), list[str]()
     with suppress(OSError):
-        if _is_ours(place, os.stat(place)):
-            names = [name for name in os.listdir(place) if name.startswith(f"{key}-") and name.endswith(suffix)]
-    for path in (place / name for name in sorted(names)):
+        if _is_ours(root, os.stat(root)):
+            names = [name for name in os.listdir(root) if name.startswith(f"{key}-") and name.endswith(suffix)]
+    for path in (root / name for name in sorted(names)):
         with suppress(OSError):
             with open(path, "rb") as file:
                 if not _is_ours(path, os.fstat(file.fileno())):
@@ -116,35 +116,35 @@ def _sound(key: str, suffix: str) -> Iterator[tuple[Path, bytes]]:
             yield path, content
 
 
-def _is_ours(place: Path, about: os.stat_result) -> bool:
+def _is_ours(root: Path, about: os.stat_result) -> bool:
     """Whether nobody but this user and root can have written there; a CacheWarning says once where it isn't so."""
     if about.st_uid not in (os.geteuid(), 0):
         reason = f"belongs to another user ({about.st_uid})"
     elif about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        reason = f"can be written by others (chmod go-w {place})"
+        reason = f"can be written by others (chmod go-w {root})"
     else:
         return True
-    if place not in _warned:
-        _warned.add(place)
-        told = f"kernels are compiled again in every process: {place} {reason}; TORCHGCO_CACHE names another folder"
+    if root not in _warned:
+        _warned.add(root)
+        told = f"kernels are compiled again in every process: {root} {reason}; TORCHGCO_CACHE names another folder"
         warnings.warn(told, CacheWarning, stacklevel=2)
     return False
 
 
 def save(key: str, suffix: str, content: bytes) -> Path | None:
     """Store `content` under a key; returns the file's path, None where the folder can't be written."""
-    place = folder()
-    if str(place).startswith("~"):
+    root = folder()
+    if str(root).startswith("~"):
         return None
-    path = place / _name(key, suffix, content)
+    path = root / _name(key, suffix, content)
     try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not _is_ours(place, os.stat(place)):
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _is_ours(root, os.stat(root)):
             return None
         write_whole(path, lambda file: file.write(content))
     except OSError:
         return None
-    _tidy(place, key[:_PREFIX])
+    _tidy(root, key[:_PREFIX])
     return path
 
 
@@ -153,13 +153,13 @@ def _name(key: str, suffix: str, content: bytes) -> str:
     return f"{key}-{hashlib.sha256(key.encode() + content).hexdigest()[:32]}{suffix}"
 
 
-def _tidy(place: Path, kin: str) -> None:
+def _tidy(root: Path, kin: str) -> None:
     """Remove the least recently used files over the limits, of a kin and of all; another process may use or remove
     them meanwhile. Only where there are too many is each file asked for its time.
     """
     objects: list[str] = []
     others: list[str] = []
-    with suppress(OSError), os.scandir(place) as entries:
+    with suppress(OSError), os.scandir(root) as entries:
         for entry in entries:
             if _OURS.fullmatch(entry.name):  # all other files in the folder are left alone
                 (objects if entry.name.endswith(OBJECT) else others).append(entry.path)

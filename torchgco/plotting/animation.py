@@ -90,9 +90,9 @@ def write_gif(axes: Sequence[Axes], show: Callable[[int], str], frames: Sequence
             pictures.append(pictures[-1])
             continue
         canvas.restore_region(still)
-        held = [set(ax.get_children()) for ax in axes]
+        children = [set(ax.get_children()) for ax in axes]
         title.set_text(show(i))
-        for ax, known in zip(axes, held, strict=True):
+        for ax, known in zip(axes, children, strict=True):
             new = [artist for artist in ax.get_children() if artist not in known]
             for artist in sorted(new, key=lambda artist: artist.get_zorder()):
                 ax.draw_artist(artist)

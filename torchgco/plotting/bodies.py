@@ -73,10 +73,10 @@ class Ball:
         """The silhouette (P, 2) of all points within `margin`."""
         return _around(self.at(t)[None, list(plane)], self.radius + margin)
 
-    def section(self, plane: Plane, at: float, margin: float = 0.0, t: float = 0.0) -> np.ndarray | None:
-        """Where the points within `margin` cut the plane in which the hidden coordinate is `at`: (P, 2), or None."""
+    def section(self, plane: Plane, depth: float, margin: float = 0.0, t: float = 0.0) -> np.ndarray | None:
+        """Where the points within `margin` cut the plane in which the hidden coordinate is `depth`: (P, 2), or None."""
         center, reach = self.at(t), self.radius + margin
-        off = center[_hidden(plane)] - at
+        off = center[_hidden(plane)] - depth
         return _around(center[None, list(plane)], np.sqrt(reach**2 - off**2)) if abs(off) < reach else None
 
 
@@ -101,7 +101,7 @@ class Box:
     @property
     def moving(self) -> bool:
         parts = self.velocity, None if self.swing is None else self.swing[0]
-        return self.track is not None or any(part is not None and bool(part.any()) for part in parts)
+        return self.track is not None or any(array is not None and bool(array.any()) for array in parts)
 
     @property
     def corners(self) -> np.ndarray:
@@ -138,8 +138,8 @@ class Box:
         least = 0.5 * (ends[:-1] + ends[1:] - np.linalg.norm(np.diff(away, axis=0), axis=1))
         near = np.flatnonzero(least < within)
         if len(near):
-            starts, steps = (torch.from_numpy(part[near]) for part in (away[:-1], np.diff(away, axis=0)))
-            axes, half = (torch.from_numpy(part).expand(len(near), *part.shape) for part in (self.sides, self.half))
+            starts, steps = (torch.from_numpy(array[near]) for array in (away[:-1], np.diff(away, axis=0)))
+            axes, half = (torch.from_numpy(array).expand(len(near), *array.shape) for array in (self.sides, self.half))
             least[near] = closest(axes.double(), torch.zeros_like(starts), half.double(), starts, steps).numpy()
         return least
 
@@ -149,18 +149,18 @@ class Box:
         # Rounded boxes may have sides of length 0, and then no hull of their corners.
         return _around(seen, reach) if reach > 0 else seen[ConvexHull(seen).vertices]
 
-    def section(self, plane: Plane, at: float, margin: float = 0.0, t: float = 0.0) -> np.ndarray | None:
-        """Where the points within `margin` cut the plane in which the hidden coordinate is `at`: (P, 2), or None.
+    def section(self, plane: Plane, depth: float, margin: float = 0.0, t: float = 0.0) -> np.ndarray | None:
+        """Where the points within `margin` cut the plane in which the hidden coordinate is `depth`: (P, 2), or None.
 
         A cut through a rounded box is the hull of cuts through the sharp one nearby, each grown by what the rounding
         has left at this distance.
         """
         corners, hidden, reach = self._corners(t), _hidden(plane), self.radius + margin
-        heights = corners[:, hidden] - at
+        heights = corners[:, hidden] - depth
         if abs(heights.mean()) > np.ptp(heights) / 2 + reach:
             return None
         levels = np.concatenate((reach * LEVELS, heights[np.abs(heights) <= reach])) if reach > 0 else np.zeros(1)
-        level, points = _crossings(corners, hidden, at + levels)
+        level, points = _crossings(corners, hidden, depth + levels)
         left = np.sqrt(np.maximum(reach**2 - levels[level] ** 2, 0.0))
         return _around(points[:, plane], left) if len(points) else None
 
@@ -189,12 +189,12 @@ def _boxes(layouts: Mapping[str, np.ndarray], i: int) -> tuple[Box, ...]:
         swings = np.stack(
             [np.asarray(layouts[f"box_{name}"], dtype=float)[i] for name in ("amplitudes", "rates", "phases")]
         )
-    found = []
+    boxes = []
     for k in np.flatnonzero(np.isfinite(centers).all(axis=1)):
         sides = np.eye(centers.shape[1]) if turns is None else _sides(np.asarray(turns, dtype=float)[i, k])
         radius = 0.0 if rounding is None else float(np.asarray(rounding)[i, k])
-        found.append(Box(centers[k], halves[k], sides, radius, None if swings is None else swings[:, k]))
-    return tuple(found)
+        boxes.append(Box(centers[k], halves[k], sides, radius, None if swings is None else swings[:, k]))
+    return tuple(boxes)
 
 
 def _hidden(plane: Plane) -> int:

@@ -35,11 +35,11 @@ def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = Non
     missing = [name for name in TRACED if name not in trace.columns]
     if missing or trace.empty:
         raise InputError("trace", f"rows with columns {', '.join(TRACED)}", f"none of {', '.join(missing) or 'them'}")
-    held = trace["element"].unique().tolist()
-    shown = held[:SHOWN] if elements is None else list(elements)
+    known = trace["element"].unique().tolist()
+    shown = known[:SHOWN] if elements is None else list(elements)
     for element in shown:
-        if element not in held:
-            raise InputError("elements", f"problems of the trace, {held[0]} to {held[-1]}", element)
+        if element not in known:
+            raise InputError("elements", f"problems of the trace, {known[0]} to {known[-1]}", element)
     figure, axes = panels(len(shown), 2, (5.2, 3.0))
     order = [name for name in ("attempt", "iteration") if name in trace.columns]
     for ax, element in zip(axes, shown, strict=True):

@@ -81,14 +81,14 @@ class Course:
         return np.concatenate([self._reaches(radius) for radius in radii])
 
     def _reaches(self, radius: float) -> np.ndarray:
-        own = [body.radius + radius for body in self.bodies]
-        return np.array(own if self.map is None else [*own, radius])
+        reaches = [body.radius + radius for body in self.bodies]
+        return np.array(reaches if self.map is None else [*reaches, radius])
 
     def distances(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (M, T) of positions (T, 3) at times t (T,), s, from centres, from sides of boxes, the map."""
-        found = [body.distance(positions, t) for body in self.bodies]
-        found += [] if self.map is None else [self.map.distance(positions).numpy()]
-        return np.array(found).reshape(len(found), len(t))
+        distances = [body.distance(positions, t) for body in self.bodies]
+        distances += [] if self.map is None else [self.map.distance(positions).numpy()]
+        return np.array(distances).reshape(len(distances), len(t))
 
     def infeasible(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Which positions (T, 3) at times t (T,), s, lie more than a millimetre inside an obstacle grown by r_veh."""
@@ -105,8 +105,8 @@ class Course:
         return contacts(self._scene(track[:1], period), 0, track[:, :3], track)
 
     def _scene(self, start: np.ndarray, period: float = 0.0) -> Scene:
-        own = (self.bodies,), start[:, :3], self.goal[None], self.vehicle_radius, self.goal_radius
-        return Scene(*own, period, np.zeros(1), self.map, body=self.body)
+        fields = (self.bodies,), start[:, :3], self.goal[None], self.vehicle_radius, self.goal_radius
+        return Scene(*fields, period, np.zeros(1), self.map, body=self.body)
 
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of a box around goal and track, a little wider where obstacles are."""
@@ -156,21 +156,21 @@ def draw_contacts(ax: Axes, places: np.ndarray, plane: draw.Plane) -> None:
 
 def handles(course: Course, touched: bool) -> list[Artist]:
     """Entries of a legend: the contacts, where there are any, and what a map doesn't know."""
-    found: list[Artist] = [Line2D([], [], label="contact", **CONTACT)] if touched else []
-    return [*found, *map_handles(course.map)]
+    entries: list[Artist] = [Line2D([], [], label="contact", **CONTACT)] if touched else []
+    return [*entries, *map_handles(course.map)]
 
 
 def _is_still(body: Solid) -> bool:
     return isinstance(body, Ball) and not body.moving
 
 
-def _draw_bodies(ax: Axes, course: Course, bodies: Sequence[Solid], t: float, at: float, plane: draw.Plane) -> None:
-    """Obstacles at time t, s, filled, and outlined at the vehicle's radius; `at` is its hidden coordinate, m."""
+def _draw_bodies(ax: Axes, course: Course, bodies: Sequence[Solid], t: float, depth: float, plane: draw.Plane) -> None:
+    """Obstacles at time t, s, filled, and outlined at the vehicle's radius; `depth` is its hidden coordinate, m."""
     full: dict[str, Any] = {"facecolor": draw.STONE, "linewidth": 0.5, "alpha": 0.6}
     grown: dict[str, Any] = {"facecolor": "none", "linewidth": 0.7, "linestyle": "--"}
     for margin, look in ((0.0, full), (course.vehicle_radius, grown)):
         shapes = [
-            body.outline(margin, plane, t) if isinstance(body, Ball) else body.section(plane, at, margin, t)
+            body.outline(margin, plane, t) if isinstance(body, Ball) else body.section(plane, depth, margin, t)
             for body in bodies
         ]
         if seen := [shape for shape in shapes if shape is not None]:

@@ -49,7 +49,7 @@ def violation_figure(trials: pd.DataFrame) -> Figure:
     """
     figure, shown = _panels(trials, "violation", "tolerance")
     for ax, values in shown:
-        decades = {name: np.log10(held.clip(LOWEST)) for name, held in values.items()}
+        decades = {name: np.log10(sample.clip(LOWEST)) for name, sample in values.items()}
         # A linear axis of exponents: its lower end stands for all below.
         _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(ADMITTED))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -90,17 +90,17 @@ def _finite(values: np.ndarray) -> np.ndarray:
 def _steps(ax: Axes, values: dict[str, np.ndarray], label: str, mark: float) -> None:
     """The share of each solver's values up to a value, over all values from the left to the right end of the axis."""
     colours = solver_colours(values)
-    finite = np.concatenate([mark + np.zeros(1), *(_finite(held) for held in values.values())])
+    finite = np.concatenate([mark + np.zeros(1), *(_finite(sample) for sample in values.values())])
     space = SPACE * (float(np.ptp(finite)) or 1.0)
     ends = finite.min() - space, finite.max() + space
-    for name, held in values.items():
-        x = np.sort(_finite(held))
-        share = np.arange(len(x) + 1) / len(held)
+    for name, sample in values.items():
+        x = np.sort(_finite(sample))
+        share = np.arange(len(x) + 1) / len(sample)
         x, share = np.concatenate((ends[:1], x, ends[1:])), np.append(share, share[-1])
         ax.plot(x, share, color=colours[name], drawstyle="steps-post", linewidth=1.6)
     ax.axvline(mark, color=INK, linestyle="--", linewidth=1.2)
     ax.set(xlim=ends, ylim=(-0.02, 1.02), ylabel="share of the layouts up to here")
     ax.yaxis.set_major_formatter(PercentFormatter(1, symbol=" %"))
-    lost = {name: int((~np.isfinite(held)).sum()) for name, held in values.items()}
+    lost = {name: int((~np.isfinite(sample)).sum()) for name, sample in values.items()}
     missing = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
     ax.set_xlabel(f"{label}\nnot finite, hence not shown: {missing}" if missing else label)

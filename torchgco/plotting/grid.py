@@ -43,8 +43,8 @@ def grid(
         for i in range(row * columns, min((row + 1) * columns, count)):
             left, upper, panels = GRID_LEFT + (i - row * columns) * (width + GRID_GAP), top, []
             for plane, height in zip(planes, heights[row], strict=True):
-                place = (left / wide, (upper - height) / high, width / wide, height / high)
-                panels.append(_axes(figure, place, box, plane, i == row * columns))
+                rect = (left / wide, (upper - height) / high, width / wide, height / high)
+                panels.append(_axes(figure, rect, box, plane, i == row * columns))
                 upper -= height + GRID_GAP
             if i + columns >= count:  # the lowest of its column
                 panels[-1].tick_params(labelbottom=True)
@@ -54,9 +54,9 @@ def grid(
     return figure, axes
 
 
-def _axes(figure: Figure, place: tuple[float, float, float, float], box: np.ndarray, plane: Plane, first: bool) -> Axes:
+def _axes(figure: Figure, rect: tuple[float, float, float, float], box: np.ndarray, plane: Plane, first: bool) -> Axes:
     """Axes of equal scales; the labels of y are at the first of a row."""
-    ax = figure.add_axes(place)
+    ax = figure.add_axes(rect)
     ax.set(xlim=box[:, 0], ylim=box[:, plane[1]], aspect="equal")
     ax.locator_params(axis="y", nbins=5)
     ax.set_ylabel(f"{'xyz'[plane[1]]} [m]" if first else "")

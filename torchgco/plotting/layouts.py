@@ -106,8 +106,8 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     leads = {solver_colours(flights)[next(iter(flights), "")] if flights else EDGE: passes(scene, i, path)}
     for plane, ax in axes.items():
         drawn |= draw_obstacles(ax, scene, i, leads, plane)
-        if (own := scene.map_of(i)) is not None:
-            drawn |= draw_map(ax, own, flown(path), plane, scene.margin, (ROCK, EDGE))
+        if (field := scene.map_of(i)) is not None:
+            drawn |= draw_map(ax, field, flown(path), plane, scene.margin, (ROCK, EDGE))
         drawn |= _paths(ax, scene, i, here, plane)
         draw_targets(ax, scene, i, plane)
     return drawn
@@ -116,9 +116,9 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
 def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFrame) -> dict[str, list[DrawnFlight]]:
     table = trials.drop_duplicates(["solver", "layout"]).set_index(["solver", "layout"])
     verdicts = table[["feasible", "reached"]].astype("boolean").fillna(False)
-    found: dict[str, list[DrawnFlight]] = {}
+    by_solver: dict[str, list[DrawnFlight]] = {}
     for solver, states in paths.items():
-        found[solver] = []
+        by_solver[solver] = []
         for i, X in enumerate(states):
             if (solver, scene.ids[i]) not in verdicts.index:
                 raise InputError("trials", f"a row of {solver} for layout {scene.ids[i]}", "none")
@@ -129,8 +129,8 @@ def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFra
             still = len(flown(path)) > 1 and bool(moved < STILL * _way(scene, i))
             # By the judge, who follows the path between the knots: a straight line may touch what it doesn't.
             touched = path[:0] if row["feasible"] else contacts(scene, i, path, X)
-            found[solver].append(DrawnFlight(path, end, touched, still, X[: len(flown(path))]))
-    return found
+            by_solver[solver].append(DrawnFlight(path, end, touched, still, X[: len(flown(path))]))
+    return by_solver
 
 
 def _way(scene: Scene, i: int) -> float:
@@ -177,22 +177,22 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass
     """
     kinds = set[str]()
     for first, (colour, lead) in enumerate(leads.items()):
-        held: dict[str, list[np.ndarray]] = {"near": [], "own": [], "grown": [], "moving": [], "vehicle": []}
-        for body, place in zip(scene.bodies[i], lead, strict=True):
-            if (body.moving and _is_far(scene, i, place)) or (first > 0 and not body.moving):
+        drawn: dict[str, list[np.ndarray]] = {"near": [], "own": [], "grown": [], "moving": [], "vehicle": []}
+        for body, pass_ in zip(scene.bodies[i], lead, strict=True):
+            if (body.moving and _is_far(scene, i, pass_)) or (first > 0 and not body.moving):
                 continue
-            own, grown = _shapes(body, scene, place, plane)
-            near = place.distance < NEAR_SHARE * _way(scene, i)
-            if own is not None:
-                held["moving" if body.moving else "own"].append(own)
+            shape, grown = _shapes(body, scene, pass_, plane)
+            near = pass_.distance < NEAR_SHARE * _way(scene, i)
+            if shape is not None:
+                drawn["moving" if body.moving else "own"].append(shape)
             if grown is not None and scene.margin > 0 and not body.moving:
-                held["grown"].append(grown)
-            if near and (own if body.moving else grown) is None:
-                held["near"].append(body.outline(0.0, plane, place.t))
+                drawn["grown"].append(grown)
+            if near and (shape if body.moving else grown) is None:
+                drawn["near"].append(body.outline(0.0, plane, pass_.t))
             if body.moving and (grown is not None or near):
                 kinds.add("moving")
-                _draw_motion(ax, body, place, plane, colour)
-                held["vehicle"].append(Ball(place.place, scene.margin, np.zeros(scene.dimension)).outline(0.0, plane))
+                _draw_motion(ax, body, pass_, plane, colour)
+                drawn["vehicle"].append(Ball(pass_.place, scene.margin, np.zeros(scene.dimension)).outline(0.0, plane))
         looks: dict[str, dict[str, Any]] = {
             "near": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.7, "linestyle": ":"},
             "own": {"facecolor": ROCK, "linewidth": 0.0},
@@ -201,7 +201,7 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass
             "moving": {"facecolor": (*to_rgb(ROCK), 0.35), "edgecolor": colour, "linewidth": 0.9, "linestyle": "--"},
             "vehicle": {"facecolor": (*to_rgb(colour), 0.25), "edgecolor": colour, "linewidth": 0.9},
         }
-        for zorder, (kind, shapes) in enumerate(held.items()):
+        for zorder, (kind, shapes) in enumerate(drawn.items()):
             if shapes:
                 ax.add_collection(PolyCollection(shapes, zorder=0.2 + 0.1 * zorder, **looks[kind]), autolim=False)
                 kinds.add(kind)
@@ -210,35 +210,35 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass
 
 def moving_corners(scene: Scene, i: int, path: np.ndarray) -> list[np.ndarray]:
     """Lower and upper corners (2, d), m, of the moving obstacles where `draw_obstacles` draws them for a path."""
-    found = []
-    for body, place in zip(scene.bodies[i], passes(scene, i, path), strict=True):
-        if body.moving and not _is_far(scene, i, place):
-            corners = body.corners + body.at(place.t) - body.at(0.0)
-            found.append(np.stack([corners.min(0) - body.radius, corners.max(0) + body.radius]))
-    return found
+    boxes = []
+    for body, pass_ in zip(scene.bodies[i], passes(scene, i, path), strict=True):
+        if body.moving and not _is_far(scene, i, pass_):
+            corners = body.corners + body.at(pass_.t) - body.at(0.0)
+            boxes.append(np.stack([corners.min(0) - body.radius, corners.max(0) + body.radius]))
+    return boxes
 
 
-def _is_far(scene: Scene, i: int, place: Pass) -> bool:
+def _is_far(scene: Scene, i: int, pass_: Pass) -> bool:
     """Whether a flight stays so far from an obstacle that moves that this isn't drawn."""
-    return place.distance > FAR_SHARE * _way(scene, i)
+    return pass_.distance > FAR_SHARE * _way(scene, i)
 
 
-def _shapes(body: Solid, scene: Scene, place: Pass, plane: Plane) -> list[np.ndarray | None]:
+def _shapes(body: Solid, scene: Scene, pass_: Pass, plane: Plane) -> list[np.ndarray | None]:
     """A body, and the same grown by the vehicle's radius: outlines, or cuts in space, None where there is nothing."""
     if scene.dimension == 2:
-        return [body.outline(margin, plane, place.t) for margin in (0.0, scene.margin)]
-    at = float(np.delete(place.place, plane)[0])
-    return [body.section(plane, at, margin, place.t) for margin in (0.0, scene.margin)]
+        return [body.outline(margin, plane, pass_.t) for margin in (0.0, scene.margin)]
+    depth = float(np.delete(pass_.place, plane)[0])
+    return [body.section(plane, depth, margin, pass_.t) for margin in (0.0, scene.margin)]
 
 
-def _draw_motion(ax: Axes, body: Solid, place: Pass, plane: Plane, colour: str) -> None:
+def _draw_motion(ax: Axes, body: Solid, pass_: Pass, plane: Plane, colour: str) -> None:
     """A moving body's last second, the time when it is passed, and the vehicle's centre then."""
-    way = body.at(np.array([max(0.0, place.t - TRAIL), place.t]))[:, plane]
+    way = body.at(np.array([max(0.0, pass_.t - TRAIL), pass_.t]))[:, plane]
     ax.plot(*way.T, color=colour, linewidth=0.9, zorder=1)
-    at = place.place[list(plane)]
-    ax.plot(*at, color=colour, zorder=5, marker="o", markersize=2.5, linestyle="none")
+    center = pass_.place[list(plane)]
+    ax.plot(*center, color=colour, zorder=5, marker="o", markersize=2.5, linestyle="none")
     look: dict[str, Any] = {"ha": "center", "va": "center", "clip_on": True, "zorder": 5}
-    ax.text(float(way[-1, 0]), float(way[-1, 1]), f"{place.t:.1f} s", fontsize=SMALL - 2, color=colour, **look)
+    ax.text(float(way[-1, 0]), float(way[-1, 1]), f"{pass_.t:.1f} s", fontsize=SMALL - 2, color=colour, **look)
 
 
 def moving_handles(whose: str, colour: str) -> list[Artist]:

@@ -143,12 +143,12 @@ def snapshots_figure(
         ax.set_xlabel("")
     draw.time_bar(figure, grid.flat, period * (plans.shape[1] - 1))
     names = draw.handles("knot", "infeasible", "obstacle", "inflated", "start", "goal", knot="plan")
-    own = [
+    extra = [
         Line2D([], [], color=INK, linewidth=1.4, label="flown"),
         Line2D([], [], color=VEHICLE_COLOUR, markeredgecolor=INK, marker="o", linestyle="none", label="vehicle"),
     ]
     touched = any(len(course.contacts(track[: step + 1], period)) for step in steps)
-    legend(figure, [*names[:2], *own, *names[2:], *handles(course, touched)])
+    legend(figure, [*names[:2], *extra, *names[2:], *handles(course, touched)])
     return figure
 
 

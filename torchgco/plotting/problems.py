@@ -74,13 +74,13 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
     courses, unit = _courses(problem, solution, _places(b, problem.B))
     problem = paced(problem, solution.times)
-    at = problem.dynamics.position
-    planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if at is None else at.stop - at.start, ())
+    position = problem.dynamics.position
+    planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if position is None else position.stop - position.start, ())
     shared = [courses] if _is_shared(problem, courses) else [[course] for course in courses]
-    maps = [_Map.of(problem, group, planes) for group in shared] if planes else []
+    maps = [SceneMap.of(problem, group, planes) for group in shared] if planes else []
     rows = ceil((problem.n + problem.m) / PANELS_ACROSS)
     wide = WIDTH / len(maps) if maps else WIDTH
-    high = max((one.height(wide) for one in maps), default=0.0)
+    high = max((map_.height(wide) for map_ in maps), default=0.0)
     figure = NotebookFigure(figsize=(WIDTH, high + PANEL * rows), layout="constrained")
     lower: Figure | SubFigure = figure
     lines: list[Artist] = [Line2D([], [], color=course.colour, label=course.label) for course in courses]
@@ -88,8 +88,8 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     if maps:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, PANEL * rows))[:, 0]
         drawn = set[str]()
-        for part, one in zip(upper.subfigures(1, len(maps), squeeze=False)[0], maps, strict=True):
-            drawn |= one.draw(part)
+        for panel, map_ in zip(upper.subfigures(1, len(maps), squeeze=False)[0], maps, strict=True):
+            drawn |= map_.draw(panel)
         lines += _handles(maps, drawn)
     _histories(lower, problem, courses, unit)
     across = legend_columns(lines, WIDTH)
@@ -114,17 +114,17 @@ def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[l
         t, unit = times(problem) if solution.times is None else solution.times, "t [s]"
     except InputError:
         t, unit = torch.arange(problem.N + 1, device=problem.x0.device), "knot"
-    found, touching = [], _touching(problem.take(torch.tensor(places, device=problem.x0.device)), solution.take(places))
+    shown, touching = [], _touching(problem.take(torch.tensor(places, device=problem.x0.device)), solution.take(places))
     for i, b in enumerate(places):
         last = int(problem.stages[b])
-        X, U = (part[b].detach().cpu().double().numpy() for part in (solution.X, solution.U))
+        X, U = (array[b].detach().cpu().double().numpy() for array in (solution.X, solution.U))
         label = f"problem {b}: {solution.statuses[b].name}, cost {float(solution.cost[b]):.6g}"
-        at = (t if t.dim() == 1 else t[b]).cpu().double().numpy()
-        X, U, at = X[: last + 1], U[:last], at[: last + 1]
-        paths = tuple(X[:, part] for part in _positions(problem))
+        moments = (t if t.dim() == 1 else t[b]).cpu().double().numpy()
+        X, U, moments = X[: last + 1], U[:last], moments[: last + 1]
+        paths = tuple(X[:, columns] for columns in _positions(problem))
         keeps = bool(solution.violation[b] <= ADMITTED)
-        found.append(Course(b, X, U, at, paths, PALETTE[i % len(PALETTE)], label, keeps, touching[i]))
-    return found, unit
+        shown.append(Course(b, X, U, moments, paths, PALETTE[i % len(PALETTE)], label, keeps, touching[i]))
+    return shown, unit
 
 
 def _touching(problem: Problem, solution: Solution) -> list[bool]:
@@ -138,28 +138,28 @@ def _touching(problem: Problem, solution: Solution) -> list[bool]:
 
 def _positions(problem: Problem) -> list[list[int]]:
     """The states of the position, and of those of other vehicles that keep a distance from it."""
-    at = problem.dynamics.position
-    if at is None:
+    position = problem.dynamics.position
+    if position is None:
         return []
-    found = [list(range(at.start, at.stop))]
-    for part in problem.constraints:
-        if isinstance(part, Separation):
-            found += [states for states in part.positions.tolist() if states not in found]
-    return found
+    positions = [list(range(position.start, position.stop))]
+    for constraint in problem.constraints:
+        if isinstance(constraint, Separation):
+            positions += [states for states in constraint.positions.tolist() if states not in positions]
+    return positions
 
 
 def _is_shared(problem: Problem, courses: list[Course]) -> bool:
     """Whether one scene serves all: they have the same obstacles and goals."""
     rows = torch.tensor([course.b for course in courses], device=problem.x0.device)
-    cores = [part.inscribed for part in problem.obstacles]  # all problems have the same body
-    parts = [getattr(part.take(rows), name) for part in cores for name in part.batched]
+    cores = [obstacles.inscribed for obstacles in problem.obstacles]  # all problems have the same body
+    parts = [getattr(core.take(rows), name) for core in cores for name in core.batched]
     parts += [] if problem.goal is None else [problem.goal.position[rows]]
-    held = [part for part in parts if isinstance(part, torch.Tensor)]
-    return all(torch.equal(part.nan_to_num(), part[:1].expand_as(part).nan_to_num()) for part in held)
+    tensors = [tensor for tensor in parts if isinstance(tensor, torch.Tensor)]
+    return all(torch.equal(tensor.nan_to_num(), tensor[:1].expand_as(tensor).nan_to_num()) for tensor in tensors)
 
 
 @dataclass(frozen=True, eq=False)
-class _Map:
+class SceneMap:
     """A scene with the trajectories in it."""
 
     world: World
@@ -169,7 +169,7 @@ class _Map:
     gates: list[Outline]
 
     @classmethod
-    def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> _Map:
+    def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> SceneMap:
         world = world_of(problem, courses[0].b)
         kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
         gates, inside = outlines(problem, courses[0].b), [view(scene, [0], kept, others) for scene in world.scenes]
@@ -229,9 +229,9 @@ class _Map:
             if scene.map is not None:
                 drawn |= draw_map(ax, scene.map, lead if len(lead) else scene.start, plane, scene.margin, (ROCK, EDGE))
         hidden = [i for i in range(self.box.shape[1]) if i not in plane]
-        at = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
-        for part in self.world.others:
-            x, y, apart = distances(part, self.box[0], self.box[1], plane, at)
+        depth = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
+        for other in self.world.others:
+            x, y, apart = distances(other, self.box[0], self.box[1], plane, depth)
             if bool((apart < 0).any()):
                 ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[ROCK], zorder=0.3)
                 drawn.add("others")
@@ -260,7 +260,7 @@ class _Map:
         return drawn
 
 
-def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
+def _handles(maps: Sequence[SceneMap], drawn: set[str]) -> list[Artist]:
     """Entries of the legend of all maps."""
     shapes: dict[str, Artist] = {
         "own": Patch(facecolor=ROCK, label="obstacle"),
@@ -271,7 +271,7 @@ def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
     points: list[Artist] = [
         Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in ("contact", "away") if kind in drawn
     ]
-    of_maps = [handle for one in maps for scene in one.world.scenes for handle in map_handles(scene.map)]
+    of_maps = [handle for map_ in maps for scene in map_.world.scenes for handle in map_handles(scene.map)]
     moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []
     known = {handle.get_label(): handle for handle in reversed(of_maps)}
     return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *known.values()]
@@ -282,7 +282,7 @@ def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Cours
     count = problem.n + problem.m
     rows = ceil(count / PANELS_ACROSS)
     axes = list(figure.subplots(rows, min(PANELS_ACROSS, count), squeeze=False, sharex=True).flat)
-    names = [one.label for one in (*states_of(problem.dynamics), *controls_of(problem.dynamics))]
+    names = [component.label for component in (*states_of(problem.dynamics), *controls_of(problem.dynamics))]
     for i, ax in enumerate(axes[:count]):
         state, j = i < problem.n, i if i < problem.n else i - problem.n
         values = []
@@ -310,10 +310,10 @@ def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.n
     span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-9))
     count = problem.N + 1 if state else problem.N
     ends = [low, high]
-    for part in bounds_of(problem.constraints, "x" if state else "u"):
-        if j >= part.lower.shape[-1]:
+    for bounds in bounds_of(problem.constraints, "x" if state else "u"):
+        if j >= bounds.lower.shape[-1]:
             continue
-        for bound in part.over(count):
+        for bound in bounds.over(count):
             for course in courses:
                 row = bound[course.b if bound.shape[0] > 1 else 0, :, j].cpu().double().numpy()
                 row = np.broadcast_to(row, (count,))[: len(course.X if state else course.U)]

@@ -52,12 +52,12 @@ def rates_figure(summary: pd.DataFrame) -> Figure:
             x, colour, side = np.arange(len(OUTCOMES)), colours[row["solver"]], (i, len(task))
             low, rate, high = np.transpose([_interval(row, name) for name in OUTCOMES])
             _bars(ax, x, low, rate, high, colour, side)
-            for place, name, top in zip(_beside(x, side)[0], OUTCOMES, high, strict=True):
+            for center, name, top in zip(_beside(x, side)[0], OUTCOMES, high, strict=True):
                 look: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": SMALL}
                 if row[f"{name}_n"]:
-                    ax.text(place, top + 0.015, f"{row[f'{name}_count']}/{row[f'{name}_n']}", color=INK, **look)
+                    ax.text(center, top + 0.015, f"{row[f'{name}_count']}/{row[f'{name}_n']}", color=INK, **look)
                 else:
-                    ax.text(place, 0.02, "not defined", rotation=90, color=colour, **look)
+                    ax.text(center, 0.02, "not defined", rotation=90, color=colour, **look)
         ax.set_xticks(range(len(OUTCOMES)), OUTCOMES)
         ax.set_xlim(-0.5, len(OUTCOMES) - 0.5)
         _as_rate(ax, "layouts", 0, 1.12)
@@ -84,25 +84,25 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
     rows = summary[summary[variable].notna()]
     tasks = list(tasks_of(rows.rename(columns={variable: "value"})))
     shown = _shown(rows)
-    known = (held for held in EFFORT_AXES if held[0] in rows.columns and rows[held[0]].notna().any())
+    known = (columns for columns in EFFORT_AXES if columns[0] in rows.columns and rows[columns[0]].notna().any())
     effort = next(known, None)  # columns of the last panel, its middle and its upper end, and its label
     width = len(shown) + (effort is not None)
     figure, axes = panels(len(tasks) * width, width, SWEEP_PANEL)
     numeric = pd.api.types.is_numeric_dtype(rows[variable])
-    draw, place = (_line, _numbers) if numeric else (_bars, _categories)
+    draw, locate = (_line, _numbers) if numeric else (_bars, _categories)
     colours = solver_colours(rows["solver"])
     for i, (title, task) in enumerate(tasks):
         row = axes[i * width : (i + 1) * width]
-        values = place(row, task["value"])
-        for j, (solver, held) in enumerate(task.groupby("solver", sort=False)):
-            x = held["value"].map(values).to_numpy(dtype=float)
+        values = locate(row, task["value"])
+        for j, (solver, group) in enumerate(task.groupby("solver", sort=False)):
+            x = group["value"].map(values).to_numpy(dtype=float)
             order = np.argsort(x)
-            held, x = held.iloc[order], x[order]
+            group, x = group.iloc[order], x[order]
             side = (j, task["solver"].nunique())
             for ax, name in zip(row, shown, strict=False):
-                draw(ax, x, *_interval(held, name), colours[solver], side)
+                draw(ax, x, *_interval(group, name), colours[solver], side)
             if effort is not None:
-                middle, high = (held[name].to_numpy(dtype=float) for name in effort[:2])
+                middle, high = (group[name].to_numpy(dtype=float) for name in effort[:2])
                 (_line if numeric else _points)(row[-1], x, middle, middle, high, colours[solver], side)
                 row[-1].set_ylabel(effort[2])
         for ax, name in zip(row, shown, strict=False):
@@ -128,9 +128,9 @@ def _words(variable: str) -> str:
     return WORDS.get(variable, variable.split(".")[-1].replace("_", " "))
 
 
-def _interval(held: Mapping[str, Any] | pd.DataFrame, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _interval(values: Mapping[str, Any] | pd.DataFrame, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The low end, the rate and the high end of an outcome, of a row or in the rows of a summary."""
-    low, rate, high = (np.asarray(held[f"{name}_{part}"], dtype=float) for part in ("low", "rate", "high"))
+    low, rate, high = (np.asarray(values[f"{name}_{suffix}"], dtype=float) for suffix in ("low", "rate", "high"))
     # Rounding can put an end of the interval slightly inside the rate at 0 and at 1.
     return np.minimum(low, rate), rate, np.maximum(high, rate)
 
@@ -144,12 +144,12 @@ def _as_rate(ax: Axes, name: str, low: float = -0.02, high: float = 1.02) -> Non
 
 def _numbers(row: list[Axes], values: pd.Series) -> dict[object, float]:
     """Set the axes for the numbers of a column; returns the place of each."""
-    found = sorted(float(value) for value in values.unique())
+    numbers = sorted(float(value) for value in values.unique())
     for ax in row:
-        if found[0] > 0 and found[-1] / found[0] >= DECADES:
+        if numbers[0] > 0 and numbers[-1] / numbers[0] >= DECADES:
             ax.set_xscale("log")
-        if len(found) <= TICKS:
-            ax.set_xticks(found, [f"{value:g}" for value in found])
+        if len(numbers) <= TICKS:
+            ax.set_xticks(numbers, [f"{value:g}" for value in numbers])
             ax.xaxis.set_minor_locator(NullLocator())
             ax.xaxis.set_minor_formatter(NullFormatter())
     return {value: float(value) for value in values.unique()}
@@ -157,12 +157,12 @@ def _numbers(row: list[Axes], values: pd.Series) -> dict[object, float]:
 
 def _categories(row: list[Axes], values: pd.Series) -> dict[object, float]:
     """Name the groups of bars on the axes; returns the middle of each group."""
-    found = [str(value) for value in values.unique()]
-    names = [name if len(name) <= GROUP_LETTERS else f"...{name[-GROUP_LETTERS:]}" for name in found]
+    labels = [str(value) for value in values.unique()]
+    names = [name if len(name) <= GROUP_LETTERS else f"...{name[-GROUP_LETTERS:]}" for name in labels]
     turned = {"rotation": 20, "ha": "right"} if sum(map(len, names)) > 30 else {}
     for ax in row:
-        ax.set_xticks(range(len(found)), names, fontsize=SMALL, **turned)
-        ax.set_xlim(-0.5, len(found) - 0.5)
+        ax.set_xticks(range(len(labels)), names, fontsize=SMALL, **turned)
+        ax.set_xlim(-0.5, len(labels) - 0.5)
     return {value: float(i) for i, value in enumerate(values.unique())}
 
 

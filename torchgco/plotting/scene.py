@@ -79,8 +79,8 @@ def scene_of(layouts: Arrays, body: BoundBody | None = None, position: slice | N
 
     def point(name: str) -> np.ndarray:
         states = np.asarray(layouts.get(name, np.full(d, np.nan)), dtype=float)
-        at = slice(d) if position is None or states.shape[-1] == d else position
-        return np.broadcast_to(states[..., at], (count, d))
+        columns = slice(d) if position is None or states.shape[-1] == d else position
+        return np.broadcast_to(states[..., columns], (count, d))
 
     return Scene(
         bodies=tuple(bodies(layouts, i) for i in range(count)),
@@ -117,12 +117,12 @@ def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
     An obstacle at rest is passed where the path has its x (where it has it several times, at the closest of these
     knots), a moving one where it comes closest.
     """
-    path, found = flown(path), []
+    path, closest = flown(path), []
     t = scene.dt * np.arange(len(path))
     step = np.abs(np.diff(path[:, 0])).max(initial=0.0)
     for body in scene.bodies[i]:
         if len(path) == 0:
-            found.append(Pass(body.at(0.0), 0.0, 0.0))
+            closest.append(Pass(body.at(0.0), 0.0, 0.0))
             continue
         apart = body.distance(path, t)
         k = int(apart.argmin())
@@ -130,8 +130,8 @@ def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
         if not body.moving:
             along = np.abs(path[:, 0] - body.center[0])
             k = int(np.where(along <= along.min() + 0.5 * step, apart, np.inf).argmin())
-        found.append(Pass(path[k], float(t[k]), least))
-    return found
+        closest.append(Pass(path[k], float(t[k]), least))
+    return closest
 
 
 def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
@@ -152,8 +152,8 @@ def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None =
         for body in scene.bodies[i]:
             reach = CONTACT_FACTOR * (body.radius + margin)
             depth = np.maximum(depth, reach - body.along(ball, scene.dt * knots, reach))
-        if (own := scene.map_of(i)) is not None:
-            depth = np.maximum(depth, map_depth(own, ball, margin))
+        if (field := scene.map_of(i)) is not None:
+            depth = np.maximum(depth, map_depth(field, ball, margin))
     return deepest(places, depth)
 
 
@@ -215,6 +215,6 @@ def _extent(body: Solid, margin: float) -> np.ndarray:
 
 def _corners(points: list[np.ndarray]) -> np.ndarray | None:
     """Lower and upper corner of the finite ones among (., d) points; None if there are none."""
-    finite = [part[np.isfinite(part).all(axis=1)] for part in points]
-    held = np.concatenate([np.empty((0, points[0].shape[1])), *finite]) if points else np.empty((0, 0))
-    return np.stack([held.min(axis=0), held.max(axis=0)]) if len(held) else None
+    finite = [array[np.isfinite(array).all(axis=1)] for array in points]
+    stacked = np.concatenate([np.empty((0, points[0].shape[1])), *finite]) if points else np.empty((0, 0))
+    return np.stack([stacked.min(axis=0), stacked.max(axis=0)]) if len(stacked) else None

@@ -21,7 +21,7 @@ DRAWN = 9  # knots of a trajectory at which a body is drawn
 
 def body_of(problem: Problem) -> BoundBody | None:
     """Obstacles whose vehicle is a body, the first ones; None where there are none."""
-    return next((part.body for part in problem.obstacles if part.body is not None), None)
+    return next((obstacles.body for obstacles in problem.obstacles if obstacles.body is not None), None)
 
 
 def balls_at(body: BoundBody, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +46,7 @@ def silhouettes(body: BoundBody, X: np.ndarray, plane: Plane) -> list[np.ndarray
     corners = np.array(list(product(*zip(*body.box, strict=True))))
     turned = rotations(body, X) @ corners.T
     places = np.asarray(X)[:, None, body.position] + turned.swapaxes(-1, -2)
-    seen = [place[:, list(plane)] for place in places]
+    seen = [vertices[:, list(plane)] for vertices in places]
     return [points[ConvexHull(points).vertices] for points in seen]
 
 
@@ -57,11 +57,11 @@ def rotations(body: BoundBody, X: np.ndarray) -> np.ndarray:
 
 def draw_body(ax: Axes, body: BoundBody, X: np.ndarray, plane: Plane, colour: Any, zorder: float = 2.8) -> None:
     """Draw the body at some of the states X (K, n), the first and the last among them."""
-    some = np.unique(np.linspace(0, len(X) - 1, min(len(X), DRAWN)).round().astype(int)) if len(X) else []
+    knots = np.unique(np.linspace(0, len(X) - 1, min(len(X), DRAWN)).round().astype(int)) if len(X) else []
     look: dict[str, Any] = {"facecolor": "none", "edgecolor": colour, "linewidth": 0.7, "alpha": 0.7}
     if body.box is not None:
         look = {"facecolor": (*to_rgb(colour), 0.06), "edgecolor": (*to_rgb(colour), 0.75), "linewidth": 0.9}
-    ax.add_collection(PolyCollection(silhouettes(body, np.asarray(X)[some], plane), zorder=zorder, **look), False)
+    ax.add_collection(PolyCollection(silhouettes(body, np.asarray(X)[knots], plane), zorder=zorder, **look), False)
 
 
 def _states(body: BoundBody, X: np.ndarray) -> torch.Tensor:

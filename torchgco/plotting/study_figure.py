@@ -150,7 +150,7 @@ def _rates(ax: Axes, summary: pd.DataFrame) -> None:
             if not row[f"{name}_n"]:
                 continue
             x = j + (i - 0.5 * (len(summary) - 1)) * step
-            rate, low, high = (float(row[f"{name}_{part}"]) for part in ("rate", "low", "high"))
+            rate, low, high = (float(row[f"{name}_{suffix}"]) for suffix in ("rate", "low", "high"))
             spread = [[max(rate - low, 0.0)], [max(high - rate, 0.0)]]
             look: dict[str, Any] = {"color": colours[str(row["solver"])], "capsize": 2, "elinewidth": 0.9}
             ax.errorbar(x, rate, spread, fmt="o", markersize=6, **look)

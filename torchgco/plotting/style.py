@@ -50,9 +50,9 @@ class NotebookFigure(Figure):
     """A figure that notebooks show, also where nobody has loaded pyplot."""
 
     def _repr_png_(self) -> bytes:
-        held = BytesIO()
-        _save_png(self, held, IN_NOTEBOOKS)
-        return held.getvalue()
+        buffer = BytesIO()
+        _save_png(self, buffer, IN_NOTEBOOKS)
+        return buffer.getvalue()
 
 
 def solver_colours(solvers: Iterable[str]) -> dict[str, str]:
@@ -165,7 +165,7 @@ def save(
 
 def _save_png(figure: Figure, path: Path | IO[bytes], dpi: int) -> None:
     """As `savefig`, which draws everything once more than it is seen, to lay the axes out."""
-    own, colour = figure.dpi, figure.get_facecolor()
+    former_dpi, colour = figure.dpi, figure.get_facecolor()
     figure.set_dpi(dpi)
     figure.set_facecolor("white")
     try:
@@ -173,5 +173,5 @@ def _save_png(figure: Figure, path: Path | IO[bytes], dpi: int) -> None:
         canvas.draw()
         Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).save(path, format="png", dpi=(dpi, dpi))
     finally:
-        figure.set_dpi(own)
+        figure.set_dpi(former_dpi)
         figure.set_facecolor(colour)

@@ -45,45 +45,45 @@ def world_of(problem: Problem, b: int) -> World:
     Raises:
         InputError: dynamics without a position.
     """
-    one = problem.take(torch.tensor([b], device=problem.x0.device))
+    single = problem.take(torch.tensor([b], device=problem.x0.device))
     by_radius: dict[float, list[Solid]] = {}
     others, maps = [], []
-    for whole in one.obstacles:
-        part = whole.inscribed
-        vehicle = 0.0 if whole.body is not None else float(part.vehicle_radius[0])  # its balls are drawn instead
-        if part.map is not None:
-            maps.append((vehicle, part.map.field.single(int(part.map.which[0]))))
-        elif (shapes := part.shapes(0)) is not None:
+    for whole in single.obstacles:
+        core = whole.inscribed
+        vehicle = 0.0 if whole.body is not None else float(core.vehicle_radius[0])  # its balls are drawn instead
+        if core.map is not None:
+            maps.append((vehicle, core.map.field.single(int(core.map.which[0]))))
+        elif (shapes := core.shapes(0)) is not None:
             by_radius.setdefault(vehicle, []).extend(_bodies(shapes))
         else:
-            others.append(part)
-    start = one.x0[:, one.position].cpu().numpy()
+            others.append(core)
+    start = single.x0[:, single.position].cpu().numpy()
     goal, radius = np.full_like(start, np.nan), np.nan
-    if one.goal is not None:
-        goal, radius = one.goal.position.cpu().numpy(), float(one.goal.radius[0])
-    dt = float(getattr(one.dynamics, "dt", None) or 0.0)
+    if single.goal is not None:
+        goal, radius = single.goal.position.cpu().numpy(), float(single.goal.radius[0])
+    dt = float(getattr(single.dynamics, "dt", None) or 0.0)
     none: dict[float, list[Solid]] = {} if maps else {0.0: []}
     scenes = [
-        Scene((tuple(held),), start, goal, vehicle, radius, dt, np.array([b]))
-        for vehicle, held in (by_radius or none).items()
+        Scene((tuple(bodies),), start, goal, vehicle, radius, dt, np.array([b]))
+        for vehicle, bodies in (by_radius or none).items()
     ]
     scenes += [Scene(((),), start, goal, vehicle, radius, dt, np.array([b]), field) for vehicle, field in maps]
-    return World(tuple(scenes), tuple(others), tuple(one.obstacles), body_of(one))
+    return World(tuple(scenes), tuple(others), tuple(single.obstacles), body_of(single))
 
 
 def _bodies(shapes: RoundedBoxes) -> list[Solid]:
     M, d = shapes.center.shape
     velocities = np.zeros((M, d)) if shapes.velocity is None else shapes.velocity
-    found: list[Solid] = []
+    bodies: list[Solid] = []
     for i in range(M):
         center, half, radius, velocity = shapes.center[i], shapes.half[i], float(shapes.radius[i]), velocities[i]
         swing = None if shapes.sines is None else shapes.sines[:, i]
         track = None if shapes.track is None else Track(shapes.track[:, i], shapes.step)
         if half.any() or swing is not None:
-            found.append(Box(center, half, shapes.sides[i], radius, swing, velocity, track))
+            bodies.append(Box(center, half, shapes.sides[i], radius, swing, velocity, track))
         else:
-            found.append(Ball(center, radius, velocity, track))
-    return found
+            bodies.append(Ball(center, radius, velocity, track))
+    return bodies
 
 
 def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, at: float) -> tuple[np.ndarray, ...]:

@@ -55,8 +55,8 @@ def stages_for(way: float, pace: float, dt: float) -> int:
 def stages(value: Any, count: int) -> int | np.ndarray | None:
     """The number of stages, or where layouts differ (count,) int64 of them."""
     if value is None or np.ndim(value) == 0:
-        held = scalar("stages", value)
-        return None if held is None else int(held)
+        number = scalar("stages", value)
+        return None if number is None else int(number)
     numbers = array(value, "layouts.stages")
     whole = numbers.shape == (count,) and bool((numbers == np.round(numbers)).all())
     if not whole or not ((numbers >= 1) & (numbers <= MOST_STAGES)).all():
@@ -68,10 +68,10 @@ def scalar(name: str, value: Any) -> float | int | None:
     """A number that layouts share, as a file holds it: also an array without axes, and stages as a float."""
     if value is None:
         return None
-    held = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
-    whole = name == "stages" and isinstance(held, float) and held.is_integer()
-    held = check_value(int(held) if whole else held, SCALARS[name], f"layouts.{name}")
-    return held if name == "stages" else float(held)
+    number = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    whole = name == "stages" and isinstance(number, float) and number.is_integer()
+    number = check_value(int(number) if whole else number, SCALARS[name], f"layouts.{name}")
+    return number if name == "stages" else float(number)
 
 
 def plain(value: Any) -> Any:
@@ -161,23 +161,23 @@ def boxes(centers: Any, halves: Any, turns: Any, radii: Any, like: np.ndarray) -
 def sines(values: Sequence[Any], centers: np.ndarray | None) -> tuple[np.ndarray | None, ...]:
     """Amplitudes, rates and phases (L, K, S, d) of boxes, NaN where there is no box; or None."""
     names = ("layouts.box_amplitudes", "layouts.box_rates", "layouts.box_phases")
-    given = [name for name, value in zip(names, values, strict=True) if value is not None]
-    if not given:
+    present = [name for name, value in zip(names, values, strict=True) if value is not None]
+    if not present:
         return None, None, None
     if centers is None:
-        raise InputError(given[0], "none without box_centers", "some")
-    found = []
+        raise InputError(present[0], "none without box_centers", "some")
+    arrays = []
     for name, value in zip(names, values, strict=True):
         if value is None:
-            raise InputError(name, f"this array with {given[0].removeprefix('layouts.')}", "none")
-        part, (count, boxes, d) = array(value, name), centers.shape
-        if part.ndim != 4 or part.shape != (count, boxes, part.shape[2], d):
-            raise InputError(name, f"shape ({count}, {boxes}, S, {d})", f"shape {part.shape}")
-        if found and part.shape != found[0].shape:
-            raise InputError(name, f"shape {found[0].shape} as box_amplitudes", f"shape {part.shape}")
-        good = np.isfinite(part).all(axis=(2, 3))
-        found.append(_present(part, good, centers, name, "finite numbers where the centre is finite"))
-    return tuple(found)
+            raise InputError(name, f"this array with {present[0].removeprefix('layouts.')}", "none")
+        numbers, (count, boxes, d) = array(value, name), centers.shape
+        if numbers.ndim != 4 or numbers.shape != (count, boxes, numbers.shape[2], d):
+            raise InputError(name, f"shape ({count}, {boxes}, S, {d})", f"shape {numbers.shape}")
+        if arrays and numbers.shape != arrays[0].shape:
+            raise InputError(name, f"shape {arrays[0].shape} as box_amplitudes", f"shape {numbers.shape}")
+        good = np.isfinite(numbers).all(axis=(2, 3))
+        arrays.append(_present(numbers, good, centers, name, "finite numbers where the centre is finite"))
+    return tuple(arrays)
 
 
 def _turns(value: Any, centers: np.ndarray) -> np.ndarray:
@@ -197,16 +197,16 @@ def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
     """Finite states (L, n), n >= d, from one state (n,) for all layouts or one each (L, n)."""
     if value is None:
         return None
-    given = array(value, field)
+    rows = array(value, field)
     count, _, dimension = centers.shape
-    fits = given.ndim == 1 or (given.ndim == 2 and given.shape[0] == count)
-    if not fits or given.shape[-1] < dimension:
+    fits = rows.ndim == 1 or (rows.ndim == 2 and rows.shape[0] == count)
+    if not fits or rows.shape[-1] < dimension:
         expected = f"shape (n,) or ({count}, n) with n >= {dimension}"
-        raise InputError(field, expected, f"shape {given.shape}")
-    given = np.tile(given, (count, 1)) if given.ndim == 1 else given
-    _none_of(~np.isfinite(given).all(axis=1), field, "finite states", given)
-    _bounded(given, field)
-    return given
+        raise InputError(field, expected, f"shape {rows.shape}")
+    rows = np.tile(rows, (count, 1)) if rows.ndim == 1 else rows
+    _none_of(~np.isfinite(rows).all(axis=1), field, "finite states", rows)
+    _bounded(rows, field)
+    return rows
 
 
 def gates(centers: Any, radii: Any, like: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -238,21 +238,21 @@ def free_time(value: Any, velocities: np.ndarray | None) -> np.ndarray | None:
     """(least, most, weight): factors of the stages' length, and the cost of a second; only where nothing moves."""
     if value is None:
         return None
-    given = array(value, "layouts.free_time")
-    if given.shape != (3,) or not np.isfinite(given).all():
-        raise InputError("layouts.free_time", "three numbers: least, most, weight", given.tolist())
-    least, most, weight = given.tolist()
+    numbers = array(value, "layouts.free_time")
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise InputError("layouts.free_time", "three numbers: least, most, weight", numbers.tolist())
+    least, most, weight = numbers.tolist()
     if not 0 < least <= most or weight < 0:
-        raise InputError("layouts.free_time", "0 < least <= most, and a weight of at least 0", given.tolist())
+        raise InputError("layouts.free_time", "0 < least <= most, and a weight of at least 0", numbers.tolist())
     if velocities is not None and bool(np.nan_to_num(velocities).any()):
         raise InputError("layouts.free_time", "None where spheres move: a study's pictures show given times", "a time")
-    return given
+    return numbers
 
 
 def required(value: Any) -> bool | None:
     """Whether the goal is a constraint, as a file holds it: also an array without axes."""
-    held = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
-    return None if held is None else check_value(held, bool, "layouts.goal_required")
+    flag = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    return None if flag is None else check_value(flag, bool, "layouts.goal_required")
 
 
 def control_bounds(lower: Any, upper: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -287,16 +287,16 @@ def best_cost(value: Any, count: int) -> np.ndarray | None:
 def ids(value: Any, count: int) -> np.ndarray:
     """Ids (L,) >= 0 as int64; None or an empty array stands for 0..L-1."""
     try:
-        given = np.asarray(() if value is None else value)
+        numbers = np.asarray(() if value is None else value)
     except ValueError:  # rows of unequal lengths
-        given = np.asarray(None)
-    if given.size == 0:
+        numbers = np.asarray(None)
+    if numbers.size == 0:
         return np.arange(count)
-    if given.shape != (count,) or not np.issubdtype(given.dtype, np.integer) or given.min() < 0:
-        numeric = given.dtype.kind in "iuf"
-        got = f"{given.dtype} of shape {given.shape}" + (f", from {given.min()}" if numeric else "")
+    if numbers.shape != (count,) or not np.issubdtype(numbers.dtype, np.integer) or numbers.min() < 0:
+        numeric = numbers.dtype.kind in "iuf"
+        got = f"{numbers.dtype} of shape {numbers.shape}" + (f", from {numbers.min()}" if numeric else "")
         raise InputError("layouts.ids", f"integers >= 0 of shape ({count},)", got)
-    return given.astype(np.int64)
+    return numbers.astype(np.int64)
 
 
 def _absent(centers: np.ndarray, field: str) -> np.ndarray:
@@ -309,10 +309,10 @@ def _absent(centers: np.ndarray, field: str) -> np.ndarray:
 
 def _of_each(value: Any, field: str, shape: tuple[int, ...], expected: str | None = None) -> np.ndarray:
     """Numbers of this shape."""
-    held = array(value, field)
-    if held.shape != shape:
-        raise InputError(field, expected or f"shape {shape}", held.shape)
-    return held
+    numbers = array(value, field)
+    if numbers.shape != shape:
+        raise InputError(field, expected or f"shape {shape}", numbers.shape)
+    return numbers
 
 
 def _present(values: np.ndarray, good: Any, centers: np.ndarray, field: str, expected: str) -> np.ndarray:
@@ -332,5 +332,5 @@ def _bounded(values: np.ndarray, field: str) -> None:
 def _none_of(bad: Any, field: str, expected: str, values: np.ndarray) -> None:
     """Raise InputError that shows the first of `values` where `bad` is true."""
     if bad.any():
-        place = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise InputError(field, expected, f"{values[place].tolist()} at {list(place)}")
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise InputError(field, expected, f"{values[index].tolist()} at {list(index)}")

@@ -202,9 +202,9 @@ class Floors(Scenario):
                 opening = self._door(rng, axis, begin, end)
                 canvas.fill(*opening, False)
                 openings.append(opening)
-            one, other = last.copy(), first.copy()
-            one[axis], other[axis] = begin[axis], end[axis]
-            left += [(first, one), (other, last)]
+            lower_end, upper_begin = last.copy(), first.copy()
+            lower_end[axis], upper_begin[axis] = begin[axis], end[axis]
+            left += [(first, lower_end), (upper_begin, last)]
         for _ in range(rng.poisson(self.furniture * float(np.prod(high - low)))):
             self._piece(rng, canvas, low, high, openings)
 

@@ -86,7 +86,7 @@ class GateForest(Quadrotor):
         if spheres > checks.MOST_OBSTACLES:
             expected = f"at most {checks.MOST_OBSTACLES} spheres around a course"
             raise InputError("scenario.density", expected, f"{self.density}, which makes {spheres}")
-        keep_clear = [(place.tolist(), self.clearance) for place in places]
+        keep_clear = [(point.tolist(), self.clearance) for point in places]
         centers = uniform_clear(rng, np.column_stack([low, high]).tolist(), spheres, keep_clear)
         drawn = self._layout(
             **equal_spheres(centers, self.obstacle_radius),
@@ -103,13 +103,13 @@ class GateForest(Quadrotor):
             for _ in range(MAX_DRAWS):
                 turned, far = rng.uniform(-self.turn, self.turn), rng.uniform(*self.spacing)
                 ahead = places[-1][:2] + far * np.array([np.cos(turned), np.sin(turned)])
-                place = np.append(ahead, rng.uniform(*self.heights))
-                near = min(float(np.linalg.norm(place - other)) for other in places)
+                point = np.append(ahead, rng.uniform(*self.heights))
+                near = min(float(np.linalg.norm(point - other)) for other in places)
                 if abs(ahead[1]) <= self.width and near >= self.spacing[0]:
                     break
             else:
                 raise InputError("scenario.width", "room for the course", f"{self.width} m")
-            places.append(place)
+            places.append(point)
         return np.stack(places)
 
 

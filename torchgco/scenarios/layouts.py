@@ -161,7 +161,7 @@ class Layouts:
         if self.free_time is not None:
             kinds = self.alike()
         size = most or self.count
-        return [some[first : first + size] for some in kinds for first in range(0, len(some), size)]
+        return [group[first : first + size] for group in kinds for first in range(0, len(group), size)]
 
     @property
     def gate_counts(self) -> np.ndarray | None:
@@ -180,11 +180,11 @@ class Layouts:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays that a file of these layouts holds, by name, without those that are None."""
-        held = {name: np.asarray(getattr(self, name)) for name in NAMED_ARRAYS if getattr(self, name) is not None}
-        held |= {} if self.map is None else map_arrays(self.map)
+        arrays = {name: np.asarray(getattr(self, name)) for name in NAMED_ARRAYS if getattr(self, name) is not None}
+        arrays |= {} if self.map is None else map_arrays(self.map)
         if not np.array_equal(self.ids, np.arange(self.count)):
-            held[IDS] = self.ids
-        return held
+            arrays[IDS] = self.ids
+        return arrays
 
     def __eq__(self, other: object) -> bool:
         """Same name, same ids and the same arrays; an absent obstacle (NaN) equals an absent one."""
@@ -203,11 +203,11 @@ class Layouts:
         if index.max() >= self.count:
             raise InputError("layouts.take", f"positions in 0..{self.count - 1}", int(index.max()))
         rows = (*SPHERES, *BOXES, *SINES, *GATES, "start", "goal", "best_cost", "ids")
-        held = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
-        held = {name: value[index] for name, value in held.items()}
+        arrays = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
+        arrays = {name: value[index] for name, value in arrays.items()}
         if isinstance(self.stages, np.ndarray):
-            held["stages"] = self.stages[index]
-        return replace(self, map=None if self.map is None else self.map.take(index), **held)
+            arrays["stages"] = self.stages[index]
+        return replace(self, map=None if self.map is None else self.map.take(index), **arrays)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the arrays to `path` (npz): all of it or, if interrupted, nothing."""
@@ -225,19 +225,19 @@ class Layouts:
         """
         free = free_memory()
         limit = limit if room < free else "of free memory"
-        held = read_arrays(path, "scenario.path", "a layout file", room=min(room, free), limit=limit)
+        arrays = read_arrays(path, "scenario.path", "a layout file", room=min(room, free), limit=limit)
         path = Path(path)
-        held = _without_spheres(held) | held
+        arrays = _without_spheres(arrays) | arrays
         for name in REQUIRED:
-            if name not in held:
-                raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(held)}")
+            if name not in arrays:
+                raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(arrays)}")
         known = (*NAMED_ARRAYS, *stored_maps.MAP_ARRAYS, IDS)
-        for name in held:
+        for name in arrays:
             if name not in known:
                 raise InputError(f"layouts.{name}", f"only {', '.join(known)}", f"this one in {path}")
-        ids = held.pop(IDS, np.empty(0, np.int64))
-        there = {name: held.pop(name) for name in stored_maps.MAP_ARRAYS if name in held}
-        return cls(**held, map=map_of(there), name=path.stem, ids=ids)  # type: ignore[arg-type]
+        ids = arrays.pop(IDS, np.empty(0, np.int64))
+        there = {name: arrays.pop(name) for name in stored_maps.MAP_ARRAYS if name in arrays}
+        return cls(**arrays, map=map_of(there), name=path.stem, ids=ids)  # type: ignore[arg-type]
 
 
 def _equal(a: np.ndarray, b: np.ndarray) -> bool:
@@ -245,10 +245,10 @@ def _equal(a: np.ndarray, b: np.ndarray) -> bool:
     return np.array_equal(a, b, equal_nan=a.dtype.kind == b.dtype.kind == "f")
 
 
-def _without_spheres(held: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _without_spheres(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Arrays of no spheres for a file that holds boxes alone; none for other files."""
-    shape = held["box_centers"].shape if "box_centers" in held else ()
-    if len(shape) != 3 or any(name in held for name in REQUIRED):
+    shape = arrays["box_centers"].shape if "box_centers" in arrays else ()
+    if len(shape) != 3 or any(name in arrays for name in REQUIRED):
         return {}
     return {"centers": np.empty((shape[0], 0, shape[2])), "radii": np.empty((shape[0], 0))}
 
@@ -286,61 +286,61 @@ def _joined(parts: Sequence[Layouts], names: Sequence[str]) -> dict[str, Any]:
     Args:
         names: of arrays with the same rows; the first holds their places.
     """
-    counts = [0 if (places := getattr(part, names[0])) is None else places.shape[1] for part in parts]
+    counts = [0 if (places := getattr(batch, names[0])) is None else places.shape[1] for batch in parts]
     joined = {}
     for name in names if max(counts) or names == SPHERES else ():
-        held = [getattr(part, name) for part in parts]
-        if all(value is None for value in held):
+        arrays = [getattr(batch, name) for batch in parts]
+        if all(value is None for value in arrays):
             continue
-        rows = zip(parts, counts, held, strict=True)
-        held = [_unmoved(name, part, count) if value is None else value for part, count, value in rows]
+        rows = zip(parts, counts, arrays, strict=True)
+        arrays = [_unmoved(name, batch, count) if value is None else value for batch, count, value in rows]
         if name in SINES:  # as many for each
-            most = max(value.shape[2] for value in held)
-            held = [np.pad(value, [(0, 0), (0, 0), (0, most - value.shape[2]), (0, 0)]) for value in held]
-        behind = [[(0, 0), (0, max(counts) - value.shape[1]), (0, 0), (0, 0)][: value.ndim] for value in held]
-        padded = [np.pad(value, by, constant_values=np.nan) for value, by in zip(held, behind, strict=True)]
+            most = max(value.shape[2] for value in arrays)
+            arrays = [np.pad(value, [(0, 0), (0, 0), (0, most - value.shape[2]), (0, 0)]) for value in arrays]
+        behind = [[(0, 0), (0, max(counts) - value.shape[1]), (0, 0), (0, 0)][: value.ndim] for value in arrays]
+        padded = [np.pad(value, by, constant_values=np.nan) for value, by in zip(arrays, behind, strict=True)]
         joined[name] = np.concatenate(padded)
     return joined
 
 
-def _unmoved(name: str, part: Layouts, count: int) -> np.ndarray:
+def _unmoved(name: str, batch: Layouts, count: int) -> np.ndarray:
     """What an array that a part lacks would hold of `count` obstacles: they are at rest, sharp and not turned."""
     if name in SINES:
-        return np.zeros((part.count, count, 0, part.dimension))
-    if name == "box_rotations" and part.dimension == 3:
-        return np.tile((1.0, 0.0, 0.0, 0.0), (part.count, count, 1))
+        return np.zeros((batch.count, count, 0, batch.dimension))
+    if name == "box_rotations" and batch.dimension == 3:
+        return np.tile((1.0, 0.0, 0.0, 0.0), (batch.count, count, 1))
     flat = name in ("box_rotations", "box_radii", "gate_radii")
-    return np.zeros((part.count, count) if flat else (part.count, count, part.dimension))
+    return np.zeros((batch.count, count) if flat else (batch.count, count, batch.dimension))
 
 
 def _joined_rows(parts: Sequence[Layouts], name: str) -> np.ndarray | None:
     """An array with a row per layout, NaN in parts without it; None where no part has it."""
-    held = [getattr(part, name) for part in parts]
-    if all(value is None for value in held):
+    arrays = [getattr(batch, name) for batch in parts]
+    if all(value is None for value in arrays):
         return None
     return np.concatenate(
-        [np.full(part.count, np.nan) if x is None else x for part, x in zip(parts, held, strict=True)]
+        [np.full(batch.count, np.nan) if x is None else x for batch, x in zip(parts, arrays, strict=True)]
     )
 
 
 def _joined_stages(parts: Sequence[Layouts]) -> np.ndarray | None:
     """The stages of all layouts, (L,); None where no part has any."""
-    if any(part.stages is None for part in parts):
-        return _same("stages", [part.stages for part in parts])
-    return np.concatenate([np.broadcast_to(np.asarray(part.stages), part.count) for part in parts])
+    if any(batch.stages is None for batch in parts):
+        return _same("stages", [batch.stages for batch in parts])
+    return np.concatenate([np.broadcast_to(np.asarray(batch.stages), batch.count) for batch in parts])
 
 
 def _joined_map(parts: Sequence[Layouts]) -> DistanceField | None:
     """The map that all parts share, or the maps of all layouts."""
-    maps: list[Any] = [part.map for part in parts]
-    if all(one is maps[0] for one in maps):
+    maps: list[Any] = [batch.map for batch in parts]
+    if all(m is maps[0] for m in maps):
         shared = maps[0] is None or maps[0].batch is None or len(parts) == 1
         return maps[0] if shared else DistanceField.joined(maps)
-    maps = [one for one in maps if one is not None]
+    maps = [m for m in maps if m is not None]
     if len(maps) < len(parts):
         raise InputError("layouts.map", "the same in all parts", "none in some")
-    every = [[one] if one.batch is not None else [one] * part.count for one, part in zip(maps, parts, strict=True)]
-    return DistanceField.joined([one for some in every for one in some])
+    every = [[m] if m.batch is not None else [m] * batch.count for m, batch in zip(maps, parts, strict=True)]
+    return DistanceField.joined([m for group in every for m in group])
 
 
 def _same(name: str, values: list[Any]) -> Any:

@@ -80,8 +80,8 @@ class MapFile(Scenario):
         check_options(self, "scenario")
         put("path", os.path.expanduser(self.path))
         put("outside", self.outside or usual_outside(self.path, self.height, "scenario"))
-        found = read(self.path, field="scenario", **{key: getattr(self, key) for key in READ})
-        put("map", DistanceField.of(found, self.unknown))
+        source = read(self.path, field="scenario", **{key: getattr(self, key) for key in READ})
+        put("map", DistanceField.of(source, self.unknown))
         put("name", Path(self.path).stem)
         task = read_task(Path(self.path)) | {
             key: getattr(self, key) for key in ("start", "goal") if getattr(self, key) is not None
@@ -119,31 +119,31 @@ class MapFile(Scenario):
         )  # fmt: skip
 
     def _position(self, value: Any, name: str) -> np.ndarray:
-        place = coordinates(value, f"scenario.{name}")
-        if place.shape != (self.dimension,) or not (np.abs(place) <= checks.TOO_LARGE).all():
+        point = coordinates(value, f"scenario.{name}")
+        if point.shape != (self.dimension,) or not (np.abs(point) <= checks.TOO_LARGE).all():
             expected = f"{self.dimension} coordinates within {checks.TOO_LARGE:g} m, as the map is {self.dimension}-D"
-            raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
+            raise InputError(f"scenario.{name}", expected, shown(point.tolist()))
         source = self.map.source
-        if self.outside == "occupied" and isinstance(source, OccupancyGrid) and not source.holds(place):
+        if self.outside == "occupied" and isinstance(source, OccupancyGrid) and not source.holds(point):
             expected = "a place on the map, around which all is occupied unless scenario.outside=free"
-            raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
-        return place
+            raise InputError(f"scenario.{name}", expected, shown(point.tolist()))
+        return point
 
     def _ends(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Start and goal (d,), the given ones as they are."""
         if self.start is not None and self.goal is not None:
             return self.start, self.goal
-        given = self.goal if self.start is None else self.start
-        places = self._free(given)
+        fixed = self.goal if self.start is None else self.start
+        places = self._free(fixed)
         apart = ENDS_APART * math.dist(places.min(0), places.max(0))
         for _ in range(MAX_DRAWS):
-            first = places[rng.integers(len(places))] if given is None else given
+            first = places[rng.integers(len(places))] if fixed is None else fixed
             second = places[rng.integers(len(places))]
             if math.dist(first, second) >= apart:
                 break
         else:
             second = places[np.linalg.norm(places - first, axis=1).argmax()]
-        return (second, first) if self.start is None and given is not None else (first, second)
+        return (second, first) if self.start is None and fixed is not None else (first, second)
 
     def _stages_between(self, start: np.ndarray, goal: np.ndarray) -> int:
         assert self.vehicle_radius is not None

@@ -53,11 +53,11 @@ class Rooms(Quadrotor):
         if (room - self.thickness <= [max(self.door), max(self.door), self.door[1]]).any():
             raise InputError("scenario.door", "openings that fit into the walls of a room", self.door)
         for name, point in (("start", self.start), ("goal", self.goal)):
-            part = (np.array(point) - low) / room
-            off = np.abs(part - np.round(part)) * room
+            scaled = (np.array(point) - low) / room
+            off = np.abs(scaled - np.round(scaled)) * room
             if (
-                (part < 0).any()
-                or (part > self.rooms).any()
+                (scaled < 0).any()
+                or (scaled > self.rooms).any()
                 or (off <= 0.5 * self.thickness + self.vehicle_radius).any()
             ):
                 raise InputError(f"scenario.{name}", "a point of scenario.region clear of its walls", point)
@@ -81,7 +81,7 @@ class Rooms(Quadrotor):
             a, b = root(room), root(self._next(room, axis) or room)
             joined[a] = b
             boxes += self._wall(room, axis, places[i] if a != b or spare[i] else None)
-        centers, halves = (np.array(part)[None] for part in zip(*boxes, strict=True))
+        centers, halves = (np.array(column)[None] for column in zip(*boxes, strict=True))
         return self._layout(box_centers=centers, box_half_sizes=halves)
 
     def _next(self, room: tuple[int, ...], axis: int) -> tuple[int, ...] | None:
@@ -99,23 +99,23 @@ class Rooms(Quadrotor):
             boxes.append((0.5 * (first + last), 0.5 * (last - first)))
         return boxes
 
-    def _wall(self, room: tuple[int, ...], axis: int, place: np.ndarray | None) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _wall(self, room: tuple[int, ...], axis: int, share: np.ndarray | None) -> list[tuple[np.ndarray, np.ndarray]]:
         """Centres and half sides of the boxes of a room's upper wall along an axis.
 
         Args:
-            place: where its opening is, shares (2,) of the room that it has along the wall's two axes; None: closed.
+            share: where its opening is, shares (2,) of the room that it has along the wall's two axes; None: closed.
         """
         low, high = np.array(self.region).T
         size = (high - low) / self.rooms
         first = low + size * room
         last = first + size
-        at = last[axis]
-        first[axis], last[axis] = at - 0.5 * self.thickness, at + 0.5 * self.thickness
-        if place is None:
+        level = last[axis]
+        first[axis], last[axis] = level - 0.5 * self.thickness, level + 0.5 * self.thickness
+        if share is None:
             return [(0.5 * (first + last), 0.5 * (last - first))]
         across, up = [i for i in range(3) if i != axis]
         inset = 0.5 * (self.thickness + np.array(self.door))
-        middle = first[[across, up]] + inset + place * (size[[across, up]] - 2.0 * inset)
+        middle = first[[across, up]] + inset + share * (size[[across, up]] - 2.0 * inset)
         edge = np.array([middle - 0.5 * np.array(self.door), middle + 0.5 * np.array(self.door)])
         boxes = []
         for begin, end in (

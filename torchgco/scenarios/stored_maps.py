@@ -33,12 +33,12 @@ def map_of(arrays: Mapping[str, np.ndarray]) -> DistanceField | None:
     Raises:
         InputError: arrays of a map of which some are missing or malformed, named `layouts.<array>`.
     """
-    held = [name for name in MAP_ARRAYS if name in arrays]
-    if not held:
+    stored = [name for name in MAP_ARRAYS if name in arrays]
+    if not stored:
         return None
     kind = CLOUD if "map_points" in arrays else GRID
     if missing := [name for name in kind if name not in arrays]:
-        raise InputError(f"layouts.{missing[0]}", f"this array beside {held[0]}", "none")
+        raise InputError(f"layouts.{missing[0]}", f"this array beside {stored[0]}", "none")
     values = [arrays[name] for name in kind]
     if kind is CLOUD:
         return DistanceField.of(PointCloud(*values))

@@ -69,10 +69,10 @@ class Trefoils(Quadrotor):
         for _ in range(MAX_DRAWS):
             near = self._near(parts)
             if not near.any():
-                return self._layout(**{name: part[None] for name, part in parts.items()})
+                return self._layout(**{name: array[None] for name, array in parts.items()})
             again = self._boxes(rng)
-            for name, part in parts.items():
-                part[near] = again[name][near]
+            for name, array in parts.items():
+                array[near] = again[name][near]
         raise InputError(
             "scenario.clearance",
             f"room for {self.num_obstacles} boxes that stay {self.clearance:g} m from start and goal",
@@ -98,8 +98,8 @@ class Trefoils(Quadrotor):
         first, second = (sx / 6.0, sy / 5.0, -sz / 2.0), (sx / 3.0, -2.0 * sy / 5.0, none)
         sines["amplitudes"][:cubes] = np.moveaxis(np.array([first, second]), 2, 0)
         sines["rates"][:cubes] = rate[:, None, None] * np.array([[1.0, 1.0, 3.0], [2.0, 2.0, 0.0]])
-        at = offset[:, None, None] * np.array([[1.0, 1.0, 3.0], [2.0, 2.0, 0.0]])
-        sines["phases"][:cubes] = at + np.array([[0.0, turn, 0.0], [0.0, turn, 0.0]])
+        phase = offset[:, None, None] * np.array([[1.0, 1.0, 3.0], [2.0, 2.0, 0.0]])
+        sines["phases"][:cubes] = phase + np.array([[0.0, turn, 0.0], [0.0, turn, 0.0]])
         return {"box_centers": centers, "box_half_sizes": half, **{f"box_{name}": sines[name] for name in sines}}
 
     def _near(self, parts: dict[str, np.ndarray]) -> np.ndarray:

@@ -144,7 +144,7 @@ class Vehicle:
         """
         frame = check_value(Airframe() if airframe is None else airframe, Airframe, "airframe")
         rest = [0.0] * 3 + [1.0] + [0.0] * 6 + [frame.gravity]  # after the position: v, q, w, a
-        given: dict[str, Any] = {
+        defaults: dict[str, Any] = {
             "name": "quadrotor", "dynamics": QuadrotorPlanning(airframe=frame),
             "state_weight": [1.0, 1, 100, *[1.0] * 7, 10, 10, 10, 10], "control_weight": [10.0, 10, 10, 1],
             "terminal_weight": [1.0, 1, 10, *[1.0] * 11], "control_reference": [0.0, 0, 0, frame.gravity],
@@ -152,7 +152,7 @@ class Vehicle:
             "start": [-1.0, 1, 0, *rest], "goal": [20.0, 1, 0.2, *rest],
             "radius": frame.radius, "goal_radius": 2.0, "stages": 100,
         }  # fmt: skip
-        return cls(**(given | changes))
+        return cls(**(defaults | changes))
 
     def among(self, scenario: Scenario, ids: Iterable[int], seed: int = 0, **where: Any) -> Task:
         """The problems of this vehicle, with its own radius, on layouts of a scenario; `where` as of `task`.
@@ -190,14 +190,14 @@ class Vehicle:
         Raises:
             InputError: none in a place where the dynamics have no limit either.
         """
-        own = getattr(self.dynamics, "control_limits", ([None] * self.dynamics.m,) * 2)[CONTROL_LIMITS.index(name)]
-        found = list[float]()
-        for i, (given, limit) in enumerate(zip(getattr(self, name), own, strict=True)):
-            bound = limit if given is None else given
+        usual = getattr(self.dynamics, "control_limits", ([None] * self.dynamics.m,) * 2)[CONTROL_LIMITS.index(name)]
+        bounds = list[float]()
+        for i, (value, limit) in enumerate(zip(getattr(self, name), usual, strict=True)):
+            bound = limit if value is None else value
             if bound is None:
                 raise InputError(f"vehicle.{name}[{i}]", "a number: the dynamics have no limit here", None)
-            found.append(bound)
-        return found
+            bounds.append(bound)
+        return bounds
 
     def task(self, layouts: Layouts, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64) -> Task:
         """The planning problems of these layouts: quadratic cost to the goal, obstacles, control bounds (section 5).
@@ -212,8 +212,8 @@ class Vehicle:
             raise InputError("dtype", "torch.float64 or torch.float32", repr(dtype))
         device = check_device(device)
         if layouts.dimension != self.dimension:
-            given = layouts.start if layouts.start is not None else layouts.goal
-            wanted = fitting(layouts.dimension, None if given is None else given.shape[1])
+            states = layouts.start if layouts.start is not None else layouts.goal
+            wanted = fitting(layouts.dimension, None if states is None else states.shape[1])
             raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
         whole = self.completed(layouts)
         assert whole.goal_radius is not None and whole.stages is not None
@@ -260,9 +260,9 @@ class Vehicle:
         """Bounds on the states, where there are any."""
         if self.state_lower is None and self.state_upper is None and self.speed is None:
             return []
-        given = (self.state_lower, -inf), (self.state_upper, inf)
+        sides = (self.state_lower, -inf), (self.state_upper, inf)
         lower, upper = (
-            [none if bound is None else bound for bound in side or [None] * self.dynamics.n] for side, none in given
+            [none if bound is None else bound for bound in side or [None] * self.dynamics.n] for side, none in sides
         )
         if self.speed is not None:
             i = self.dynamics.state_names.index("speed")
@@ -286,20 +286,20 @@ class Vehicle:
             InputError: states of another length than the vehicle's.
         """
         layouts = self.at_rest(layouts)
-        own: dict[str, Any] = {"vehicle_radius": self.radius, "goal_radius": self.goal_radius, "stages": self.stages}
-        own = {name: _given(getattr(layouts, name), default) for name, default in own.items()}
-        own |= {name: self._states(layouts, name) for name in ("start", "goal")}
+        values: dict[str, Any] = {"vehicle_radius": self.radius, "goal_radius": self.goal_radius, "stages": self.stages}
+        values = {name: _given(getattr(layouts, name), default) for name, default in values.items()}
+        values |= {name: self._states(layouts, name) for name in ("start", "goal")}
         dt = self.dynamics.dt if layouts.dt is None else layouts.dt
-        return replace(layouts, dt=dt if isinstance(dt, float | int) else None, **own)
+        return replace(layouts, dt=dt if isinstance(dt, float | int) else None, **values)
 
     def at_rest(self, layouts: Layouts) -> Layouts:
         """The layouts with states where they give positions alone: the vehicle's own start or goal, moved there."""
         moved = {}
         for name in ("start", "goal"):
-            given = getattr(layouts, name)
-            if given is not None and given.shape[1] == layouts.dimension == self.dimension:
+            points = getattr(layouts, name)
+            if points is not None and points.shape[1] == layouts.dimension == self.dimension:
                 moved[name] = np.tile(np.array(getattr(self, name), np.float64), (layouts.count, 1))
-                moved[name][:, self.dynamics.position] = given
+                moved[name][:, self.dynamics.position] = points
         return replace(layouts, **moved) if moved else layouts
 
     def _states(self, layouts: Layouts, name: str):

@@ -59,11 +59,11 @@ class Document:
     @classmethod
     def of(cls, problem: Problem, radius: float = 0.0, **given: Any) -> Document:
         """The page of a batch of problems, whose vehicle has a `radius`, m, where there are no obstacles."""
-        shape, at = shape_of(problem), problem.position
-        radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=radius)
-        names = [kind_of(part) for part in problem.constraints]
+        shape, position = shape_of(problem), problem.position
+        radius = max((float(obstacles.vehicle_radius.max()) for obstacles in problem.obstacles), default=radius)
+        names = [kind_of(constraint) for constraint in problem.constraints]
         size = {"radius": radius if shape is None else shape.reach, "shape": shape}
-        return cls(dimension=at.stop - at.start, constraints=names, **size, **given)  # type: ignore[arg-type]
+        return cls(dimension=position.stop - position.start, constraints=names, **size, **given)  # type: ignore[arg-type]
 
     def add(
         self,
@@ -79,12 +79,12 @@ class Document:
         Args:
             times: (N+1,) of the knots, s; None: multiples of `dt`.
         """
-        packing, at = Packing(), problem.position
-        start = problem.x0[b, at].detach().cpu().double().numpy()
+        packing, position = Packing(), problem.position
+        start = problem.x0[b, position].detach().cpu().double().numpy()
         goal = None if problem.goal is None else problem.goal.position[b].cpu().double().numpy()
         middle = start if goal is None else 0.5 * (start + goal)
         names = list(self.solvers)
-        part: dict[str, Any] = {
+        content: dict[str, Any] = {
             "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
             "goal_radius": None if problem.goal is None else number(problem.goal.radius[b]),
             "map": _extent(problem, b), "gates": outlines_of(problem, b),
@@ -94,7 +94,7 @@ class Document:
             "times": None if times is None else packing.put(times, steps=True),
         }  # fmt: skip
         self.labels.append({"label": label, "results": {flight.solver: flight.result for flight in flights}})
-        self.parts.append(packing.sealed(part))
+        self.parts.append(packing.sealed(content))
 
     def ordered(self, places: Sequence[int]) -> None:
         """Put the layouts in another order: first the one at the first of these places."""
@@ -104,25 +104,25 @@ class Document:
         """Obstacles in the layout's part; many of them, as of a map, in a part that layouts of equal ones share."""
         if len(shapes.center) < SHARED_FROM:
             return shapes.packed(packing, middle)
-        own = Packing()
-        text = own.sealed(shapes.packed(own, 0.5 * (shapes.center.min(axis=0) + shapes.center.max(axis=0))))
+        shared = Packing()
+        text = shared.sealed(shapes.packed(shared, 0.5 * (shapes.center.min(axis=0) + shapes.center.max(axis=0))))
         places = list(self.maps)
         key = sha256(text.encode()).digest()
         self.maps.setdefault(key, text)
         return {"shared": places.index(key) if key in places else len(places)}
 
     def _shapes(self, obstacles: Sequence[Obstacles], b: int) -> list[Any]:
-        found = []
-        for part in (part.inscribed for part in obstacles):  # those of a body are the obstacles of each of its balls
-            shapes = shapes_of(part, b)
+        drawn = []
+        for core in (core.inscribed for core in obstacles):  # those of a body are the obstacles of each of its balls
+            shapes = shapes_of(core, b)
             if shapes is None:
-                note = f"not drawn: {type(part).__name__}"
+                note = f"not drawn: {type(core).__name__}"
                 self.notes += [] if note in self.notes else [note]
             elif len(shapes.center):
-                found.append(shapes)
-            if (unknown := unknown_of(part, b)) is not None:
-                found.append(unknown)
-        return found
+                drawn.append(shapes)
+            if (unknown := unknown_of(core, b)) is not None:
+                drawn.append(unknown)
+        return drawn
 
     def head(self) -> str:
         """What holds for all layouts, compressed."""
@@ -139,8 +139,8 @@ class Document:
 
 def _extent(problem: Problem, b: int) -> list[list[float | None]] | None:
     """Lower and upper corner of the maps of a problem, m; None without one."""
-    maps = (part.map for part in problem.obstacles if part.map is not None)
-    fields = [(part.field, int(part.which[b])) for part in maps]
+    maps = (obstacles.map for obstacles in problem.obstacles if obstacles.map is not None)
+    fields = [(map_.field, int(map_.which[b])) for map_ in maps]
     if not fields:
         return None
     low, high = [field.origin[g] for field, g in fields], [field.upper[g] for field, g in fields]
@@ -160,8 +160,8 @@ def outlines_of(problem: Problem, b: int) -> list[list[list[float | None]]]:
     ends = centers[-1:] if problem.goal is None else [problem.goal.position[b].detach().cpu().double().numpy()]
     ways = np.array([*centers[1:], *ends]) - [start, *centers[:-1]]
     rows = zip(gates, centers, ways, strict=True)
-    found = [_ring(center, radius, way) if radius > 0 else corners for (corners, radius), center, way in rows]
-    return [[_numbers(corner) for corner in outline] for outline in found]
+    closed = [_ring(center, radius, way) if radius > 0 else corners for (corners, radius), center, way in rows]
+    return [[_numbers(corner) for corner in outline] for outline in closed]
 
 
 def _ring(center: np.ndarray, radius: float, along: np.ndarray) -> np.ndarray:
@@ -212,5 +212,5 @@ class SearchPart:
 
 
 def _line(packing: Packing, line: Line) -> dict[str, Any]:
-    held = {"kind": line.kind, "group": line.group, "fate": line.fate, "text": line.text}
-    return held | {"points": packing.put(line.points, steps=True)}
+    entry = {"kind": line.kind, "group": line.group, "fate": line.fate, "text": line.text}
+    return entry | {"points": packing.put(line.points, steps=True)}

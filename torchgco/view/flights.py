@@ -61,34 +61,34 @@ class ShownFlight:
 
     def packed(self, packing: Packing, number_of: int) -> dict[str, Any]:
         """As the page reads it, under the number of its solver."""
-        held: dict[str, Any] = {
+        entry: dict[str, Any] = {
             "solver": number_of, "result": self.result, "rows": self.rows, "notes": self.notes,
             "contacts": np.round(self.contacts, 3).tolist(), "path": packing.put(self.path, steps=True),
         }  # fmt: skip
         if self.attitude is not None:
-            held["attitude"] = packing.put(self.attitude)
+            entry["attitude"] = packing.put(self.attitude)
         bad = np.flatnonzero(self.violation > 0)
-        held["violated"] = [[int(k), number(self.violation[k], 3), int(self.worst[k])] for k in bad]
+        entry["violated"] = [[int(k), number(self.violation[k], 3), int(self.worst[k])] for k in bad]
         if self.plan is not None:
-            held["plan"] = packing.put(np.nan_to_num(self.plan), steps=True)
+            entry["plan"] = packing.put(np.nan_to_num(self.plan), steps=True)
         if self.sensed is not None:
-            held["sensed"] = self.sensed.until(len(self.path)).packed(packing, self.path[:, 2])
-        return held
+            entry["sensed"] = self.sensed.until(len(self.path)).packed(packing, self.path[:, 2])
+        return entry
 
 
 def violated(problem: Problem, X: Tensor, U: Tensor, admitted: float) -> tuple[np.ndarray, np.ndarray]:
     """The largest violation (B, N+1) of each knot above `admitted`, and of which constraint; 0 and -1 elsewhere."""
     most = X.new_full((problem.B, problem.N + 1), admitted)
     worst = torch.full_like(most, -1, dtype=torch.int64)
-    for place, part in enumerate(problem.constraints):
-        rows = part.violation(X, U)
+    for index, constraint in enumerate(problem.constraints):
+        rows = constraint.violation(X, U)
         if rows.numel() == 0:
             continue
-        knots = torch.arange(problem.N + 1, device=X.device)[part.knots]
+        knots = torch.arange(problem.N + 1, device=X.device)[constraint.knots]
         largest = rows.flatten(2).amax(-1).nan_to_num(0.0)
         more = largest > most[:, knots]
         most[:, knots] = torch.where(more, largest, most[:, knots])
-        worst[:, knots] = torch.where(more, place, worst[:, knots])
+        worst[:, knots] = torch.where(more, index, worst[:, knots])
     return torch.where(worst < 0, 0.0, most).cpu().numpy(), worst.cpu().numpy()
 
 
@@ -97,9 +97,9 @@ def worst_row(problem: Problem, violation: np.ndarray, worst: np.ndarray) -> Row
     k = int(violation.argmax()) if len(violation) else 0
     if not len(violation) or worst[k] < 0:
         return []
-    part = problem.constraints[worst[k]]
-    unit = " m" if isinstance(part, Obstacles) else ""
-    return [("worst", f"{kind_of(part)}, knot {k}: {violation[k]:.2g}{unit}")]
+    constraint = problem.constraints[worst[k]]
+    unit = " m" if isinstance(constraint, Obstacles) else ""
+    return [("worst", f"{kind_of(constraint)}, knot {k}: {violation[k]:.2g}{unit}")]
 
 
 def whole(X: np.ndarray) -> np.ndarray:
@@ -126,18 +126,18 @@ def flights_of(
         admitted: the violation up to which nothing is marked.
         touching: (B,) bool: where contact is looked for.
     """
-    (violation, worst), found = violated(problem, X, U, admitted), []
+    (violation, worst), flights = violated(problem, X, U, admitted), []
     dt = getattr(problem.dynamics, "dt", None) or 1.0
     states, body = X.detach().cpu().double().numpy(), body_of(problem)
     for b in range(problem.B):
         kept = whole(states[b])
-        path, at = kept[:, problem.position], slice(0, len(kept))
+        path, knots = kept[:, problem.position], slice(0, len(kept))
         places = path[:0]
-        bad, which = violation[b, at], worst[b, at]
+        bad, which = violation[b, knots], worst[b, knots]
         if touching[b] and len(path):
-            part = problem.take(torch.tensor([b], device=X.device))
-            places = contacts(part.obstacles, path, dt, kept)
+            single = problem.take(torch.tensor([b], device=X.device))
+            places = contacts(single.obstacles, path, dt, kept)
         told = [*rows[b], *worst_row(problem, bad, which)]
         attitude = look.attitude(kept) if body is None else turned(body, kept)
-        found.append(ShownFlight(solver, path, attitude, results[b], told, bad, which, places))
-    return found
+        flights.append(ShownFlight(solver, path, attitude, results[b], told, bad, which, places))
+    return flights

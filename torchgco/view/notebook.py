@@ -61,10 +61,10 @@ def _times(problem: Problem, solution: Solution) -> tuple[np.ndarray | None, flo
             t = times(problem)
         except InputError:
             return None, dt
-    held = t.detach().cpu().double().numpy()
-    held = np.broadcast_to(held, (problem.B, problem.N + 1))
+    moments = t.detach().cpu().double().numpy()
+    moments = np.broadcast_to(moments, (problem.B, problem.N + 1))
     even = np.minimum(np.arange(problem.N + 1), np.reshape(problem.stages.cpu().numpy(), (-1, 1))) * dt
-    return (None, dt) if np.allclose(held, even, rtol=0, atol=1e-9 * dt) else (held, dt)
+    return (None, dt) if np.allclose(moments, even, rtol=0, atol=1e-9 * dt) else (moments, dt)
 
 
 def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], np.ndarray]:
@@ -75,10 +75,10 @@ def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], 
         frame = solution.to_frame()
     rows, results = [], []
     for row in frame.to_dict("records"):
-        held: Rows = [("status", str(row["status"])), ("cost", f"{row['cost']:.6g}")]
-        held += [("clearance", f"{row['clearance']:.3f} m")] if np.isfinite(row.get("clearance", np.nan)) else []
-        held += [("violation", f"{row['violation']:.2g}"), ("iterations", str(row["iterations"]))]
-        rows.append(held)
+        entries: Rows = [("status", str(row["status"])), ("cost", f"{row['cost']:.6g}")]
+        entries += [("clearance", f"{row['clearance']:.3f} m")] if np.isfinite(row.get("clearance", np.nan)) else []
+        entries += [("violation", f"{row['violation']:.2g}"), ("iterations", str(row["iterations"]))]
+        rows.append(entries)
         good = bool(row["violation"] <= ADMITTED and not row.get("clearance", 0.0) < 0)
         results.append("reached" if good and row.get("reached", False) else "feasible" if good else "failed")
     clearance = frame["clearance"].to_numpy() if "clearance" in frame else np.full(problem.B, -np.inf)

@@ -36,19 +36,19 @@ class Packing:
         values = np.asarray(values, dtype=float)
         halves = differences(values) if steps else values.clip(-LARGEST_HALF, LARGEST_HALF).astype("<f2")
         raw = np.frombuffer(np.ascontiguousarray(halves).tobytes(), dtype=np.uint8).reshape(-1, 2)
-        place = self.size
+        offset = self.size
         self.planes.append(raw.T.tobytes())
         self.size += raw.size
-        return {KEY: place, "shape": list(values.shape), "steps": steps}
+        return {KEY: offset, "shape": list(values.shape), "steps": steps}
 
     def put_whole(self, values: np.ndarray) -> dict[str, Any]:
         """Keep whole numbers (K,) from 0 up to below 2^32, as the differences between one and the next, modulo 2^32."""
         steps = np.diff(np.asarray(values, dtype=np.uint32), prepend=np.uint32(0))
         raw = np.frombuffer(steps.astype("<u4").tobytes(), dtype=np.uint8).reshape(-1, WHOLE_BYTES)
-        place = self.size
+        offset = self.size
         self.planes.append(raw.T.tobytes())
         self.size += raw.size
-        return {KEY: place, "shape": list(steps.shape), "whole": True}
+        return {KEY: offset, "shape": list(steps.shape), "whole": True}
 
     def sealed(self, text: dict[str, Any]) -> str:
         """Text and arrays in one, compressed, as base64."""
@@ -59,11 +59,11 @@ class Packing:
 
 def differences(values: np.ndarray) -> np.ndarray:
     """Half-precision steps (K, ...) along the first axis, whose sums follow the values (K, ...)."""
-    found, reached = np.empty(values.shape, dtype="<f2"), np.zeros(values.shape[1:])
+    steps, reached = np.empty(values.shape, dtype="<f2"), np.zeros(values.shape[1:])
     for k, value in enumerate(values.clip(-LARGEST_HALF, LARGEST_HALF)):
-        found[k] = (value - reached).clip(-LARGEST_HALF, LARGEST_HALF)
-        reached = reached + found[k].astype(float)
-    return found
+        steps[k] = (value - reached).clip(-LARGEST_HALF, LARGEST_HALF)
+        reached = reached + steps[k].astype(float)
+    return steps
 
 
 def number(value: Any, digits: int = 6) -> float | None:

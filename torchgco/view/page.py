@@ -24,10 +24,10 @@ POLICY = "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsaf
 def page(document: Document) -> str:
     """The text of the file. It asks the network for nothing: its own policy forbids it, too."""
     built = {name: base64.b64encode(zlib.compress(path.read_bytes(), 9)) for name, path in BUILT.items()}
-    scripts = [_text(name, held.decode(), "built") for name, held in built.items()]
+    scripts = [_text(name, content.decode(), "built") for name, content in built.items()]
     scripts += [_text(name, _inert((STATIC / name).read_text()), "module") for name in MODULES]
     data = [_text("head", document.head(), "data")]
-    data += [_text(f"part-{i}", part, "data") for i, part in enumerate(document.parts)]
+    data += [_text(f"part-{i}", text, "data") for i, text in enumerate(document.parts)]
     data += [_text(f"map-{i}", text, "data") for i, text in enumerate(document.maps.values())]
     values = {
         "title": escape(document.title),
@@ -39,7 +39,7 @@ def page(document: Document) -> str:
         "scripts": "\n".join((*scripts, *data)),
     }
     template = (STATIC / "page.html").read_text()
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found[1]], template)
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
 
 
 def _text(name: str, text: str, kind: str) -> str:

@@ -20,11 +20,11 @@ def search_of(solution: Solution, problem: Problem, b: int) -> SearchPart | None
         return None
     passes = [name for _, name, rows in record.passes if b in rows]
     rounds = []
-    for one in record.comparisons:
-        for i in (one.rows == b).nonzero().flatten().tolist():
-            lines = [*_caught(record, problem, b), *_paths(one, i), *_candidates(one, problem, i)]
-            count = int((one.fate[i] != int(Fate.ABSENT)).sum())
-            rounds.append((f"pass {one.number}, {count} candidates", lines))
+    for comparison in record.comparisons:
+        for i in (comparison.rows == b).nonzero().flatten().tolist():
+            lines = [*_caught(record, problem, b), *_paths(comparison, i), *_candidates(comparison, problem, i)]
+            count = int((comparison.fate[i] != int(Fate.ABSENT)).sum())
+            rounds.append((f"pass {comparison.number}, {count} candidates", lines))
     return SearchPart(passes, rounds)
 
 
@@ -36,36 +36,36 @@ def _caught(record: SearchRecord, problem: Problem, b: int) -> list[Line]:
     if record.caught is None:
         return []
     rows, states = record.caught
-    found = (rows == b).nonzero().flatten().tolist()
-    return [Line(whole(_array(states[i]))[:, problem.position], "caught", 0, "", "") for i in found]
+    indices = (rows == b).nonzero().flatten().tolist()
+    return [Line(whole(_array(states[i]))[:, problem.position], "caught", 0, "", "") for i in indices]
 
 
-def _paths(one: Comparison, i: int) -> list[Line]:
+def _paths(comparison: Comparison, i: int) -> list[Line]:
     """The paths of the roadmap that are there, each in its homotopy class."""
-    found = []
-    for path in range(one.paths.shape[1]):
-        corners = whole(_array(one.paths[i, path]))
+    lines = []
+    for path in range(comparison.paths.shape[1]):
+        corners = whole(_array(comparison.paths[i, path]))
         if len(corners) > 1:
-            group = int(one.classes[i, path])
+            group = int(comparison.classes[i, path])
             length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
             same = "" if group == path else f", of the class of path {group + 1}"
-            found.append(Line(corners, "path", group, "", f"path {path + 1}: {length:.2f} m{same}"))
-    return found
+            lines.append(Line(corners, "path", group, "", f"path {path + 1}: {length:.2f} m{same}"))
+    return lines
 
 
-def _candidates(one: Comparison, problem: Problem, i: int) -> list[Line]:
+def _candidates(comparison: Comparison, problem: Problem, i: int) -> list[Line]:
     """The trajectories of each candidate after each step that it reached; its fate is said once, with the last."""
-    found = []
-    for c in range(one.fate.shape[1]):
-        fate = Fate(int(one.fate[i, c]))
+    lines = []
+    for c in range(comparison.fate.shape[1]):
+        fate = Fate(int(comparison.fate[i, c]))
         if fate == Fate.ABSENT:
             continue
-        path, cost = int(one.path[i, c]), float(one.cost[i, c])
-        steps = {step: whole(_array(getattr(one, step)[i, c]))[:, problem.position] for step in SEARCH_STEPS}
+        path, cost = int(comparison.path[i, c]), float(comparison.cost[i, c])
+        steps = {step: whole(_array(getattr(comparison, step)[i, c]))[:, problem.position] for step in SEARCH_STEPS}
         reached = [step for step, points in steps.items() if len(points) > 1]
         told = f"candidate {c + 1} along path {path + 1}: {fate.name.lower()}"
         told += f", cost {cost:.6g}" if np.isfinite(cost) else ""
         for step in reached:
             text = told if step == reached[-1] else ""
-            found.append(Line(steps[step], step, int(one.classes[i, path]), fate.name.lower(), text))
-    return found
+            lines.append(Line(steps[step], step, int(comparison.classes[i, path]), fate.name.lower(), text))
+    return lines

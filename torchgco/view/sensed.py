@@ -43,18 +43,18 @@ class Sensed:
         """
         log, cells, kept = self.seen, int(np.prod(self.seen.shape)), self._kept(heights)
         changes = [
-            np.sort(at[kept[at]].astype(np.int64) + cells * states[kept[at]].astype(np.int64))
-            for at, states in log.changes
+            np.sort(index[kept[index]].astype(np.int64) + cells * states[kept[index]].astype(np.int64))
+            for index, states in log.changes
         ]
         paths = [corners(path) for path in self.sought]
         none = np.zeros(0, np.int64)
         return {
             "corner": log.corner.tolist(), "shape": list(log.shape), "resolution": log.resolution,
             "changes": packing.put_whole(np.concatenate([none, *changes])),
-            "counts": packing.put_whole(np.array([len(part) for part in changes])),
+            "counts": packing.put_whole(np.array([len(change) for change in changes])),
             "paths": packing.put(np.concatenate([np.zeros((0, len(log.shape))), *paths]), steps=True),
             "corners": packing.put_whole(np.array([len(path) for path in paths])),
-            "safe": [int(one) for one in self.safe],
+            "safe": [int(safe) for safe in self.safe],
         }  # fmt: skip
 
     def _kept(self, heights: np.ndarray) -> np.ndarray:
@@ -64,8 +64,8 @@ class Sensed:
         levels = np.floor((heights - log.corner[2]) / log.resolution).clip(0, log.shape[2] - 1).astype(int)
         kept[:, :, levels.min() : levels.max() + 1] = True
         flat = kept.reshape(-1)
-        for at, states in log.changes:
-            flat[at[states == OCCUPIED]] = True
+        for index, states in log.changes:
+            flat[index[states == OCCUPIED]] = True
         return flat
 
 

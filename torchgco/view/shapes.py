@@ -50,14 +50,14 @@ class Shapes:
 
     def packed(self, packing: Packing, middle: np.ndarray) -> dict[str, Any]:
         """As the page reads them; centres count from `middle` (d,), near which half precision is finest."""
-        held: dict[str, Any] = {"count": len(self.center), "until": self.until, "middle": middle.tolist()}
-        held |= {"cells": self.cells, "unknown": self.unknown}
+        entry: dict[str, Any] = {"count": len(self.center), "until": self.until, "middle": middle.tolist()}
+        entry |= {"cells": self.cells, "unknown": self.unknown}
         arrays = {"center": self.center - middle, "half": self.half, "radius": self.radius, "turn": self.turn}
         arrays["velocity"] = self.velocity
         if self.track is not None:
-            held |= {"knots": len(self.track), "step": self.step}
+            entry |= {"knots": len(self.track), "step": self.step}
             arrays["track"] = (self.track - middle).reshape(-1, self.track.shape[-1])
-        return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}
+        return entry | {name: packing.put(once(array)) for name, array in arrays.items() if array is not None}
 
 
 def once(rows: np.ndarray) -> np.ndarray:
@@ -65,9 +65,9 @@ def once(rows: np.ndarray) -> np.ndarray:
     return rows[:1] if len(rows) > 1 and bool((rows == rows[0]).all()) else rows
 
 
-def _map(part: Any, b: int) -> Shapes:
+def _map(obstacles: Any, b: int) -> Shapes:
     """The occupied cells of a grid, or the balls of a cloud."""
-    field, g = part.field, int(part.which[b])
+    field, g = obstacles.field, int(obstacles.which[b])
     if isinstance(field.source, PointCloud):
         points = field.source.clouds()[g]
         return Shapes(points, np.zeros((1, field.d)), np.array([field.source.radius]))
@@ -75,12 +75,12 @@ def _map(part: Any, b: int) -> Shapes:
     return _cells(grid, grid.is_occupied)
 
 
-def unknown_of(part: Obstacles, b: int) -> Shapes | None:
+def unknown_of(obstacles: Obstacles, b: int) -> Shapes | None:
     """The unknown cells of a map; None where there are none."""
-    if part.map is None or not isinstance(part.map.field.source, OccupancyGrid):
+    if obstacles.map is None or not isinstance(obstacles.map.field.source, OccupancyGrid):
         return None
-    grid = part.map.field.source.single(int(part.map.which[b]))
-    return _cells(grid, grid.is_unknown, part.map.field.unknown) if bool(grid.is_unknown.any()) else None
+    grid = obstacles.map.field.source.single(int(obstacles.map.which[b]))
+    return _cells(grid, grid.is_unknown, obstacles.map.field.unknown) if bool(grid.is_unknown.any()) else None
 
 
 def _cells(grid: OccupancyGrid, cells: np.ndarray, unknown: Unknown | None = None) -> Shapes:
@@ -89,19 +89,19 @@ def _cells(grid: OccupancyGrid, cells: np.ndarray, unknown: Unknown | None = Non
     return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1), cells=True, unknown=unknown)
 
 
-def shapes_of(part: Obstacles, b: int) -> Shapes | None:
+def shapes_of(obstacles: Obstacles, b: int) -> Shapes | None:
     """The obstacles of problem b, as one that is a ball meets them; None where nobody says how they look."""
-    if part.map is not None:
-        return _map(part.map, b)
-    found = part.shapes(b)
-    if found is None or found.sines is not None:
+    if obstacles.map is not None:
+        return _map(obstacles.map, b)
+    boxes = obstacles.shapes(b)
+    if boxes is None or boxes.sines is not None:
         return None
-    until = None if part.stops is None else float(part.stops[b]) * part.dt
-    half, turn = np.zeros((1, found.center.shape[1])), None
-    if found.half.any():
-        half, turn = found.half, turns(found.sides)
-    motion = {"velocity": found.velocity, "until": until, "track": found.track, "step": found.step}
-    return Shapes(found.center, half, found.radius, turn, **motion)
+    until = None if obstacles.stops is None else float(obstacles.stops[b]) * obstacles.dt
+    half, turn = np.zeros((1, boxes.center.shape[1])), None
+    if boxes.half.any():
+        half, turn = boxes.half, turns(boxes.sides)
+    motion = {"velocity": boxes.velocity, "until": until, "track": boxes.track, "step": boxes.step}
+    return Shapes(boxes.center, half, boxes.radius, turn, **motion)
 
 
 def turns(axes: np.ndarray) -> np.ndarray | None:

@@ -65,7 +65,7 @@ def look_of(dynamics: Dynamics) -> Look:
     for kind, look in VEHICLES.items():
         if isinstance(dynamics, kind):
             return look
-    names = [one.name for one in states_of(dynamics)]
+    names = [component.name for component in states_of(dynamics)]
     if QUATERNION[0] in names and tuple(names[(k := names.index(QUATERNION[0])) : k + 4]) == QUATERNION:
         return Look("dart", quaternion=slice(k, k + 4))
     if HEADING in names:
@@ -120,10 +120,10 @@ def shape_of(problem: Problem) -> Shape | None:
 def turned(body: BoundBody, X: np.ndarray) -> np.ndarray:
     """Quaternions (K, 4) by which a body is turned in states X (K, n)."""
     axes = rotations(body, X).swapaxes(-1, -2)
-    found = turns(axes)
-    if found is None:
+    quaternions = turns(axes)
+    if quaternions is None:
         return np.tile(NOT_TURNED, (len(axes), 1))
-    return found if found.ndim == 2 else _about_z(found)
+    return quaternions if quaternions.ndim == 2 else _about_z(quaternions)
 
 
 def _about_z(angle: np.ndarray) -> np.ndarray:

@@ -82,9 +82,9 @@ class Setup:
             field = "model.vehicle.stages" if first.stages is None else "scenario.stages"
             got = f"{N} stages with {bodies} obstacles, {_gigabytes(problem)} or more"
             raise InputError(field, f"a problem that fits into the free memory, {_gigabytes(free)}", got)
-        own = replace(first, map=None).arrays()
+        arrays = replace(first, map=None).arrays()
         of_map = first.map.values.nbytes if first.map is not None and not self.scenario.shares_map else 0
-        flights = count * (sum(held.nbytes for held in own.values()) + of_map + 8 * N * dynamics.m)
+        flights = count * (sum(array.nbytes for array in arrays.values()) + of_map + 8 * N * dynamics.m)
         if flights > free:
             got = f"{count}, {_gigabytes(flights)} or more"
             raise InputError("study.layouts", f"layouts that fit into the free memory, {_gigabytes(free)}", got)
@@ -121,9 +121,9 @@ def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> 
 
 def plain(config: DictConfig) -> dict[str, Any]:
     """A configuration as plain dicts, lists and numbers, resolved: no part of the library knows OmegaConf."""
-    held = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(held, dict)
-    return {str(key): value for key, value in held.items()}
+    container = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
 
 
 def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[str | None], dict[str, Any]]:
@@ -131,13 +131,13 @@ def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[st
 
     `sources` are Hydra's own `config_sources` of the command.
     """
-    given = [o for o in overrides if not o.lstrip("+~").startswith(("solver=", "solver."))]
+    shared = [o for o in overrides if not o.lstrip("+~").startswith(("solver=", "solver."))]
     folders = [source.path for source in sources if source.schema == "file"]
     others = tuple(f"file://{path}" for path in folders if str(config_dir()) not in path)
 
     def recompose(solver: str | None) -> dict[str, Any]:
         try:
-            return _composed(tuple(overrides) if solver is None else (*given, f"solver={solver}"), others)
+            return _composed(tuple(overrides) if solver is None else (*shared, f"solver={solver}"), others)
         except InputError as error:
             if solver is None or error.field != "solver":
                 raise
@@ -198,8 +198,8 @@ def _vehicle(configuration: Mapping[str, Any]) -> Vehicle:
     try:
         return _instantiate(configuration["model"]["vehicle"], "model.vehicle")
     except InputError as error:
-        part, _, name = error.field.partition(".")
-        if part != "airframe" or configuration.get("vehicle") is None:
+        group, _, name = error.field.partition(".")
+        if group != "airframe" or configuration.get("vehicle") is None:
             raise
         raise InputError(f"vehicle.{name}", error.expected, error.got) from None
 
@@ -262,7 +262,7 @@ def solver_from(settings: Mapping[str, Any], trust: bool = False) -> Any:
 
 def mission_from(configuration: Mapping[str, Any], solver: Any, trust: bool = False) -> Mission:
     """The closed loop of a study of missions with a solver as its planner's, from its configuration; see `_stored`."""
-    mission, plant = (_stored(configuration.get(part), part, part, trust) for part in ("mission", "plant"))
+    mission, plant = (_stored(configuration.get(key), key, key, trust) for key in ("mission", "plant"))
     return _closed_loop(mission, plant, solver, vehicle_of(configuration, trust))
 
 
@@ -308,9 +308,9 @@ class _Device(Checked, named="device"):
 
 def _device(node: Mapping[str, Any]) -> tuple[torch.device, torch.dtype]:
     """The device and dtype; also sets the threads and kernels of this process."""
-    given = _Device(**{field.name: node[field.name] for field in fields(_Device)})
-    if given.name == "cuda" and not torch.cuda.is_available():
+    device = _Device(**{field.name: node[field.name] for field in fields(_Device)})
+    if device.name == "cuda" and not torch.cuda.is_available():
         raise InputError("device", "device=cpu, as no CUDA device is visible", "device=cuda")
-    torch.set_num_threads(allotted_cores() if given.threads is None else given.threads)
-    use_native(given.kernels == "native")
-    return torch.device(given.name), getattr(torch, given.dtype)
+    torch.set_num_threads(allotted_cores() if device.threads is None else device.threads)
+    use_native(device.kernels == "native")
+    return torch.device(device.name), getattr(torch, device.dtype)

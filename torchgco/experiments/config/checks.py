@@ -54,14 +54,14 @@ def _hydra_word(word: str) -> str:
 
 def _hydra_path(key: str, value: str) -> str:
     """A path, or several to sweep over, with homes in place of `~`; quoted where Hydra would read no text in it."""
-    value = ",".join(os.path.expanduser(part) for part in value.split(","))
+    value = ",".join(os.path.expanduser(path) for path in value.split(","))
     try:
         read = OverridesParser.create().parse_override(f"{key}={value}")
         if "${" in value or read.is_sweep_override() or isinstance(read.value(), str | None):
             return value
     except HydraException:
         pass
-    slashed = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), value)
+    slashed = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), value)
     return f"'{slashed}'"
 
 
@@ -71,12 +71,12 @@ def check_once(words: Iterable[str]) -> None:
     Raises:
         InputError: a key that is.
     """
-    given: dict[str, str] = {}
+    values: dict[str, str] = {}
     for word in words:
         key, equals, _ = word.lstrip("+").partition("=")
-        if equals and key in given:
-            raise InputError(key, "one value", f"{given[key]} and {word}")
-        given[key] = word
+        if equals and key in values:
+            raise InputError(key, "one value", f"{values[key]} and {word}")
+        values[key] = word
 
 
 def _read(name: str) -> Any:
@@ -98,9 +98,9 @@ def check(config: Mapping[str, Any]) -> None:
     base = _read("config")
     chosen = _default_options(base).items()
     groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
-    own = [key for key in base if key not in ("defaults", "hydra")]
-    needed = [*own, *(key for key, option in groups.items() if option is not None)]
-    _keys(config, "", needed, [*own, *groups, VEHICLE_GROUP])
+    base_keys = [key for key in base if key not in ("defaults", "hydra")]
+    needed = [*base_keys, *(key for key, option in groups.items() if option is not None)]
+    _keys(config, "", needed, [*base_keys, *groups, VEHICLE_GROUP])
     device = _read(f"device/{groups['device']}")
     for name, known in (("study", base["study"]), ("device", device), ("model", MODEL)):
         _keys(config[name], name, list(known), list(known))
@@ -190,9 +190,9 @@ def _not_found(error: BaseException, key: str, target: str) -> InputError:
 
 def _unknown_key(error: BaseException, key: str) -> InputError:
     """The error for an unknown key: it names the first part that the configuration lacks, and the key most like it."""
-    found: Any = error.__cause__  # of OmegaConf
-    key = str(getattr(found, "full_key", None) or key)
-    name, parent = key.rpartition(".")[2], found.parent_node if hasattr(found, "parent_node") else None
+    cause: Any = error.__cause__  # of OmegaConf
+    key = str(getattr(cause, "full_key", None) or key)
+    name, parent = key.rpartition(".")[2], cause.parent_node if hasattr(cause, "parent_node") else None
     if key in CLOSED_LOOP:
         return InputError(key, "experiment=mission, as its keys are given", "none")
     if key.split(".")[0] == VEHICLE_GROUP and not (isinstance(parent, DictConfig) and "mass" in parent):

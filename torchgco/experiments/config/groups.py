@@ -169,8 +169,8 @@ def _default(field: Field[Any]) -> Any:
 def _tree(value: Any) -> Any:
     """An object as nested containers that Hydra instantiates."""
     if is_dataclass(value) and not isinstance(value, type):
-        own = {field.name: _tree(getattr(value, field.name)) for field in fields(value) if field.init}
-        return {"_target_": _path(type(value))} | own
+        tree = {field.name: _tree(getattr(value, field.name)) for field in fields(value) if field.init}
+        return {"_target_": _path(type(value))} | tree
     if isinstance(value, Passes):
         return {name: _tree(row) for name, row in value.items()}
     return [_tree(item) for item in value] if isinstance(value, (list, tuple)) else value
@@ -191,7 +191,7 @@ def _joined(plane: Any, space: Any) -> Any:
 def _literal(value: Any) -> str:
     """A value in the grammar of interpolations."""
     if isinstance(value, dict):
-        return f"{{{','.join(f'{key}:{_literal(held)}' for key, held in value.items())}}}"
+        return f"{{{','.join(f'{key}:{_literal(item)}' for key, item in value.items())}}}"
     return f"[{','.join(map(_literal, value))}]" if isinstance(value, list) else json.dumps(value)
 
 
@@ -204,8 +204,8 @@ def _sizes(made: Any) -> dict[str, Any]:
 def _radius(usual: float, _root_: Any) -> float:
     """The radius of the vehicle, m; a family's usual one for the paper's, and for models that have no such group."""
     vehicle = _root_.get("vehicle")
-    own = vehicle.get("radius") if OmegaConf.is_dict(vehicle) else None
-    return usual if own is None or own == Airframe().radius else own
+    radius = vehicle.get("radius") if OmegaConf.is_dict(vehicle) else None
+    return usual if radius is None or radius == Airframe().radius else radius
 
 
 def _pace(usual: float | None, _root_: Any) -> float | None:

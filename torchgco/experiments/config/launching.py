@@ -17,9 +17,9 @@ def allotted_cores() -> int:
     """Cores that this process may use: those that Slurm or else the system allots, or its part of them as a job."""
     cores = int(os.environ.get("SLURM_CPUS_PER_TASK", 0)) or len(os.sched_getaffinity(0))
     launcher = _launcher()
-    own = launcher.get("cpus_per_task") or launcher.get("ray", {}).get("remote", {}).get("num_cpus")
-    if own is not None:
-        return min(cores, max(1, int(own)))
+    cpus = launcher.get("cpus_per_task") or launcher.get("ray", {}).get("remote", {}).get("num_cpus")
+    if cpus is not None:
+        return min(cores, max(1, int(cpus)))
     return max(1, cores // jobs_at_once())
 
 
@@ -47,5 +47,5 @@ def _launcher() -> Any:
     """The launcher's configuration in a job that may run beside others; empty elsewhere."""
     if not HydraConfig.initialized():
         return {}
-    given = HydraConfig.get()
-    return given.launcher if given.mode == RunMode.MULTIRUN and given.launcher._target_ != BASIC else {}
+    config = HydraConfig.get()
+    return config.launcher if config.mode == RunMode.MULTIRUN and config.launcher._target_ != BASIC else {}

@@ -56,8 +56,8 @@ def _check(value: Any, known: frozenset[type], group: str, field: str) -> None:
 def _is_known(target: Any, known: frozenset[type]) -> bool:
     """Whether a path names one of the classes. Nothing is imported: modules of the classes are by now."""
     module, _, name = target.rpartition(".") if isinstance(target, str) else ("", "", "")
-    found = vars(sys.modules[module]).get(name) if module in sys.modules else None
-    return any(found is kind for kind in known)
+    attribute = vars(sys.modules[module]).get(name) if module in sys.modules else None
+    return any(attribute is kind for kind in known)
 
 
 def _refused(field: str, expected: str, got: Any) -> InputError:

@@ -157,7 +157,7 @@ class SolveBatch(Batch):
         groups = self.layouts.alike()
         flown = [self._fly(np.array(self.places)[rows]) for rows in groups]
         order = np.argsort(np.concatenate(groups), kind="stable")
-        rows = pd.concat([some for some, _ in flown], ignore_index=True).iloc[order].reset_index(drop=True)
+        rows = pd.concat([table for table, _ in flown], ignore_index=True).iloc[order].reset_index(drop=True)
         longest = max(self.stages or 0, *(U.shape[1] for _, U in flown))
         return rows, np.concatenate([self._lengthened(U, longest) for _, U in flown])[order]
 
@@ -217,8 +217,8 @@ class SolveBatch(Batch):
         if solver.in_slots(1) is not None:
             plan = plan_of(self.setup)
             processes = (plan.workers or 1) * jobs_at_once()
-            given = None if plan.batch_size == "auto" else plan.batch_size
-            at_once = min(problem.B, given or plan_batch(problem, self.setup.device, processes))
+            batch_size = None if plan.batch_size == "auto" else plan.batch_size
+            at_once = min(problem.B, batch_size or plan_batch(problem, self.setup.device, processes))
             solver = solver.in_slots(at_once)
         while True:
             together = torch.zeros_like(ids)
@@ -279,8 +279,8 @@ def _certificate(
 
     Either proves a stationary point; those of a solver without a dual step are no more than estimates.
     """
-    given = [lam.detach().to("cpu", torch.float64) for lam in solution.multipliers.lam]
-    found = certify(problem, X, U, asked, given, times)
-    doubted = asked & ~(found.kkt_residual <= PROVEN)
+    multipliers = [lam.detach().to("cpu", torch.float64) for lam in solution.multipliers.lam]
+    certificate = certify(problem, X, U, asked, multipliers, times)
+    doubted = asked & ~(certificate.kkt_residual <= PROVEN)
     fitted = certify(problem, X, U, doubted, times=times).kkt_residual
-    return replace(found, kkt_residual=torch.fmin(found.kkt_residual, fitted))
+    return replace(certificate, kkt_residual=torch.fmin(certificate.kkt_residual, fitted))

@@ -103,8 +103,8 @@ class Jobs(Callback):
         failed = []
         for report in reports:
             if report.refused is not None:
-                own = " ".join(word for word in report.overrides if word not in shared)
-                failed.append(f"job {own}: {report.refused}")
+                words = " ".join(word for word in report.overrides if word not in shared)
+                failed.append(f"job {words}: {report.refused}")
         cut = {report.folder: report for report in reports if not report.done and report.refused is None}
         for report in cut.values():
             try:

@@ -158,10 +158,10 @@ class _Study:
 
 def _finish(study: _Study, store: StudyFolder, rows: pd.DataFrame, flown: np.ndarray) -> None:
     """Write the files of a study from its rows and what was flown, (solver, L, ...)."""
-    held: np.ndarray | pd.DataFrame = flown
+    results: np.ndarray | pd.DataFrame = flown
     if study.setup.mission is not None:
-        held = mission_table(store.path, study.tasks, list(study.solvers), flown)
-    store.finish(with_success(rows, study.layouts, study.rivals), held, study.layouts)
+        results = mission_table(store.path, study.tasks, list(study.solvers), flown)
+    store.finish(with_success(rows, study.layouts, study.rivals), results, study.layouts)
 
 
 def _report(study: _Study, folder: Path) -> str:
@@ -184,14 +184,14 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
         if plan.figure is not None:
             raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
     rivals = _rivals(configuration, recompose)
-    solvers = {name: setup.solver if held is configuration else solver_of(held) for name, held in rivals.items()}
+    solvers = {name: setup.solver if config is configuration else solver_of(config) for name, config in rivals.items()}
     if setup.mission is None:
         _check_time(task, solvers)
     plant = None if setup.mission is None else setup.mission.plant
     decided = {**configuration, **files_of(configuration, getattr(plant, "files", ()))}
     manifest = Manifest(
         configuration={"version": VERSION, **decided},
-        solvers={name: settings_of(held) for name, held in rivals.items()},
+        solvers={name: settings_of(config) for name, config in rivals.items()},
         layouts=layout_digests(tasks.layouts, configuration["model"]["vehicle"], closed_loop(decided)),
     )
     return _Study(plan, tasks, solvers, manifest)
@@ -210,23 +210,23 @@ def _check_time(task: Task, solvers: Mapping[str, Any]) -> None:
     if task.problem.time is None:
         return
     problem = for_solvers(task.problem)
-    for place, (name, solver) in enumerate(solvers.items()):
+    for index, (name, solver) in enumerate(solvers.items()):
         if solver.choosing_time(problem) is None:
-            raise InputError("study.baselines" if place else "solver", f"{CHOOSING_TIME}, as it is free here", name)
+            raise InputError("study.baselines" if index else "solver", f"{CHOOSING_TIME}, as it is free here", name)
 
 
 def _rivals(configuration: dict[str, Any], recompose: Recompose) -> dict[str, dict[str, Any]]:
     """The configurations of the solvers by name, the one under study first; a baseline that equals it is left out."""
-    own = configuration["solver"]["name"]
-    found = {own: configuration}
+    studied = configuration["solver"]["name"]
+    rivals = {studied: configuration}
     for name in configuration["study"]["baselines"] or ():
         other = recompose(name)
         here, there = settings_of(configuration), settings_of(other)
-        if name == own and digest(here) != digest(there):
-            expected = f"another name, as the baseline {own} has other settings: solver.name={own}_changed"
-            raise InputError("solver.name", expected, f"{own} ({difference(there, here)})")
-        found.setdefault(name, other)
-    return found
+        if name == studied and digest(here) != digest(there):
+            expected = f"another name, as the baseline {studied} has other settings: solver.name={studied}_changed"
+            raise InputError("solver.name", expected, f"{studied} ({difference(there, here)})")
+        rivals.setdefault(name, other)
+    return rivals
 
 
 def _fly(study: _Study, store: StudyFolder, missing: Mapping[str, Sequence[int]], name: str) -> None:
@@ -315,7 +315,7 @@ def _update_success(study: _Study, store: StudyFolder) -> None:
 def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """States (L, N+1, n) of every solver, for the pictures; those with fewer stages stay where they end."""
     names, every, times = flown["solver"].tolist(), flown["U"], flown.get("times")
-    found = {name: np.full((*U.shape[:1], U.shape[1] + 1, study.setup.vehicle.dynamics.n), np.nan)
+    states = {name: np.full((*U.shape[:1], U.shape[1] + 1, study.setup.vehicle.dynamics.n), np.nan)
              for name, U in zip(names, every, strict=True)}  # fmt: skip
     for places in study.tasks.groups:
         problem = study.tasks.of(places, exact=True).problem
@@ -323,5 +323,5 @@ def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, n
             U = torch.from_numpy(every[i][places, : problem.N])
             t = times_at(None if times is None else times[i], places, problem.N)
             X = states_of(problem, U, t).numpy()
-            found[name][places, : problem.N + 1], found[name][places, problem.N + 1 :] = X, X[:, -1:]
-    return found
+            states[name][places, : problem.N + 1], states[name][places, problem.N + 1 :] = X, X[:, -1:]
+    return states

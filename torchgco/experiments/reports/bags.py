@@ -102,17 +102,17 @@ class _Messages:
 
     def path(self) -> list[tuple[int, Any]]:
         poses = [
-            self._of("geometry_msgs/msg/PoseStamped", self._header(at), self._pose(k))
-            for k, at in enumerate(self.nanoseconds)
+            self._of("geometry_msgs/msg/PoseStamped", self._header(stamp), self._pose(k))
+            for k, stamp in enumerate(self.nanoseconds)
         ]
         return [(self.nanoseconds[0], self._of("nav_msgs/msg/Path", self._header(self.nanoseconds[0]), poses))]
 
     def trajectory(self) -> list[tuple[int, Any]]:
         first, points = self.nanoseconds[0], []
-        for k, at in enumerate(self.nanoseconds):
+        for k, stamp in enumerate(self.nanoseconds):
             transform = self._of("geometry_msgs/msg/Transform", self._vector(self.p[k]), self._attitude(k))
             motion = [self._twist(self.v[k], self.w_world[k])], [self._twist(self.a[k], self.turning[k])]
-            since = self._of("builtin_interfaces/msg/Duration", *divmod(at - first, NANO))
+            since = self._of("builtin_interfaces/msg/Duration", *divmod(stamp - first, NANO))
             points.append(self._of("trajectory_msgs/msg/MultiDOFJointTrajectoryPoint", [transform], *motion, since))
         whole = self._of("trajectory_msgs/msg/MultiDOFJointTrajectory", self._header(first), [BODY], points)
         return [(first, whole)]
@@ -120,17 +120,17 @@ class _Messages:
     def odometry(self) -> list[tuple[int, Any]]:
         body = self.q * [1.0, -1.0, -1.0, -1.0]
         v, unknown, messages = _turned(body, self.v), np.zeros(36), []
-        for k, at in enumerate(self.nanoseconds):
+        for k, stamp in enumerate(self.nanoseconds):
             pose = self._of("geometry_msgs/msg/PoseWithCovariance", self._pose(k), unknown)
             twist = self._of("geometry_msgs/msg/TwistWithCovariance", self._twist(v[k], self.w[k]), unknown)
-            messages.append((at, self._of("nav_msgs/msg/Odometry", self._header(at), BODY, pose, twist)))
+            messages.append((stamp, self._of("nav_msgs/msg/Odometry", self._header(stamp), BODY, pose, twist)))
         return messages
 
 
 def _stacked(columns: Mapping[str, np.ndarray], labels: Sequence[str]) -> np.ndarray:
     """(T, 3) of up to three columns; 0 in the place of others."""
-    found = [np.asarray(columns[label], float) for label in labels]
-    return np.stack([*found, *[np.zeros_like(found[0])] * (3 - len(found))], axis=1)
+    arrays = [np.asarray(columns[label], float) for label in labels]
+    return np.stack([*arrays, *[np.zeros_like(arrays[0])] * (3 - len(arrays))], axis=1)
 
 
 def _or_slope(

@@ -24,23 +24,23 @@ def advised(tasks: Tasks, trials: pd.DataFrame) -> str:
     As `Solution.explain` has it, without solving again: of the first layouts, each sentence with those that it is for.
     """
     setup = tasks.setup
-    own = trials[trials["solver"] == setup.solver_name]
-    short = own[~own["reached"].astype("boolean").fillna(False).astype(bool)]
+    flown = trials[trials["solver"] == setup.solver_name]
+    short = flown[~flown["reached"].astype("boolean").fillna(False).astype(bool)]
     if len(short) == 0:
         return ""
     shown = short.head(EXPLAINED)
-    found: dict[str, list[str]] = {}
+    sentences: dict[str, list[str]] = {}
     for row in shown.to_dict("records"):
-        one, status = tasks.of([row["layout"]]).problem, Status[str(row["status"])]
+        problem, status = tasks.of([row["layout"]]).problem, Status[str(row["status"])]
         facts = Facts(
-            status, setup.solver, hasattr(setup.solver, "passes"), bool(one.obstacles), False, None,
-            float(row["clearance"]), **map_facts(one, status, False),
+            status, setup.solver, hasattr(setup.solver, "passes"), bool(problem.obstacles), False, None,
+            float(row["clearance"]), **map_facts(problem, status, False),
         )  # fmt: skip
         for sentence in [*facts.told[1:], *advice(facts)]:
-            found.setdefault(sentence, []).append(str(row["layout"]))
+            sentences.setdefault(sentence, []).append(str(row["layout"]))
     more = f", the first {len(shown)} of them here" if len(short) > len(shown) else ""
-    lines = [f"\n{setup.solver_name} did not reach {len(short)} of {len(own)} goals{more}. What to try:"]
-    for sentence, places in found.items():
+    lines = [f"\n{setup.solver_name} did not reach {len(short)} of {len(flown)} goals{more}. What to try:"]
+    for sentence, places in sentences.items():
         layouts_told = f"layout{'s' if len(places) > 1 else ''} {', '.join(places)}: "
         lines.append(textwrap.fill(layouts_told + sentence, LINE_WIDTH, initial_indent="  ", subsequent_indent="    "))
     return "\n".join([*lines, "study.explain=true tells what was tried."])
@@ -61,17 +61,17 @@ def explained(tasks: Tasks, trials: pd.DataFrame) -> str:
     with a record, by which no bit of a result changes.
     """
     name = tasks.setup.solver_name
-    own = trials[trials["solver"] == name]
-    failed = own.loc[~own["success"].fillna(own["reached"]).astype(bool), "layout"].tolist()
+    flown = trials[trials["solver"] == name]
+    failed = flown.loc[~flown["success"].fillna(flown["reached"]).astype(bool), "layout"].tolist()
     if not failed:
         return f"\n{name} failed on no layout: there is nothing to explain."
     shown = failed[:EXPLAINED]
-    found = dict[int, str]()
+    by_layout = dict[int, str]()
     for rows in tasks.layouts.take(shown).alike():
-        found |= _told(tasks, np.array(shown)[rows])
-    told = [found[number] for number in shown]
+        by_layout |= _told(tasks, np.array(shown)[rows])
+    told = [by_layout[number] for number in shown]
     more = f", the first {len(shown)} of them here" if len(failed) > len(shown) else ""
-    return "\n\n".join([f"\n{name} failed on {len(failed)} of {len(own)} layouts{more}.", *told])
+    return "\n\n".join([f"\n{name} failed on {len(failed)} of {len(flown)} layouts{more}.", *told])
 
 
 def _told(tasks: Tasks, places: np.ndarray) -> dict[int, str]:

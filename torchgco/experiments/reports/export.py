@@ -57,18 +57,18 @@ def write_export(
             above 0.
     """
     check_value(rate, Positive | None, "--rate")
-    study, place = Study.read(folder, trust), folder / FOLDER if output is None else output
+    study, target = Study.read(folder, trust), folder / FOLDER if output is None else output
     ids, names = study.layouts.ids.tolist(), list(study.manifest.solvers)
-    for option, given, known in (("--layout", layouts, ids), ("--solver", solvers, names)):
-        if missing := [one for one in given if one not in known]:
+    for option, chosen, known in (("--layout", layouts, ids), ("--solver", solvers, names)):
+        if missing := [item for item in chosen if item not in known]:
             raise InputError(option, f"among {', '.join(map(str, known[:20]))} of the study", missing[0])
-    if place.exists() and not place.is_dir():
-        raise InputError("--output", "a folder", place)
+    if target.exists() and not target.is_dir():
+        raise InputError("--output", "a folder", target)
     tables, written = _missions if study.missions else _trajectories, list[Path]()
     for solver, number, columns in tables(study, rate, lambda solver, number: number in (layouts or ids)):
         if solver in (solvers or names):
-            written.append(place / (f"{solver}-{number}" if bag else f"{solver}-{number}.csv"))
-            place.mkdir(parents=True, exist_ok=True)
+            written.append(target / (f"{solver}-{number}" if bag else f"{solver}-{number}.csv"))
+            target.mkdir(parents=True, exist_ok=True)
             if bag:
                 write_bag(written[-1], {name: columns[name].to_numpy() for name in columns}, _position(study), bag)
             else:
@@ -80,19 +80,19 @@ def write_export(
 def _position(study: Study) -> list[str]:
     """The labels of the position's columns."""
     dynamics = QuadrotorPlant() if study.missions else study.vehicle.dynamics
-    at = dynamics.position
-    return [] if at is None else [one.label for one in states_of(dynamics)[at]]
+    position = dynamics.position
+    return [] if position is None else [state.label for state in states_of(dynamics)[position]]
 
 
 def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
     """Single trajectories, rolled out from the controls that the study kept."""
-    held = study.times
+    all_times = study.times
     for places, problem in study.batches():
         for name, controls in study.flown(SOLUTIONS, "U").items():
             U = torch.from_numpy(controls[places, : problem.N])
-            own = durations.times_at(None if held is None else held[name], places, problem.N)
-            X = durations.states_of(problem, U, own)
-            t = times(problem).expand(problem.B, -1) if own is None else own
+            knot_times = durations.times_at(None if all_times is None else all_times[name], places, problem.N)
+            X = durations.states_of(problem, U, knot_times)
+            t = times(problem).expand(problem.B, -1) if knot_times is None else knot_times
             for b, number in enumerate(study.layouts.ids[places].tolist()):
                 last = problem.N if problem.horizon is None else int(problem.horizon[b])
                 if wanted(name, number) and bool(torch.isfinite(U[b, :last]).all()):
@@ -114,28 +114,28 @@ def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:
     """The columns of a mission, from its log."""
     plant = QuadrotorPlant()
     t, x, u = (log[names].to_numpy(float) for names in (["t"], _numbered("x", plant.n), _numbered("u", plant.m, 1)))
-    at = t[:, 0] if rate is None else sample_times(t[0, 0], t[-1, 0], rate)
+    moments = t[:, 0] if rate is None else sample_times(t[0, 0], t[-1, 0], rate)
     if rate is not None:
-        u = u[np.clip(np.searchsorted(t[:, 0], at + 1e-9, side="right") - 1, 0, len(u) - 1)]  # they hold
+        u = u[np.clip(np.searchsorted(t[:, 0], moments + 1e-9, side="right") - 1, 0, len(u) - 1)]  # they hold
     rates = np.gradient(x[:, VELOCITY], t[:, 0], axis=0) if len(t) > 1 else np.zeros((1, 3))
     x = x.copy()
     q = x[:, ATTITUDE_STATES]  # a view; q and -q are the same attitude: neighbours are to have the same sign
     q[1:] *= np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0).cumprod()[:, None]
-    x, rates = _between(at, t[:, 0], x), _between(at, t[:, 0], rates)
+    x, rates = _between(moments, t[:, 0], x), _between(moments, t[:, 0], rates)
     x[:, ATTITUDE_STATES] /= np.linalg.norm(x[:, ATTITUDE_STATES], axis=1, keepdims=True)
-    columns: dict[str, Any] = {TIME_COLUMN: at}
-    columns |= {one.label: x[:, i] for i, one in enumerate(states_of(plant))}
+    columns: dict[str, Any] = {TIME_COLUMN: moments}
+    columns |= {component.label: x[:, i] for i, component in enumerate(states_of(plant))}
     columns |= {f"a{axis} [m/s^2]": rates[:, i] for i, axis in enumerate("xyz")}
     columns["thrust [N]"] = x[:, 13:].sum(1)
-    return pd.DataFrame(columns | {one.label: u[:, i] for i, one in enumerate(controls_of(plant))})
+    return pd.DataFrame(columns | {component.label: u[:, i] for i, component in enumerate(controls_of(plant))})
 
 
 def _numbered(letter: str, count: int, first: int = 0) -> list[str]:
     return [f"{letter}{i}" for i in range(first, first + count)]
 
 
-def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
+def _between(moments: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(moments, t, column) for column in values.T], axis=1)
 
 
 def _parser() -> RunParser:
@@ -161,7 +161,7 @@ def _run(options: argparse.Namespace) -> int:
     files = write_export(
         options.run, options.output, options.rate, options.layout, options.solver, options.trust, options.bag
     )  # fmt: skip
-    parts = [part for path in files for part in ([path] if path.is_file() else path.iterdir())]
-    size = sum(part.stat().st_size for part in parts)
+    parts = [file for path in files for file in ([path] if path.is_file() else path.iterdir())]
+    size = sum(file.stat().st_size for file in parts)
     say(f"{files[0].parent if files else options.run}: {len(files)} files, {size / 1e6:.2f} MB")
     return 0

@@ -63,11 +63,11 @@ def missions(folder: Path, trust: bool = False) -> Recorded:
 
 def _logged(path: Path, trust: bool) -> tuple[Tensor, Tensor, float]:
     """States, commands and the time step of the flights in a file."""
-    parts = [part for _, part in read_table(path, trust).groupby(["solver", "mission"], sort=False)]
+    parts = [flight for _, flight in read_table(path, trust).groupby(["solver", "mission"], sort=False)]
     dt = float(parts[0]["t"].iloc[1] - parts[0]["t"].iloc[0])
     named = [f"x{i}" for i in range(17)], [f"u{i}" for i in range(1, 5)]
-    held = ([torch.from_numpy(part[names].to_numpy(float)) for part in parts] for names in named)
-    x, u = (pad_sequence(flights, batch_first=True, padding_value=torch.nan) for flights in held)
+    sequences = ([torch.from_numpy(flight[names].to_numpy(float)) for flight in parts] for names in named)
+    x, u = (pad_sequence(flights, batch_first=True, padding_value=torch.nan) for flights in sequences)
     return x, u[:, :-1], dt
 
 
@@ -96,7 +96,7 @@ def table(before: Airframe, found: Identified) -> str:
         if field.name == "inertia":
             old, new = (tuple(row[i] for i, row in enumerate(J)) for J in (old, new))
         if old != new:
-            shown = [", ".join(f"{v:.4g}" for v in (one if isinstance(one, tuple) else (one,))) for one in (old, new)]
+            shown = [", ".join(f"{v:.4g}" for v in (x if isinstance(x, tuple) else (x,))) for x in (old, new)]
             lines.append(f"{field.name:<20} {shown[0]:>24} -> {shown[1]} {AIRFRAME_UNITS[field.name].split(',')[0]}")
     return "\n".join([*lines, f"{'delay':<20} {'':>24} -> {found.delay:g} s"])
 
@@ -127,12 +127,12 @@ def _run(options: argparse.Namespace) -> int:
     if options.run is not None and options.words:
         raise InputError("command line", "--run RUN or KEY=VALUE, not both", options.words[0])
     told = str(options.run) if options.run is not None else " ".join(options.words)
-    given = flights(options.words, options.seed) if options.run is None else missions(options.run, options.trust)
-    found = identify(*given)
+    recorded = flights(options.words, options.seed) if options.run is None else missions(options.run, options.trust)
+    identified = identify(*recorded)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("--output", "a folder that can be made", error) from None
-    write(path, lambda file: file.write(document(found, told or "plant=rotors").encode()))
-    say(f"{table(given[3], found)}\n{path}: torchgco --config-dir {path.parent.parent} vehicle={path.stem} ...")
+    write(path, lambda file: file.write(document(identified, told or "plant=rotors").encode()))
+    say(f"{table(recorded[3], identified)}\n{path}: torchgco --config-dir {path.parent.parent} vehicle={path.stem} ...")
     return 0

@@ -56,8 +56,8 @@ def mission_table(folder: Path, tasks: Tasks, solvers: Sequence[str], logs: np.n
     if plans:
         steps = pd.concat(fine, ignore_index=True)
         write(folder / TIME_STEPS, lambda file: steps.to_parquet(file, index=False))
-        held = {"plan": np.stack(plans), "solver": np.array(solvers), "layout": layouts.ids}
-        write(folder / PLANS_FILE, lambda file: np.savez_compressed(file, **held))
+        columns = {"plan": np.stack(plans), "solver": np.array(solvers), "layout": layouts.ids}
+        write(folder / PLANS_FILE, lambda file: np.savez_compressed(file, **columns))
     return pd.concat(frames, ignore_index=True)
 
 
@@ -74,16 +74,16 @@ def write_mission_report(folder: Path, tasks: Tasks, figures: bool = True) -> st
 
 def _drawings(folder: Path, trials: pd.DataFrame, tasks: Tasks) -> dict[str, Callable[[], object]]:
     """Functions that draw and write: outcomes, and where few missions fly, for each what the paper shows of it."""
-    held: dict[str, Callable[[], object]] = {}
+    to_draw: dict[str, Callable[[], object]] = {}
 
     def add(name: str, figure: Callable[[], Figure]) -> None:
         path = folder / "figures" / f"{name}.png"
-        held[name] = lambda: write(path, lambda file: save(figure(), file, dpi=110))
+        to_draw[name] = lambda: write(path, lambda file: save(figure(), file, dpi=110))
 
     if len(shown := several(trials)):
         add("outcomes", lambda: draw.outcomes_figure(shown))
     if not all((folder / name).is_file() for name in (PLANS_FILE, TIME_STEPS)):  # of many missions
-        return held
+        return to_draw
     with np.load(folder / PLANS_FILE, allow_pickle=False) as flown:
         plans = dict(zip(flown["solver"].tolist(), flown["plan"], strict=True))
     tables = [pd.read_parquet(folder / name) for name in (MISSION, TIME_STEPS)]
@@ -105,8 +105,8 @@ def _drawings(folder: Path, trials: pd.DataFrame, tasks: Tasks) -> dict[str, Cal
             add(f"{label}-states", partial(draw.states_figure, fine[name], course.goal))
             add(f"{label}-tracking", partial(draw.tracking_figure, frame))
             gif = folder / "figures" / f"{label}.gif"
-            held[f"{label}.gif"] = partial(mission_animation, frame, plan, course, period, gif, name)
-    return held
+            to_draw[f"{label}.gif"] = partial(mission_animation, frame, plan, course, period, gif, name)
+    return to_draw
 
 
 def _by_solver(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
@@ -119,8 +119,8 @@ def _course(tasks: Tasks, number: int) -> tuple[Course, float]:
     assert setup.mission is not None
     near = setup.mission.goal_radius
     radius = float(task.goal_radius) if near is None else near
-    held = layouts.vehicle_radius
-    vehicle = setup.vehicle.radius if held is None else held
+    stated = layouts.vehicle_radius
+    vehicle = setup.vehicle.radius if stated is None else stated
     gates = tuple(outlines(task.problem, 0))
     if (body := body_of(task.problem)) is not None:
         vehicle = float(body.inner.vehicle_radius[0])

@@ -43,10 +43,10 @@ def missions(study: Study, found: Mapping[int, SearchPart]) -> Document:
     for places, problem in study.batches():
         document = document or document_of(study, problem, QUADROTOR)
         for b, number in enumerate(study.layouts.ids[places].tolist()):
-            part = problem.take(torch.tensor([b]))
-            flights = [log.flight(study, part, name, number, document.notes) for name in document.solvers]
-            held = [flight for flight in flights if flight is not None]
-            document.add(f"mission {number}", problem, b, held, found.get(number))
+            single = problem.take(torch.tensor([b]))
+            flights = [log.flight(study, single, name, number, document.notes) for name in document.solvers]
+            flown = [flight for flight in flights if flight is not None]
+            document.add(f"mission {number}", problem, b, flown, found.get(number))
     assert document is not None
     return document
 
@@ -71,12 +71,12 @@ class _Log:
     @classmethod
     def read(cls, study: Study) -> _Log:
         steps = dict(iter(study.log.groupby(["solver", "mission"], sort=False)))
-        held = study.flown(PLANS_FILE, "plan") if (study.folder / PLANS_FILE).is_file() else {}
+        stored = study.flown(PLANS_FILE, "plan") if (study.folder / PLANS_FILE).is_file() else {}
         numbers, loops, missing = study.layouts.ids.tolist(), dict[str, Mission](), ""
-        plans = {(name, i): plan for name, plans in held.items() for i, plan in zip(numbers, plans, strict=True)}
+        plans = {(name, i): plan for name, plans in stored.items() for i, plan in zip(numbers, plans, strict=True)}
         if study.manifest.configuration["mission"].get("sensor", "full") != "full":
             try:
-                loops = {name: study.mission(name) for name in held}
+                loops = {name: study.mission(name) for name in stored}
             except InputError as error:  # an option that another version knew
                 missing = f"no map: {error}"
         return cls(steps, study.rows, plans, loops, missing)  # type: ignore[arg-type]
@@ -109,28 +109,28 @@ def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str
     X = whole(steps[list(DRAWN_STATES)].to_numpy(dtype=float))
     path, clear = X[:, :3], steps["clearance"].to_numpy(dtype=float)
     bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
-    place = next((i for i, one in enumerate(problem.constraints) if one in problem.obstacles), -1)
+    index = next((i for i, constraint in enumerate(problem.constraints) if constraint in problem.obstacles), -1)
     return ShownFlight(
         solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", _told(row), bad,
-        np.where(bad > 0, place, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt), X),
+        np.where(bad > 0, index, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt), X),
         notes=_notes(steps)[: len(path)],
     )  # fmt: skip
 
 
 def _told(row: Mapping[str, Any]) -> Rows:
-    held: Rows = [("outcome", str(row["outcome"])), ("flight time", f"{row['flight_time']:.2f} s")]
-    held += [("clearance", f"{row['clearance']:.3f} m"), ("from the goal", f"{row['goal_distance']:.2f} m")]
-    held += [("missed deadlines", f"{row['missed_deadlines']:g}"), ("kept plans", f"{row['shifted_plans']:g}")]
+    rows: Rows = [("outcome", str(row["outcome"])), ("flight time", f"{row['flight_time']:.2f} s")]
+    rows += [("clearance", f"{row['clearance']:.3f} m"), ("from the goal", f"{row['goal_distance']:.2f} m")]
+    rows += [("missed deadlines", f"{row['missed_deadlines']:g}"), ("kept plans", f"{row['shifted_plans']:g}")]
     if np.isfinite(row.get("gates_passed", np.nan)):
-        held += [("gates passed", f"{row['gates_passed']:g}"), ("farthest from one", f"{row['gate_distance']:.3f} m")]
+        rows += [("gates passed", f"{row['gates_passed']:g}"), ("farthest from one", f"{row['gate_distance']:.3f} m")]
     share = row.get("safe_share", np.nan)
-    return [*held, ("periods with a safe plan", f"{100 * share:.4g} %")] if np.isfinite(share) else held
+    return [*rows, ("periods with a safe plan", f"{100 * share:.4g} %")] if np.isfinite(share) else rows
 
 
 def _notes(steps: pd.DataFrame) -> list[str]:
     clear, violation = steps["clearance"].to_numpy(dtype=float), steps["violation"].to_numpy(dtype=float)
     seconds = (steps["planner_seconds"] + steps["tracker_seconds"]).to_numpy(dtype=float)
-    safe = ["" if one else ", not safe" for one in steps["safe"] == 1] if "safe" in steps else [""] * len(steps)
+    safe = ["" if flag else ", not safe" for flag in steps["safe"] == 1] if "safe" in steps else [""] * len(steps)
     return [
         f"clearance {c:.3f} m; plan: {source}{word}, violation {v:.2g}; {1e3 * s:.0f} ms"
         for c, v, s, source, word in zip(clear, violation, seconds, steps["source"], safe, strict=True)

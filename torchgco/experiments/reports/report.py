@@ -72,20 +72,20 @@ def write_report(
     trials = read_trials(folder / TRIALS) if trials is None else trials
     parts = parts_of(trials)
     write_tables(folder, parts)
-    held = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
+    to_draw = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
         stored = Layouts.load(folder / LAYOUTS)
         layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), tasks)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
             states = {name: X[:SHOWN_LAYOUTS] for name, X in trajectories(solutions).items()}
         if figures:
-            held["layouts"] = lambda: layout_grid(layouts, states, trials, **how)
+            to_draw["layouts"] = lambda: layout_grid(layouts, states, trials, **how)
         if printed:
             for ending in ("png", "pdf"):
-                held[f"study.{ending}"] = lambda: study_figure(
+                to_draw[f"study.{ending}"] = lambda: study_figure(
                     layouts, states, trials, parts[0].summary, printed, **how
                 )
-    draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
+    draw({name: partial(_draw, folder, name, figure) for name, figure in to_draw.items()})
     return format_report(parts, form)
 
 
@@ -118,22 +118,22 @@ def drawings(part: Part) -> Drawings:
     What would be empty isn't drawn: a distribution or shares of single trials.
     """
     mission, again = part.kind is MISSIONS, part.kind.summarise
-    named, trials, summary, held = "outcomes" if mission else "rates", part.trials, part.summary, {}
+    named, trials, summary, to_draw = "outcomes" if mission else "rates", part.trials, part.summary, {}
     swept = task_columns(trials)[len(TASK) :]
     for name in swept:
         others = [other for other in swept if other != name]
         rows, table = trials[trials[name].notna()], summary[summary[name].notna()]
         if len(table[[*TASK, *others]].drop_duplicates()) > FACETS:
             table = again(rows.drop(columns=others))
-        held[f"{named}-{name}"] = lambda table=table, name=name: sweep_figure(table, name)
+        to_draw[f"{named}-{name}"] = lambda table=table, name=name: sweep_figure(table, name)
     if len(summary[[*TASK, *swept]].drop_duplicates()) > FACETS:
         trials = trials.drop(columns=swept)
         summary = again(trials)
     if not mission and summary["n"].max() > 1:  # of a single trial nothing is a rate
-        held["rates"] = lambda: rates_figure(summary)
+        to_draw["rates"] = lambda: rates_figure(summary)
     elif len(shown := several(trials)):
-        held["outcomes"] = lambda: outcomes_figure(shown)
-    return held | _distributions(trials, "missions-" if mission else "")
+        to_draw["outcomes"] = lambda: outcomes_figure(shown)
+    return to_draw | _distributions(trials, "missions-" if mission else "")
 
 
 def several(trials: pd.DataFrame) -> pd.DataFrame:
@@ -145,12 +145,12 @@ def several(trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def _distributions(trials: pd.DataFrame, prefix: str) -> Drawings:
-    held: Drawings = {}
+    to_draw: Drawings = {}
     if is_spread(trials, "clearance"):
-        held[f"{prefix}clearance"] = lambda: clearance_figure(trials)
+        to_draw[f"{prefix}clearance"] = lambda: clearance_figure(trials)
     if not prefix and is_spread(trials, "violation"):  # a mission's is that of its plans
-        held["violation"] = lambda: violation_figure(trials)
-    return held
+        to_draw["violation"] = lambda: violation_figure(trials)
+    return to_draw
 
 
 def _parser() -> RunParser:

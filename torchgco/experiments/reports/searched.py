@@ -71,7 +71,7 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
     Raises:
         InputError: missions with a sensor, whose search is that for a path on the map.
     """
-    found: dict[int, SearchPart] = {}
+    by_number: dict[int, SearchPart] = {}
     for name in study.manifest.solvers:
         solver, seen = study.solver(name).recording(), []
         if isinstance(solver, AugmentedLagrangian):
@@ -79,24 +79,24 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
                 continue
             watched = Watched(solver.guidance)
             solver, seen = replace(solver, guidance=watched), watched.seen
-        for some in _alike(study, numbers):
-            problem, solution = _solved(study, some, name, solver)
-            for b, number in enumerate(some):
-                part = search_of(solution, problem, b) or SearchPart()
-                own = [one for one in seen if one.number == number]
-                if part.passes or part.rounds or own:
-                    whole = found.setdefault(number, SearchPart())
-                    whole.passes.extend(f"{name}: {text}" for text in part.passes)
-                    whole.rounds.extend((f"{name}: {text}", lines) for text, lines in part.rounds)
-                    whole.guides.extend((f"outer iteration {one.outer}, {name}", one.balls, one.sample) for one in own)
-    return found
+        for group in _alike(study, numbers):
+            problem, solution = _solved(study, group, name, solver)
+            for b, number in enumerate(group):
+                record = search_of(solution, problem, b) or SearchPart()
+                guides = [g for g in seen if g.number == number]
+                if record.passes or record.rounds or guides:
+                    whole = by_number.setdefault(number, SearchPart())
+                    whole.passes.extend(f"{name}: {text}" for text in record.passes)
+                    whole.rounds.extend((f"{name}: {text}", lines) for text, lines in record.rounds)
+                    whole.guides.extend((f"outer iteration {g.outer}, {name}", g.balls, g.sample) for g in guides)
+    return by_number
 
 
 def _alike(study: Study, numbers: Sequence[int]) -> list[list[int]]:
     """The numbers of layouts that were solved together, as they have as many stages."""
     ids = study.layouts.ids.tolist()
     places = study.layouts.take([ids.index(number) for number in numbers]).alike()
-    return [[numbers[i] for i in some] for some in places]
+    return [[numbers[i] for i in group] for group in places]
 
 
 def _solved(study: Study, numbers: Sequence[int], name: str, solver: Any) -> tuple[Problem, Solution]:

@@ -108,11 +108,11 @@ def verify(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> tu
         InputError: a missing folder, folders without a finished study, a damaged or missing file, a table that doesn't
             have one row per solver and layout, a study of an older version, a class that `trust` alone admits.
     """
-    given = [Path(folder) for folder in folders]
-    studies = below(given, MANIFEST).values()
+    paths = [Path(folder) for folder in folders]
+    studies = below(paths, MANIFEST).values()
     done = [folder for folder in studies if (folder / DONE).is_file()]
     if not done:
-        raise InputError("folders", "a finished study in or below them", ", ".join(map(str, given)))
+        raise InputError("folders", "a finished study in or below them", ", ".join(map(str, paths)))
     unfinished = [str(folder) for folder in studies if folder not in done]
     return [verify_study(folder, trust) for folder in done], unfinished
 
@@ -150,7 +150,7 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
 
 def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str, ...]]:
     """What is confirmed of summary.csv and paired.csv, counted again from the table of trials; and which are absent."""
-    found, absent = [], []
+    tables, absent = [], []
     for name, table in joined(parts_of(trials)).items():
         path = folder / f"{name}.csv"
         if not path.is_file():
@@ -158,19 +158,19 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
             continue
         held, computed = readable(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
         if list(held.columns) != list(computed.columns) or len(held) != len(computed):
-            shapes = (f"{len(some)} rows, {len(some.columns)} columns" for some in (held, computed))
+            shapes = (f"{len(frame)} rows, {len(frame.columns)} columns" for frame in (held, computed))
             differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
         else:
             keys = pd.MultiIndex.from_frame(computed[ROW_KEYS.intersection(computed.columns)])
             differences = _differences(held.set_axis(keys), computed.set_axis(keys))
-        found.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
-    return found, tuple(absent)
+        tables.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
+    return tables, tuple(absent)
 
 
 def _identity(manifest: Manifest, vehicle: Vehicle, layouts: Layouts, index: pd.MultiIndex) -> pd.DataFrame:
     """The columns that name layouts, settings and surroundings, from layouts.npz and study.json."""
-    given = manifest.configuration
-    codes = layout_digests(layouts, given["model"]["vehicle"], closed_loop(given))
+    configuration = manifest.configuration
+    codes = layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration))
     rows = pd.DataFrame({"model": vehicle.name, **manifest.constants}, index=index)
     rows["layout_digest"] = index.get_level_values("layout").map(codes)
     rows["settings_digest"] = index.get_level_values("solver").map(manifest.settings)
@@ -182,14 +182,14 @@ def _trajectories(
 ) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
     arrays = readable(folder / SOLUTIONS, read_npz, trust=trust)
-    names, place = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
+    names, index = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
     parts, tasks = [], [vehicle.task(layouts.take(places)) for places in layouts.together(BATCH)]
     for name in manifest.solvers:
         controls = torch.from_numpy(arrays["U"][names.index(name)])
         held_times = arrays["times"][names.index(name)] if "times" in arrays else None
         for task in tasks:
             ids = task.layouts.ids
-            stored = [place[number] for number in ids.tolist()]
+            stored = [index[number] for number in ids.tolist()]
             times = times_at(held_times, stored, task.problem.N)
             verdict = judge(task.problem, controls[stored, : task.problem.N], task.goal, task.goal_radius, times=times)
             columns = {"solver": name, "layout": ids, **frame_columns(verdict)}
@@ -232,19 +232,19 @@ def _nearest(log: pd.DataFrame, layouts: Layouts, contact: Contact, period: floa
     ids = layouts.ids.tolist()
     x = np.full((len(ids), 1 + log["step"].max() if len(log) else 0, STATES), np.nan)
     x[log["mission"].map(ids.index).to_numpy(dtype=int), log["step"]] = log[[f"x{i}" for i in range(STATES)]]
-    found = contact.distances(torch.from_numpy(x), period).numpy()
-    nearest = np.fmin.reduce(np.where(np.isnan(x[..., 0]), np.inf, found), axis=1, initial=np.inf)
+    distances = contact.distances(torch.from_numpy(x), period).numpy()
+    nearest = np.fmin.reduce(np.where(np.isnan(x[..., 0]), np.inf, distances), axis=1, initial=np.inf)
     return dict(zip(ids, nearest.tolist(), strict=True))
 
 
 def _differences(held: pd.DataFrame, computed: pd.DataFrame) -> pd.DataFrame:
-    found = []
+    differing = []
     for name in computed.columns:
         values = held[name] if name in held.columns else pd.Series(pd.NA, index=held.index)
         differ = np.flatnonzero(~_equal(values, computed[name]))
-        found += [(i, *held.index[i], name, values.iloc[i], computed[name].iloc[i]) for i in differ.tolist()]
+        differing += [(i, *held.index[i], name, values.iloc[i], computed[name].iloc[i]) for i in differ.tolist()]
     names = [*held.index.names, "column", "held", "computed"]
-    return pd.DataFrame(sorted(found, key=lambda row: row[0]), columns=["row", *names])[names]
+    return pd.DataFrame(sorted(differing, key=lambda row: row[0]), columns=["row", *names])[names]
 
 
 def _equal(held: pd.Series, computed: pd.Series) -> np.ndarray:
@@ -300,10 +300,10 @@ def confirmed_frame(studies: Sequence[Verification]) -> pd.DataFrame:
     for study in studies:
         for table in study.tables:
             names = _sorted(study, table)
-            held = {kind: " ".join(found) for kind, found in names.items()}
-            held |= {} if any(found for kind, found in names.items() if kind != "confirmed") else {"confirmed": "all"}
+            cells = {kind: " ".join(named) for kind, named in names.items()}
+            cells |= {} if any(named for kind, named in names.items() if kind != "confirmed") else {"confirmed": "all"}
             first = {"study": str(study.folder), "file": table.name, "rows": table.rows}
-            rows.append({**first, "differing": len(table.differences), **held})
+            rows.append({**first, "differing": len(table.differences), **cells})
         empty = dict.fromkeys(("confirmed", "by_outcome", "checksum", "unconfirmed"), "")
         for name in study.absent:
             rows.append({"study": str(study.folder), "file": name, "rows": 0, "differing": 0, **empty})
@@ -324,7 +324,7 @@ def _sorted(study: Verification, table: Table) -> dict[str, list[str]]:
 
 
 def _columns(study: Verification) -> list[str]:
-    held = {name: ", ".join(names) for name, names in _sorted(study, study.tables[0]).items()}
+    columns = {name: ", ".join(names) for name, names in _sorted(study, study.tables[0]).items()}
     texts = {
         "confirmed": "columns: {}",
         "by_outcome": "agree with the outcome: {}",
@@ -332,15 +332,15 @@ def _columns(study: Verification) -> list[str]:
         "unconfirmed": "not confirmed: {} (missions are judged at time steps, of which the log has only the control "
         "steps), but as the study wrote them (checksum)",
     }
-    return [text.format(held[name]) for name, text in texts.items() if held[name]]
+    return [text.format(columns[name]) for name, text in texts.items() if columns[name]]
 
 
 def _difference_text(study: Verification, table: Table) -> str:
-    count, place = len(table.differences), study.folder
-    place = place if table is study.tables[0] else place / table.name
+    count, path = len(table.differences), study.folder
+    path = path if table is study.tables[0] else path / table.name
     rows = [[str(value) for value in row] for row in table.differences.head(DIFFERENT).to_numpy().tolist()]
     values = "1 value differs" if count == 1 else f"{count} values differ"
-    lines = [f"{place}: {values} in {_rows([table.rows])}"]
+    lines = [f"{path}: {values} in {_rows([table.rows])}"]
     lines.append(aligned([list(table.differences.columns), *rows], 1))
     more = count - len(rows)
     return "\n".join([*lines, *([f"... and {more} more"] if more else [])])

@@ -47,7 +47,7 @@ def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) 
     return page(missions(study, parts) if study.missions else _trajectories(study, parts))
 
 
-def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
+def _trajectories(study: Study, searched: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
     controls, held_times = study.flown(SOLUTIONS, "U"), study.times
     document, rows, order = None, study.rows, list[np.ndarray]()
@@ -65,10 +65,10 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
             said = [result_of(row) for row in here], [told(row) for row in here]
             flown.append(flights_of(problem, look, X, U, name, *said, ADMITTED, touching))
         for b, number in enumerate(ids):
-            held = [flights[b] for flights in flown if len(flights[b].path)]
+            shown = [flights[b] for flights in flown if len(flights[b].path)]
             # The knots' times are those of the solver under study; others are shown at the same knots.
-            own = None if held_times is None else held_times[document.solvers[0]][places[b], : problem.N + 1]
-            document.add(f"layout {number}", problem, b, held, found.get(number), own)
+            knot_times = None if held_times is None else held_times[document.solvers[0]][places[b], : problem.N + 1]
+            document.add(f"layout {number}", problem, b, shown, searched.get(number), knot_times)
         bar.update(len(ids))
         order.append(places)
     bar.close()
@@ -87,12 +87,12 @@ def told(row: Mapping[str, Any]) -> Rows:
     cost = f"{row['cost']:.6g}"
     if np.isfinite(row["best_cost"]) and row["best_cost"] != 0:
         cost += f", {row['cost'] / row['best_cost']:.3f} × best"
-    held: Rows = [("status", str(row["status"])), ("cost", cost)]
-    held += [("clearance", f"{row['clearance']:.3f} m")] if np.isfinite(row["clearance"]) else []
-    held += [("violation", f"{row['violation']:.2g}"), ("from the goal", f"{row['goal_distance']:.2f} m")]
+    entries: Rows = [("status", str(row["status"])), ("cost", cost)]
+    entries += [("clearance", f"{row['clearance']:.3f} m")] if np.isfinite(row["clearance"]) else []
+    entries += [("violation", f"{row['violation']:.2g}"), ("from the goal", f"{row['goal_distance']:.2f} m")]
     seconds = row["seconds"]
     time = f"{seconds:.2f} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
-    return [*held, ("iterations", f"{row['iterations']:g}"), ("time", time)]
+    return [*entries, ("iterations", f"{row['iterations']:g}"), ("time", time)]
 
 
 def _parser() -> RunParser:

@@ -35,11 +35,11 @@ def states_of(problem: Problem, U: Tensor, times: Tensor | None) -> Tensor:
     """The states (B, N+1, n) to which controls (B, N, m) lead, with times (B, N+1) of the knots where it is free."""
     if problem.time is None:
         return open_loop(within_horizons(problem).dynamics, problem.x0, U)
-    held = problem.x0.unsqueeze(1).expand(-1, problem.N + 1, -1)
-    whole, _, controls = at_times(problem, held, U, times)
+    start = problem.x0.unsqueeze(1).expand(-1, problem.N + 1, -1)
+    whole, _, controls = at_times(problem, start, U, times)
     return open_loop(whole.dynamics, whole.x0, controls)[..., : problem.n].contiguous()
 
 
-def times_at(held: np.ndarray | None, places: Any, N: int) -> Tensor | None:
+def times_at(times: np.ndarray | None, places: Any, N: int) -> Tensor | None:
     """The times (B, N+1) of some layouts of all (L, N'+1); None where there are none."""
-    return None if held is None else torch.from_numpy(np.ascontiguousarray(held[places, : N + 1]))
+    return None if times is None else torch.from_numpy(np.ascontiguousarray(times[places, : N + 1]))

@@ -33,13 +33,13 @@ def create(path: Path, save: Callable[[IO[bytes]], Any]) -> bool:
         InputError: the system refuses to write there (disk full, no permission).
     """
 
-    def move(part: str, whole: Path) -> None:
+    def move(temporary: str, whole: Path) -> None:
         try:
-            os.link(part, whole)
+            os.link(temporary, whole)
         except OSError as error:
             if error.errno not in NO_LINKS:
                 raise
-            os.replace(part, whole)
+            os.replace(temporary, whole)
 
     try:
         _write(path, save, move)
@@ -89,12 +89,12 @@ def readable(path: Path, reader: Callable[..., Read], sized: bool = True, **opti
     if not path.exists():
         raise damaged(path, "is missing")
     try:
-        found = reader(path, **options)  # first, as it refuses sizes
+        content = reader(path, **options)  # first, as it refuses sizes
         if path.suffix == ".npz":
             with zipfile.ZipFile(path) as members:
                 if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
                     raise ValueError("a checksum differs")
-        return found
+        return content
     except Exception as error:  # damaged bytes make readers raise nearly anything
         if sized and isinstance(error, InputError) and "--trust" in error.expected:
             raise

@@ -81,13 +81,13 @@ class StudyFolder:
     def _claimed(self, path: Path) -> bool:
         """Whether study.json is this study's; False where it is damaged and to be repaired."""
         try:
-            held = read_manifest(path)
+            stored = read_manifest(path)
         except InputError:
             if not self.repair:
                 raise
             return False
-        if held.identity() != self.manifest.identity():
-            raise self._another(f"({difference(held.identity(), self.manifest.identity())})")
+        if stored.identity() != self.manifest.identity():
+            raise self._another(f"({difference(stored.identity(), self.manifest.identity())})")
         return True
 
     def finished(self, layouts: Layouts) -> bool:
@@ -167,13 +167,13 @@ class StudyFolder:
         Raises:
             InputError: a shard is damaged or isn't of this study.
         """
-        held = [self._read(path, solver) for path in self._shards(solver)]
-        if not held:
+        shards = [self._read(path, solver) for path in self._shards(solver)]
+        if not shards:
             return pd.DataFrame(columns=[name for name in COLUMNS if name not in JUDGED]), np.empty((0, 0, 0))
-        rows = pd.concat([rows for rows, _ in held], ignore_index=True)
-        place = {number: i for i, number in enumerate(self.manifest.layouts)}
-        order = rows["layout"].map(place).drop_duplicates().sort_values().index
-        return rows.loc[order].reset_index(drop=True), np.concatenate([U for _, U in held])[order.to_numpy()]
+        rows = pd.concat([rows for rows, _ in shards], ignore_index=True)
+        rank = {number: i for i, number in enumerate(self.manifest.layouts)}
+        order = rows["layout"].map(rank).drop_duplicates().sort_values().index
+        return rows.loc[order].reset_index(drop=True), np.concatenate([U for _, U in shards])[order.to_numpy()]
 
     def finish(self, trials: pd.DataFrame, flown: np.ndarray | pd.DataFrame, layouts: Layouts) -> None:
         """Write trials.parquet, layouts.npz, and solutions.npz from controls or mission.parquet from a table.
@@ -185,8 +185,8 @@ class StudyFolder:
         if isinstance(flown, pd.DataFrame):
             write(self.path / MISSION, _table(flown))
         else:
-            own = {"U": flown} if layouts.free_time is None else parted(flown)
-            write(self.path / SOLUTIONS, _arrays({**own, "solver": solvers, "layout": layouts.ids}))
+            arrays = {"U": flown} if layouts.free_time is None else parted(flown)
+            write(self.path / SOLUTIONS, _arrays({**arrays, "solver": solvers, "layout": layouts.ids}))
         write(self.path / LAYOUTS, _arrays(layouts.arrays()))
 
     def replace(self, trials: pd.DataFrame, layouts: Layouts) -> None:
@@ -194,7 +194,7 @@ class StudyFolder:
         new = {TRIALS: _bytes(_table(trials)), LAYOUTS: _bytes(_arrays(layouts.arrays()))}
         # Old and new content both count as whole until `close`: a stop in between damages nothing.
         sums = self._checksums()
-        both = {name: [*held, sha256(new[name]).hexdigest()] if name in new else held for name, held in sums.items()}
+        both = {name: [*codes, sha256(new[name]).hexdigest()] if name in new else codes for name, codes in sums.items()}
         write(self.path / DONE, _json(both))
         for name, content in new.items():
             write(self.path / name, lambda file, content=content: file.write(content))
@@ -203,8 +203,8 @@ class StudyFolder:
         """Mark the study as done, with the checksums of its files, and drop its shards."""
         write(self.path / DONE, _json({name: [checksum(self.path / name)] for name in self.files}))
         self.drop_shards()
-        for part in self.path.glob(f"{PART[0]}*{PART[1]}"):  # of a start that was killed while it wrote
-            part.unlink(missing_ok=True)
+        for path in self.path.glob(f"{PART[0]}*{PART[1]}"):  # of a start that was killed while it wrote
+            path.unlink(missing_ok=True)
 
     def drop_shards(self) -> None:
         """Remove the shards of a study that is done."""
@@ -277,7 +277,7 @@ def read_checksums(path: Path) -> dict[str, list[str]]:
 
     def read(path: Path) -> dict[str, list[str]]:
         sums = json.loads(regular(path).read_bytes())
-        if not all(isinstance(held, list) for held in sums.values()):
+        if not all(isinstance(digests, list) for digests in sums.values()):
             raise ValueError("no checksums")
         return sums
 
@@ -288,8 +288,8 @@ def read_shard(path: Path) -> Flown:
     """The rows and controls in a shard; InputError where it can't be read."""
 
     def read(path: Path) -> Flown:
-        held = read_npz(path)
-        rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
+        arrays = read_npz(path)
+        rows, U = pd.DataFrame(json.loads(str(arrays["rows"]))), arrays["U"]
         absent = set(COLUMNS) - {*JUDGED, *rows.columns}
         if absent or U.ndim != 3 or len(U) != len(rows):
             raise ValueError(f"{len(rows)} rows, controls {U.shape}, no {', '.join(sorted(absent)) or 'more'}")
@@ -335,11 +335,11 @@ def _arrays(arrays: Mapping[str, np.ndarray]) -> Save:
     return lambda file: np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def _json(held: Mapping[str, Sequence[str]]) -> Save:
-    return lambda file: file.write(json.dumps(held, indent=1).encode())
+def _json(content: Mapping[str, Sequence[str]]) -> Save:
+    return lambda file: file.write(json.dumps(content, indent=1).encode())
 
 
 def _bytes(save: Save) -> bytes:
-    held = io.BytesIO()
-    save(held)
-    return held.getvalue()
+    buffer = io.BytesIO()
+    save(buffer)
+    return buffer.getvalue()

@@ -70,8 +70,8 @@ def files_of(configuration: Mapping[str, Any], further: Iterable[Any] = ()) -> d
     """
     named = [value for value in flat({"plant": configuration.get("plant") or {}}).values() if isinstance(value, str)]
     paths = {path: os.path.expanduser(path) for path in (*named, *map(str, further))}
-    held = {path: checksum(Path(there))[:DIGITS] for path, there in paths.items() if os.path.isfile(there)}
-    return {READ_FILES: held} if held else {}
+    digests = {path: checksum(Path(there))[:DIGITS] for path, there in paths.items() if os.path.isfile(there)}
+    return {READ_FILES: digests} if digests else {}
 
 
 @dataclass(frozen=True)
@@ -96,23 +96,23 @@ class Manifest:
     @property
     def constants(self) -> dict[str, Any]:
         """Values that all rows of the study share, by column."""
-        device, given = self.configuration["device"], self.configuration
+        device, config = self.configuration["device"], self.configuration
         return {
-            "seed": given["seed"], "version": given["version"], "device": device["name"], "dtype": device["dtype"]
+            "seed": config["seed"], "version": config["version"], "device": device["name"], "dtype": device["dtype"]
         }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
         """Equal for two studies exactly if they compute the same; the clearest differences come first."""
-        held = decisive(self.configuration, self.solvers)
-        study = {"layouts": len(self.layouts), **held.pop("study")}
-        given = {"version": self.configuration["version"], "seed": self.configuration["seed"], "study": study}
-        return _normal({**given, **held, "layouts": {str(i): code for i, code in self.layouts.items()}})
+        settings = decisive(self.configuration, self.solvers)
+        study = {"layouts": len(self.layouts), **settings.pop("study")}
+        leading = {"version": self.configuration["version"], "seed": self.configuration["seed"], "study": study}
+        return _normal({**leading, **settings, "layouts": {str(i): code for i, code in self.layouts.items()}})
 
     def to_json(self) -> bytes:
         """The text of study.json; it includes the digests of the settings for readers only."""
-        held = {"configuration": self.configuration, "solvers": self.solvers, "settings": self.settings}
-        held["layouts"] = {str(number): code for number, code in self.layouts.items()}
-        return json.dumps({**held, "checksum": digest(held)}, indent=1, default=str).encode()
+        content = {"configuration": self.configuration, "solvers": self.solvers, "settings": self.settings}
+        content["layouts"] = {str(number): code for number, code in self.layouts.items()}
+        return json.dumps({**content, "checksum": digest(content)}, indent=1, default=str).encode()
 
     @classmethod
     def from_json(cls, text: bytes) -> Self:
@@ -121,10 +121,10 @@ class Manifest:
         Raises:
             ValueError, TypeError, KeyError, AttributeError: the text is none.
         """
-        held = json.loads(text.decode())
-        layouts = {int(number): str(code) for number, code in held["layouts"].items()}
-        made = cls(held["configuration"], held["solvers"], layouts)
-        if held.pop("checksum") != digest(held):
+        content = json.loads(text.decode())
+        layouts = {int(number): str(code) for number, code in content["layouts"].items()}
+        made = cls(content["configuration"], content["solvers"], layouts)
+        if content.pop("checksum") != digest(content):
             raise ValueError("its checksum differs from its content")
         groups = [made.configuration, *made.solvers.values(), *map(made.configuration.get, GROUPS)]
         if not all(group is None or isinstance(group, dict) for group in groups):
@@ -178,8 +178,8 @@ def _shared(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[str, Any]:
         model["dynamics"] = {key: value for key, value in dict(model["dynamics"]).items() if key != "dt"}
     values: dict[str, Any] = {"model": model, "dt": layouts.dt}
     for key, field in OVERRULED.items():
-        values[key] = vehicle.get(key) if (own := getattr(layouts, field)) is None else own
-    values |= {name: own for name in (TIME, BINDS) if (own := getattr(layouts, name)) is not None}
+        values[key] = vehicle.get(key) if (value := getattr(layouts, field)) is None else value
+    values |= {name: value for name in (TIME, BINDS) if (value := getattr(layouts, name)) is not None}
     if layouts.map is not None and layouts.map.batch is None:
         values["map"] = _map_digests(layouts.map)
     return values
@@ -195,7 +195,7 @@ def _of_layout(layouts: Layouts, spheres: Sequence[str], i: int) -> dict[str, An
     if "box_radii" in boxes and not boxes["box_radii"].any():
         del boxes["box_radii"]
     values: dict[str, Any] = {**_present(layouts, spheres, i)}
-    values |= {name: part for name, part in boxes.items() if len(part)}
+    values |= {name: rows for name, rows in boxes.items() if len(rows)}
     values |= _present(layouts, GATES, i)
     values |= {name: states[i] for name in ("start", "goal") if (states := getattr(layouts, name)) is not None}
     if isinstance(layouts.stages, np.ndarray):
@@ -207,11 +207,11 @@ def _of_layout(layouts: Layouts, spheres: Sequence[str], i: int) -> dict[str, An
 
 def _present(layouts: Layouts, names: Sequence[str], i: int) -> dict[str, np.ndarray]:
     """The rows of a layout's arrays, without those of NaN, by which spheres, boxes or gates are absent."""
-    held = {name: value[i] for name in names if (value := getattr(layouts, name)) is not None}
-    if not held:
+    arrays = {name: value[i] for name in names if (value := getattr(layouts, name)) is not None}
+    if not arrays:
         return {}
-    places = held[names[0]]
-    return {name: value[~np.isnan(places).all(axis=-1)] for name, value in held.items()}
+    places = arrays[names[0]]
+    return {name: value[~np.isnan(places).all(axis=-1)] for name, value in arrays.items()}
 
 
 def _map_digests(field: DistanceField) -> dict[str, str]:
@@ -234,12 +234,12 @@ def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 
 def _branches(tree: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    found = []
+    branches = []
     for key, value in tree.items():
         name = f"{path}.{key}" if path else str(key)
-        found.append((name, value))
-        found += _branches(_parts(value), name)
-    return found
+        branches.append((name, value))
+        branches += _branches(_parts(value), name)
+    return branches
 
 
 def _parts(value: Any) -> dict[str, Any]:
@@ -253,11 +253,11 @@ def _normal(value: Any) -> Any:
     """Plain data in which equal numbers are equal in text: floats alone, no negative zero."""
     if isinstance(value, Mapping):
         # No call for text: a manifest has a digest per layout, thousands of them.
-        return {str(key): held if type(held) is str else _normal(held) for key, held in value.items()}
+        return {str(key): item if type(item) is str else _normal(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         return (value.astype(np.float64) + 0.0).tolist() if value.dtype.kind == "f" else _normal(value.tolist())
     if isinstance(value, list | tuple):
-        return [_normal(held) for held in value]
+        return [_normal(item) for item in value]
     if isinstance(value, int | float) and not isinstance(value, bool) and not abs(value) > EXACT:
         return float(value) + 0.0
     return value

@@ -115,8 +115,8 @@ def parts_of(trials: pd.DataFrame) -> list[Part]:
         return [Part(TRAJECTORIES, trials, summarise(trials), compare(trials))]
     flown, single = _own(trials[missions]), _own(trials[~missions])
     pairs = compare(flown)
-    found = [Part(MISSIONS, flown, summarise_missions(flown), pairs[pairs["outcome"] == "reached"])]
-    return [Part(TRAJECTORIES, single, summarise(single), compare(single)), *found] if len(single) else found
+    parts = [Part(MISSIONS, flown, summarise_missions(flown), pairs[pairs["outcome"] == "reached"])]
+    return [Part(TRAJECTORIES, single, summarise(single), compare(single)), *parts] if len(single) else parts
 
 
 def _own(rows: pd.DataFrame) -> pd.DataFrame:
@@ -138,14 +138,14 @@ def write_tables(folder: Path, parts: Sequence[Part]) -> None:
 
 
 def _stacked(tables: Sequence[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
-    held = []
+    frames = []
     for kind, table in tables:
         # Columns that the other kind lacks would turn counts into floats.
         counts = [name for name in table.columns if pd.api.types.is_integer_dtype(table[name])] if tables[1:] else []
-        held.append(table.astype(dict.fromkeys(counts, "Int64")))
-        held[-1].insert(0, KIND, kind)
-    filled = [table for table in held if len(table)]
-    return pd.concat(filled, ignore_index=True) if filled else held[0]
+        frames.append(table.astype(dict.fromkeys(counts, "Int64")))
+        frames[-1].insert(0, KIND, kind)
+    filled = [table for table in frames if len(table)]
+    return pd.concat(filled, ignore_index=True) if filled else frames[0]
 
 
 def format_report(parts: Sequence[Part], form: str) -> str:

@@ -42,8 +42,8 @@ def read_npz(path: Path, trust: bool = False) -> dict[str, np.ndarray]:
     with open(regular(path), "rb") as file:
         if not trust and (size := npz_size(file)) > LARGEST_FILE:
             refuse(path, f"arrays of {size / 1e9:.3g} GB")
-        with np.load(file, allow_pickle=False) as held:
-            return {name: held[name] for name in held.files}
+        with np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
 
 
 def read_layouts(path: Path, trust: bool = False) -> Layouts:
@@ -158,8 +158,8 @@ def _size(path: Path) -> int:
 def _longest(path: Path, column: str) -> int:
     """Bytes of the longest text in a column; repeated ones are held once."""
     table = pyarrow.parquet.read_table(path, columns=[column], read_dictionary=[column], use_threads=False)
-    found = 0
+    longest = 0
     for chunk in table.column(0).chunks:
-        held = chunk.dictionary if isinstance(chunk, pyarrow.DictionaryArray) else chunk
-        found = max(found, pyarrow.compute.max(pyarrow.compute.binary_length(held)).as_py() or 0)
-    return found
+        texts = chunk.dictionary if isinstance(chunk, pyarrow.DictionaryArray) else chunk
+        longest = max(longest, pyarrow.compute.max(pyarrow.compute.binary_length(texts)).as_py() or 0)
+    return longest

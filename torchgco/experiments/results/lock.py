@@ -45,15 +45,15 @@ def held(folder: Path, job: int | None = None, jobs: int | None = None) -> Itera
         InputError: they still hold it then, or the folder can't be written to.
     """
     claim = _Claim(folder, time.monotonic() + PATIENCE)
-    own = claim.whole() if job is None else claim.share(folder / f"{LOCK}-{job}-of-{jobs}")
+    lock = claim.whole() if job is None else claim.share(folder / f"{LOCK}-{job}-of-{jobs}")
     try:
         with suppress(OSError):  # only for the lines of others
             since = datetime.now().astimezone().isoformat(" ", "seconds")
             me = {"pid": os.getpid(), "host": platform.node(), "since": since}
-            Path(f"{_path(own)}{HOLDER}").write_text(json.dumps(me))
+            Path(f"{_path(lock)}{HOLDER}").write_text(json.dumps(me))
         yield
     finally:
-        _release(own)
+        _release(lock)
 
 
 class _Claim:

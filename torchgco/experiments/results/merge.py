@@ -49,11 +49,11 @@ def merge(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> pd.
             than a run's file may, and rows with different content for one
             flight.
     """
-    found = find_runs(folders, trust)
-    unfinished = [run for run in found if run.planned is not None]
-    runs = [run for run in found if len(run.trials)]
+    all_runs = find_runs(folders, trust)
+    unfinished = [run for run in all_runs if run.planned is not None]
+    runs = [run for run in all_runs if len(run.trials)]
     if not runs:
-        raise InputError("folders", "studies with trials", f"{', '.join(map(_folder, found))}, which have none yet")
+        raise InputError("folders", "studies with trials", f"{', '.join(map(_folder, all_runs))}, which have none yet")
     rows, variants = _tagged(runs)
     rows = _named(_without_repetitions(rows, runs), variants)
     merged = _sorted(_judged_together(rows)).drop(columns=OWN)
@@ -78,14 +78,14 @@ def _tagged(runs: Sequence[Run]) -> tuple[pd.DataFrame, list[str]]:
     ]
     rows = pd.concat(tables, ignore_index=True)
     rows = rows.assign(**{name: pd.Categorical.from_codes(*pd.factorize(rows[name])) for name in CODED if name in rows})
-    settings = {digest(held): held for run in runs for held in run.solvers.values()}
+    settings = {digest(solver): solver for run in runs for solver in run.solvers.values()}
     numbers: dict[str, int] = {}
     code = np.zeros(len(rows), dtype=int)
     names = [RUN, "settings_digest", "device", "dtype", "version"]
     groups = grouped(rows, names)
-    firsts = rows[names].iloc[[place[0] for place in groups]].to_numpy(dtype=object)
-    for place, (number, *key) in zip(groups, firsts.tolist(), strict=True):
-        code[place] = numbers.setdefault(_variant(runs[number], settings, *key), len(numbers))
+    firsts = rows[names].iloc[[group[0] for group in groups]].to_numpy(dtype=object)
+    for group, (number, *key) in zip(groups, firsts.tolist(), strict=True):
+        code[group] = numbers.setdefault(_variant(runs[number], settings, *key), len(numbers))
     return rows.assign(**{VARIANT: code}), list(numbers)
 
 
@@ -96,9 +96,9 @@ def _variant(run: Run, settings: Mapping[str, dict[str, Any]], code: str, device
         settings: of all solvers whose manifest was found, by digest.
     """
     kernels = (run.configuration.get("device") or {}).get("kernels", "native")
-    held = flat(settings.get(code, {"settings": code}))
-    held |= {f"device.{name}": value for name, value in zip(ARITHMETIC, (device, dtype, kernels), strict=True)}
-    return json.dumps(held | {"version": version}, sort_keys=True, default=str)
+    values = flat(settings.get(code, {"settings": code}))
+    values |= {f"device.{name}": value for name, value in zip(ARITHMETIC, (device, dtype, kernels), strict=True)}
+    return json.dumps(values | {"version": version}, sort_keys=True, default=str)
 
 
 def _without_repetitions(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
@@ -123,12 +123,12 @@ def _without_repetitions(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFram
 def _named(rows: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
     """The rows with a label after the name of each solver that flew in several variants."""
     names = rows["solver"].astype(object)
-    for place in grouped(rows, ["model", "solver"]):
-        code = rows[VARIANT].iloc[place]
+    for group in grouped(rows, ["model", "solver"]):
+        code = rows[VARIANT].iloc[group]
         numbers = code.unique().tolist()
         if len(numbers) > 1:
-            found = labels([variants[number] for number in numbers])
-            label = code.map({number: found[variants[number]] for number in numbers})
+            by_variant = labels([variants[number] for number in numbers])
+            label = code.map({number: by_variant[variants[number]] for number in numbers})
             names[code.index] = names[code.index] + " [" + label + "]"
     return rows.assign(solver=names.astype("category"))
 
@@ -169,7 +169,7 @@ def _sorted(rows: pd.DataFrame) -> pd.DataFrame:
     flown = rows[[RUN, "solver"]].drop_duplicates()
     baselines = flown.loc[flown.duplicated(RUN), "solver"]  # not the first of their run
     groups = grouped(rows, [*task_columns(rows), "solver"])
-    heads = rows.iloc[[place[0] for place in groups]].reset_index(drop=True)
+    heads = rows.iloc[[group[0] for group in groups]].reset_index(drop=True)
     keys = pd.DataFrame({name: pd.factorize(heads[name])[0] for name in TASK})
     for name in task_columns(rows)[len(TASK) :]:
         keys[name] = heads[name].rank(method="dense", na_option="bottom")

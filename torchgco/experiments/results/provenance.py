@@ -97,10 +97,10 @@ def _entry(setup: Setup, plan: Schedule, command: Sequence[str]) -> dict[str, An
 def _held(path: Path) -> list[dict[str, Any]]:
     """The entries of earlier starts; none where they can't be read."""
     try:
-        held = json.loads(regular(path).read_bytes())
+        entries = json.loads(regular(path).read_bytes())
     except (OSError, ValueError, RecursionError):
         return []
-    return held if isinstance(held, list) else []
+    return entries if isinstance(entries, list) else []
 
 
 def _keep(path: Path, entries: list[dict[str, Any]]) -> None:
@@ -132,8 +132,8 @@ def _processor() -> str | None:
 
 
 def _compiler() -> str | None:
-    found = find_compiler()
-    return None if found is None else found.identity.splitlines()[1]  # after its path
+    compiler = find_compiler()
+    return None if compiler is None else compiler.identity.splitlines()[1]  # after its path
 
 
 def _processor_seconds() -> float:

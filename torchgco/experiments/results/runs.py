@@ -60,11 +60,11 @@ def find_runs(folders: Iterable[str | os.PathLike[str]], trust: bool = False) ->
         InputError: a missing folder, folders without trials, a damaged file, a table that is no study's, without
             `trust` one that takes more memory than a run's file may.
     """
-    given = [Path(folder) for folder in folders]
-    found = below(given, TRIALS, MANIFEST).values()
-    runs = [run for folder in found if (run := _run(folder, folder in given, trust)) is not None]
+    paths = [Path(folder) for folder in folders]
+    studies = below(paths, TRIALS, MANIFEST).values()
+    runs = [run for folder in studies if (run := _run(folder, folder in paths, trust)) is not None]
     if not runs:
-        raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
+        raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, paths)) or "no folder")
     return runs
 
 
@@ -82,15 +82,15 @@ def below(folders: Sequence[Path], *names: str) -> dict[Path, Path]:
     for folder in folders:
         if not folder.is_dir():
             raise InputError("folders", "an existing folder", folder)
-    found = (sorted({path.parent for name in names for path in folder.rglob(name)}) for folder in folders)
-    return {folder.resolve(): folder for some in found for folder in some}
+    groups = (sorted({path.parent for name in names for path in folder.rglob(name)}) for folder in folders)
+    return {folder.resolve(): folder for group in groups for folder in group}
 
 
-def _run(folder: Path, given: bool, trust: bool) -> Run | None:
+def _run(folder: Path, explicit: bool, trust: bool) -> Run | None:
     """The run in a folder; None for a table that a merge wrote, unless the folder itself was given."""
     if (folder / TRIALS).is_file():
         trials = read_trials(folder / TRIALS, trust)
-        if MERGED in trials.attrs and not given:
+        if MERGED in trials.attrs and not explicit:
             return None
         if not (folder / MANIFEST).is_file():
             return Run(folder, trials, {}, {})

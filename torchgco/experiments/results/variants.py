@@ -32,27 +32,27 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     tasks = [list(run.trials[TASK].drop_duplicates().itertuples(index=False, name=None)) for run in runs]
     missions = [bool(are_missions(run.trials).all()) for run in runs]
     chosen: dict[tuple[int, Any], dict[str, Any]] = {}
-    of_kind = [(task, kind) for found, kind in zip(tasks, missions, strict=True) for task in found]
+    of_kind = [(task, kind) for flown, kind in zip(tasks, missions, strict=True) for task in flown]
     for task, kind in dict.fromkeys(of_kind):
-        members = [i for i, found in enumerate(tasks) if task in found and missions[i] == kind]
+        members = [i for i, flown in enumerate(tasks) if task in flown and missions[i] == kind]
         of_task = lambda trials, task=task: trials[(trials[TASK] == list(task)).all(axis=1)]
         # Nearly always a run has flown a single task.
         tables = [runs[i].trials if len(tasks[i]) == 1 else of_task(runs[i].trials) for i in members]
         cells = _swept([runs[i] for i in members], tables)
-        chosen |= {(i, task): held for i, held in zip(members, cells, strict=True)}
-    columns = list(dict.fromkeys(key for held in chosen.values() for key in held))
-    kinds = {key: _kind([held[key] for held in chosen.values() if key in held]) for key in columns}
+        chosen |= {(i, task): values for i, values in zip(members, cells, strict=True)}
+    columns = list(dict.fromkeys(key for values in chosen.values() for key in values))
+    kinds = {key: _kind([values[key] for values in chosen.values() if key in values]) for key in columns}
     frames = []
-    for i, (run, found) in enumerate(zip(runs, tasks, strict=True)):
-        cells = [chosen[i, task] for task in found]
+    for i, (run, flown) in enumerate(zip(runs, tasks, strict=True)):
+        cells = [chosen[i, task] for task in flown]
         of_row = np.zeros(len(run.trials), dtype=int)
-        if len(found) > 1:
-            of_row = run.trials.groupby(TASK, sort=False, dropna=False, observed=True).ngroup()  # numbers `found`
-        held = {
+        if len(flown) > 1:
+            of_row = run.trials.groupby(TASK, sort=False, dropna=False, observed=True).ngroup()  # numbers `flown`
+        arrays = {
             key: pd.array([_cell(cell.get(key), key in cell, kinds[key]) for cell in cells], dtype=kinds[key])
             for key in columns
         }
-        frames.append(pd.DataFrame(held, index=range(len(cells))).take(of_row).set_axis(run.trials.index))
+        frames.append(pd.DataFrame(arrays, index=range(len(cells))).take(of_row).set_axis(run.trials.index))
     return frames
 
 
@@ -62,14 +62,14 @@ def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str
     Args:
         tables: the trials of each run in that task.
     """
-    given = [_keys(run) for run in runs]
-    known = [keys for keys in given if keys]
+    all_keys = [_keys(run) for run in runs]
+    known = [keys for keys in all_keys if keys]
     shared = [key for key in (known[0] if known else {}) if all(key in keys for keys in known)]
     swept = [key for key in shared if key != FILE and len({_text(keys[key]) for keys in known}) > 1]
-    cells = [{key: keys[key] for key in swept if keys} for keys in given]
+    cells = [{key: keys[key] for key in swept if keys} for keys in all_keys]
     clusters = _clusters(runs, cells, tables)
     if FILE in shared and any(clusters):
-        for cell, keys in zip(cells, given, strict=True):
+        for cell, keys in zip(cells, all_keys, strict=True):
             cell |= {FILE: keys[FILE]} if keys else {}
         clusters = _clusters(runs, cells, tables)
     for cell, cluster in zip(cells, clusters, strict=True):
@@ -79,7 +79,7 @@ def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str
 
 def _keys(run: Run) -> dict[str, Any]:
     parts = {name: run.configuration.get(name) for name in ("scenario", "model", *CLOSED_LOOP)}
-    keys = flat({name: part for name, part in parts.items() if isinstance(part, Mapping)})
+    keys = flat({name: node for name, node in parts.items() if isinstance(node, Mapping)})
     return {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAME_KEYS}
 
 
@@ -90,8 +90,8 @@ def _clusters(
 
     Runs whose swept values (`cells`) differ are not compared.
     """
-    held: list[tuple[str, dict[Any, str], str]] = []  # folder, digest by (layout, seed), swept values
-    place = []
+    clusters: list[tuple[str, dict[Any, str], str]] = []  # folder, digest by (layout, seed), swept values
+    numbers = []
     values_of = pd.factorize(np.array([_text(cell) for cell in cells], dtype=object))[0]
     seeds = [(seed, code) for table, code in zip(tables, values_of, strict=True) for seed in table["seed"].unique()]
     if len(set(seeds)) == len(seeds):
@@ -102,16 +102,16 @@ def _clusters(
         return [None] * len(runs)  # nearly always: nothing to distinguish
     for run, rows, cell in zip(runs, of_run, cells, strict=True):
         digests, values = rows.set_index(["layout", "seed"])["layout_digest"].to_dict(), _text(cell)
-        for number, (_, known, theirs) in enumerate(held):
+        for number, (_, known, theirs) in enumerate(clusters):
             if values == theirs and all(known.get(key, code) == code for key, code in digests.items()):
                 known.update(digests)
-                place.append(number)
+                numbers.append(number)
                 break
         else:
-            place.append(len(held))
-            held.append((run.folder.as_posix(), digests, values))
-    split = [sum(theirs == values for *_, theirs in held) > 1 for *_, values in held]
-    return [held[number][0] if split[number] else None for number in place]
+            numbers.append(len(clusters))
+            clusters.append((run.folder.as_posix(), digests, values))
+    split = [sum(theirs == values for *_, theirs in clusters) > 1 for *_, values in clusters]
+    return [clusters[number][0] if split[number] else None for number in numbers]
 
 
 def _digests(trials: pd.DataFrame) -> pd.DataFrame:
@@ -143,13 +143,13 @@ def labels(variants: Sequence[str]) -> dict[str, str]:
     Where the versions alone distinguish the variants, the label is the version. Of many settings the first are named,
     and a number makes equal labels unique.
     """
-    held = {variant: json.loads(variant) for variant in variants}
-    keys = dict.fromkeys(key for settings in held.values() for key in settings)
-    differ = [key for key in keys if len({_text(settings.get(key)) for settings in held.values()}) > 1]
-    if "version" in differ and len({settings.get("version") for settings in held.values()}) == len(held):
+    parsed = {variant: json.loads(variant) for variant in variants}
+    keys = dict.fromkeys(key for settings in parsed.values() for key in settings)
+    differ = [key for key in keys if len({_text(settings.get(key)) for settings in parsed.values()}) > 1]
+    if "version" in differ and len({settings.get("version") for settings in parsed.values()}) == len(parsed):
         differ = ["version"]
     made: dict[str, str] = {}
-    for variant, settings in held.items():
+    for variant, settings in parsed.items():
         more = f", {len(differ) - LABEL_SETTINGS} more" if len(differ) > LABEL_SETTINGS else ""
         label = ", ".join(f"{key}={_value(settings, key)}" for key in differ[:LABEL_SETTINGS]) + more
         alike = sum(other == label or other.startswith(f"{label} #") for other in made.values())

@@ -33,7 +33,7 @@ def summarise_missions(trials: pd.DataFrame) -> pd.DataFrame:
         InputError: as `summarise`.
     """
     summary = summarise(trials)
-    rows = [_of_missions(trials.iloc[place]) for place in grouped(trials, [*task_columns(trials), "solver"])]
+    rows = [_of_missions(trials.iloc[index]) for index in grouped(trials, [*task_columns(trials), "solver"])]
     return pd.concat([summary, pd.DataFrame(rows)], axis=1)
 
 

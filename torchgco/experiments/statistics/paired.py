@@ -112,8 +112,8 @@ class _Flights:
     def match(self, rows: np.ndarray, a: str, b: str) -> tuple[np.ndarray, np.ndarray, int]:
         """Positions of two solvers' rows of the trials that both flew, among `rows`, and how many only one flew."""
         rows_a, rows_b = (rows[self.solver[rows] == self.names.index(name)] for name in (a, b))
-        for name, held in ((a, rows_a), (b, rows_b)):
-            self._check_single(name, held)
+        for name, positions in ((a, rows_a), (b, rows_b)):
+            self._check_single(name, positions)
         _, in_a, in_b = np.intersect1d(self.trial[rows_a], self.trial[rows_b], assume_unique=True, return_indices=True)
         return rows_a[in_a], rows_b[in_b], len(rows_a) + len(rows_b) - 2 * len(in_a)
 

@@ -117,9 +117,9 @@ class _Values:
         return cls(trials["seed"].to_numpy(), invalid, hits, numbers, status, [str(name) for name in statuses])
 
     def summary(self, rows: np.ndarray) -> dict[str, object]:
-        held = {name: values[rows] for name, values in self.numbers.items()}
-        valid, reached, cost = ~self.invalid[rows], self.hits["reached"][rows] == 1, held["cost"]
-        ratio = held["cost_ratio"][reached & np.isfinite(held["cost_ratio"])]
+        selected = {name: values[rows] for name, values in self.numbers.items()}
+        valid, reached, cost = ~self.invalid[rows], self.hits["reached"][rows] == 1, selected["cost"]
+        ratio = selected["cost_ratio"][reached & np.isfinite(selected["cost_ratio"])]
         row: dict[str, object] = {
             "n": len(rows),
             "seed": " ".join(str(seed) for seed in pd.unique(self.seed[rows])),
@@ -128,7 +128,7 @@ class _Values:
         for name in self.hits:
             row |= rate_columns(name, self.hits[name][rows])
         row |= {
-            "violation_median": float(np.median(held["violation"])),
+            "violation_median": float(np.median(selected["violation"])),
             "cost_median_reached": _quantiles("", cost[reached])["_median"],
             "cost_median": _quantiles("", cost[np.isfinite(cost)])["_median"],
             "cost_n": int(np.isfinite(cost).sum()),
@@ -136,7 +136,7 @@ class _Values:
             **_quantiles("cost_ratio", ratio),
         }
         for name in EFFORT:
-            row |= _quantiles(name, held[name][valid])
+            row |= _quantiles(name, selected[name][valid])
         counts = np.bincount(self.status[rows], minlength=len(self.statuses)).tolist()
         return row | {f"{STATUS}{name}": count for name, count in zip(self.statuses, counts, strict=True)}
 
@@ -202,7 +202,7 @@ def rate_columns(name: str, hits: np.ndarray) -> dict[str, object]:
     n, count = int((~np.isnan(hits)).sum()), int(np.nansum(hits))
     low, high = wilson(count, n)
     parts = {"count": count, "n": n, "rate": count / n if n else nan, "low": low, "high": high}
-    return {f"{name}_{part}": value for part, value in parts.items()}
+    return {f"{name}_{suffix}": value for suffix, value in parts.items()}
 
 
 def _truth(column: pd.Series) -> pd.Series:

@@ -57,7 +57,7 @@ class Kind:
         """
         blocks = []
         for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
-            seeds, swept = dict.fromkeys(seed for held in task["seed"] for seed in held.split()), swept_of(task)
+            seeds, swept = dict.fromkeys(seed for text in task["seed"] for seed in text.split()), swept_of(task)
             blocks.append(f"{self.of}{scenario} ({model}), seed {', '.join(seeds)}")
             blocks.append(_lines(task, swept, solver() | self.rates | self.more_rates(task)))
             blocks.append(_lines(task, swept, solver() | self.effort) + self.effort_note(task))
@@ -91,7 +91,7 @@ def rate(name: str) -> Cell:
     def cell(row: pd.Series) -> str:
         if not row[f"{name}_n"]:
             return "-"
-        share, low, high = (100 * row[f"{name}_{part}"] for part in ("rate", "low", "high"))
+        share, low, high = (100 * row[f"{name}_{suffix}"] for suffix in ("rate", "low", "high"))
         return f"{row[f'{name}_count']}/{row[f'{name}_n']} {share:.0f} % [{low:.0f}, {high:.0f}]"
 
     return cell
@@ -131,11 +131,11 @@ def _lines(rows: pd.DataFrame, swept: Sequence[str], columns: Columns) -> str:
 def _printed(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
     """A row for each row, with its task and swept variables before its cells."""
     swept = swept_of(rows)
-    held = [
+    table = [
         [row["scenario"], row["model"], *cells(row, swept), *(cell(row) for cell in columns.values())]
         for _, row in rows.iterrows()
     ]
-    return pd.DataFrame(held, columns=[*TASK, *headers(swept), *columns])
+    return pd.DataFrame(table, columns=[*TASK, *headers(swept), *columns])
 
 
 def format_frame(table: pd.DataFrame, form: str) -> str:

@@ -59,14 +59,14 @@ class SeenMap:
             reach: m, up to which a ray without a return shows free space.
             before: m before a return from which on a ray shows none.
         """
-        found = call(
+        count = call(
             "tgco_add_scan", self._size, self.corner, self.resolution, self.odds, self.state, self._beside,
             self._counts, len(scan.distances), np.ascontiguousarray(scan.origin, np.float64),
             np.ascontiguousarray(scan.directions, np.float64), np.ascontiguousarray(scan.distances, np.float64),
             float(reach), float(before), CHORD * self.resolution,
             HIT, MISS, LEAST_ODDS, MOST_ODDS, FREE_AT, FREE_BESIDE, OCCUPIED_AT, self._touched, self._changed,
         )  # fmt: skip
-        return self._changed[:found].copy()
+        return self._changed[:count].copy()
 
     def clear(self, center: Sequence[float] | np.ndarray, radius: float) -> np.ndarray:
         """Mark the cells whose cubes touch a ball as free, as if seen. Returns the indices of those that changed."""
@@ -74,7 +74,7 @@ class SeenMap:
         away = [
             np.clip(np.abs(axis - p) - 0.5 * self.resolution, 0, None) for axis, p in zip(axes, center, strict=True)
         ]
-        near = sum(np.meshgrid(*(part**2 for part in away), indexing="ij")) <= radius**2
+        near = sum(np.meshgrid(*(offset**2 for offset in away), indexing="ij")) <= radius**2
         new = near & (self.state == UNKNOWN)
         self.odds[new], self.state[new] = FREE_BESIDE, FREE
         return np.flatnonzero(new).astype(np.int32)
@@ -96,8 +96,8 @@ class SeenMap:
 
     def cell(self, point: Sequence[float] | np.ndarray) -> np.ndarray:
         """The cell (3,) int64 that holds a point, or the nearest of the grid."""
-        at = np.floor((np.asarray(point) - self.corner) / self.resolution).astype(np.int64)
-        return np.clip(at, 0, self._size - 1)
+        cell = np.floor((np.asarray(point) - self.corner) / self.resolution).astype(np.int64)
+        return np.clip(cell, 0, self._size - 1)
 
     def box(self, inset: float) -> tuple[np.ndarray, np.ndarray]:
         """The lowest and the highest point (3,), m, of what is left of the grid `inset`, m, within its faces."""

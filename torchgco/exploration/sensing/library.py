@@ -44,5 +44,5 @@ def _library(compiler: Compiler | None) -> ctypes.CDLL:
     for name, declared in DECLARED.findall(source):
         function = getattr(library, name)
         function.restype = c_int64
-        function.argtypes = [c_void_p if "*" in one else C_TYPES[one.split()[0]] for one in declared.split(",")]
+        function.argtypes = [c_void_p if "*" in arg else C_TYPES[arg.split()[0]] for arg in declared.split(",")]
     return library

@@ -134,7 +134,7 @@ class Lidar(Sensor):
     def pattern(self, shift: np.ndarray) -> np.ndarray:
         """See `Sensor`."""
         pitch = np.radians(self.field_of_view) / self.rays
-        azimuth, elevation = (part + by for part, by in zip(self._angles, shift * pitch, strict=True))
+        azimuth, elevation = (angles + by for angles, by in zip(self._angles, shift * pitch, strict=True))
         flat = np.cos(elevation)
         return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
@@ -177,7 +177,7 @@ class Depth(Sensor):
             (2.0 * (np.arange(count) + 0.5 + by) / count - 1.0) * edge
             for count, by, edge in zip(self.rays, shift, reach, strict=True)
         )
-        y, z = (part.ravel() for part in np.meshgrid(across, down, indexing="ij"))
+        y, z = (grid.ravel() for grid in np.meshgrid(across, down, indexing="ij"))
         return np.column_stack([np.ones_like(y), y, z])
 
     def spread(self, distances: np.ndarray) -> np.ndarray:

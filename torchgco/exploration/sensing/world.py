@@ -53,15 +53,15 @@ class Motion:
 
     def off(self, t: np.ndarray) -> np.ndarray:
         """How far they are off (K, M, 3), m, at times t (K,), s."""
-        found = t[:, None, None] * self.velocities
+        offset = t[:, None, None] * self.velocities
         for s in range(self.amplitudes.shape[1]):
             angle = t[:, None, None] * self.rates[:, s] + self.phases[:, s]
-            found = found + self.amplitudes[:, s] * np.sin(angle)
-        return found
+            offset = offset + self.amplitudes[:, s] * np.sin(angle)
+        return offset
 
     def take(self, rows: np.ndarray) -> Self:
         """The motion of some bodies."""
-        return replace(self, **{name: part[rows] for name, part in vars(self).items()})
+        return replace(self, **{name: value[rows] for name, value in vars(self).items()})
 
     def later(self, t: float) -> Self:
         """The same with time t, s, as time 0; what velocities have led to by then isn't counted."""
@@ -70,17 +70,17 @@ class Motion:
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The motion of the bodies of all parts."""
-        most = max((part.amplitudes.shape[1] for part in parts), default=0)
+        most = max((motion.amplitudes.shape[1] for motion in parts), default=0)
 
         def padded(value: np.ndarray) -> np.ndarray:
             return np.pad(value, [(0, 0), (0, most - value.shape[1]), (0, 0)])
 
         none = cls.steady(np.zeros((0, 3)))
         sines = (
-            np.concatenate([padded(getattr(part, name)) for part in (none, *parts)])
+            np.concatenate([padded(getattr(motion, name)) for motion in (none, *parts)])
             for name in ("amplitudes", "rates", "phases")
         )
-        return cls(np.concatenate([part.velocities for part in (none, *parts)]), *sines)
+        return cls(np.concatenate([motion.velocities for motion in (none, *parts)]), *sines)
 
 
 @dataclass(frozen=True)
@@ -109,13 +109,13 @@ class World:
         Raises:
             InputError: obstacles of a kind that has no rays.
         """
-        one = problem.take(slice(b, b + 1))
-        maps = [part.map for part in one.obstacles if part.map is not None]
+        single = problem.take(slice(b, b + 1))
+        maps = [obstacles.map for obstacles in single.obstacles if obstacles.map is not None]
         if len(maps) > 1:
             raise InputError("constraints", "one map at most, for a sensor", len(maps))
-        parts = [_bodies(part) for part in one.obstacles if part.map is None]
-        boxes = np.concatenate([np.zeros((0, 16)), *(part[0] for part in parts)])
-        world = cls(boxes, Motion.joined([part[1] for part in parts]))
+        parts = [_bodies(obstacles) for obstacles in single.obstacles if obstacles.map is None]
+        boxes = np.concatenate([np.zeros((0, 16)), *(bodies[0] for bodies in parts)])
+        world = cls(boxes, Motion.joined([bodies[1] for bodies in parts]))
         if not maps:
             return world
         occupied, corner, resolution = _cells(maps[0])
@@ -150,7 +150,7 @@ class World:
         return distance
 
 
-def _cells(part: Any) -> tuple[np.ndarray, tuple[float, float, float], float]:
+def _cells(map_: Any) -> tuple[np.ndarray, tuple[float, float, float], float]:
     """The occupied cells of one problem's map, where they begin, m, and their side, m.
 
     A cloud of points is rasterised to the cells that its balls reach into, as large as those of its distance field.
@@ -158,14 +158,14 @@ def _cells(part: Any) -> tuple[np.ndarray, tuple[float, float, float], float]:
     Raises:
         InputError: a map of the plane.
     """
-    source, which = part.field.source, int(part.which[0])
+    source, which = map_.field.source, int(map_.which[0])
     if source.d != 3:
         kind = f"{type(source).__name__} in {source.d}-D"
         raise InputError("scenario", "a map in space, for a sensor", kind)
     if isinstance(source, PointCloud):
-        source = _rasterised(source, which, part.field.spacing)
-    held = source.is_occupied | (source.is_unknown & (part.field.unknown == "occupied"))
-    occupied, origin = (held, source.origin) if source.batch is None else (held[which], source.origin)
+        source = _rasterised(source, which, map_.field.spacing)
+    blocked = source.is_occupied | (source.is_unknown & (map_.field.unknown == "occupied"))
+    occupied, origin = (blocked, source.origin) if source.batch is None else (blocked[which], source.origin)
     x, y, z = (origin if origin.ndim == 1 else origin[which]).tolist()
     return np.ascontiguousarray(occupied, np.uint8), (x, y, z), source.resolution
 
@@ -176,11 +176,11 @@ def _rasterised(cloud: PointCloud, which: int, side: float) -> OccupancyGrid:
     return cloud.single(0 if cloud.batch is None else which).rasterised(side)
 
 
-def _bodies(part: Obstacles) -> tuple[np.ndarray, Motion]:
+def _bodies(obstacles: Obstacles) -> tuple[np.ndarray, Motion]:
     """The boxes (M, 16) of obstacles, and how they move, of one problem, without the absent ones."""
-    shapes = part.shapes(0)
+    shapes = obstacles.shapes(0)
     if shapes is None or shapes.track is not None:
-        raise InputError("scenario", "spheres, boxes, capsules or a map for a sensor", type(part).__name__)
+        raise InputError("scenario", "spheres, boxes, capsules or a map for a sensor", type(obstacles).__name__)
     M, radius = len(shapes.center), np.where(shapes.radius < 1e-12, 0.0, shapes.radius)  # of a sharp box: rounding
     boxes = np.concatenate([shapes.center, shapes.sides.reshape(M, 9), shapes.half, radius[:, None]], axis=1)
     motion = Motion.steady(np.zeros((M, 3)) if shapes.velocity is None else shapes.velocity)

@@ -86,7 +86,7 @@ class Ahead:
             back = ca.SX.sym(f"v{i}", call.inputs.numel())
             upper = ca.SX.sym(f"h{i}", len(columns) * (len(columns) + 1) // 2)
             stages.append(Stage(self.stages[i].source, by, ca.vertcat(back, upper), i))
-            pairs = [(p, q) for at, p in enumerate(columns) for q in columns[at:]]
+            pairs = [(p, q) for first, p in enumerate(columns) for q in columns[first:]]
             for (p, q), entry in zip(pairs, ca.vertsplit(upper), strict=True):
                 bent[p, q] += entry
                 if p != q:
@@ -94,9 +94,9 @@ class Ahead:
             total += _product(back.T, call.inputs, chooses(by))
         symbols = [self.z, *(call.outputs for call in self.calls)]
         along = ca.vertcat(ca.SX.eye(self.z.numel()), *self.slopes)
-        own = ca.sparsify(second(total, ca.vertcat(*symbols)))
-        chosen = chooses(own)
-        return stages, ca.sparsify(bent + _product(_product(own, along, chosen).T, along, chosen))
+        inner = ca.sparsify(second(total, ca.vertcat(*symbols)))
+        chosen = chooses(inner)
+        return stages, ca.sparsify(bent + _product(_product(inner, along, chosen).T, along, chosen))
 
 
 def chooses(expression: Any) -> bool:
@@ -148,7 +148,7 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
         return emit.emit(name, ca.Function(name, [*inputs], [*outputs]), emit.SHARED_AT)
     if (kept_bytes := sum(stages[i].source.kept_bytes for i in kept if stages[i].ahead is None)) > MOST_KEPT:
         raise InputError("networks", f"derivatives of at most {MOST_KEPT} bytes in native kernels", kept_bytes)
-    given = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
+    arguments = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
     passed = ", ".join(f"in{i}" for i in range(len(inputs)))
     helpers, declared, lines, symbols = [], [], [], [*inputs]
     for i in kept:
@@ -163,7 +163,7 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
     helpers.append(emit.emit(f"{name}_end", ca.Function(name, symbols, [*outputs]), emit.SHARED_AT))
     lines.append(f"    {name}_end({passed}, {', '.join(f'out{i}' for i in range(len(outputs)))});")
     written = ", ".join(f"V *restrict out{i}" for i in range(len(outputs)))
-    head = f"__attribute__((noinline)) static void {name}({given}, {written}) {{"
+    head = f"__attribute__((noinline)) static void {name}({arguments}, {written}) {{"
     return "\n".join([*dict.fromkeys(helpers), head, *declared, *lines, "}\n"])
 
 

@@ -44,8 +44,8 @@ def rows_numbers(problem: Problem, i: int, source: KnotSource, shared: Tensor) -
 
 def traced_part(problem: Problem, i: int) -> Any:
     """What is traced of constraint i: itself, or what places the balls of a body, whose rows C knows."""
-    part: Any = problem.constraints[i]
-    return part.points if is_lifted(part) else part
+    constraint: Any = problem.constraints[i]
+    return constraint.points if is_lifted(constraint) else constraint
 
 
 def span_of_rows(problem: Problem, i: int) -> Span:
@@ -97,7 +97,7 @@ def places_of(slopes: Any) -> list[tuple[int, int, int]]:
 
 def squares(places: list[tuple[int, int, int]], weights: str) -> list[str]:
     """C that adds c_z' diag(weights) c_z to the upper triangle of H, of slopes e at these places."""
-    pairs = ((one, other) for one in places for other in places if other[0] == one[0] and other[1] >= one[1])
+    pairs = ((first, other) for first in places for other in places if other[0] == first[0] and other[1] >= first[1])
     return [
         f"    ADD(H[{column} * (NX + NU) + {later}], e[{i}] * {weights}[{row}], e[{j}]);"
         for (row, column, i), (_, later, j) in pairs

@@ -60,11 +60,11 @@ def trace_cost(problem: Problem) -> CostSource:
     cost, *_ = unscaled(problem)
     if type(cost).total is not Cost.total:
         raise InputError(_named("total", cost), "the sum of stage and terminal costs for native kernels", "its own")
-    own = None if type(cost).expand is Cost.expand else problem.n + 1 + problem.m
+    block = None if type(cost).expand is Cost.expand else problem.n + 1 + problem.m
     stage, last = spans_of_cost(problem)
     return CostSource(
-        knot_source("stage", stage, partial(_code, "stage", own), __file__),
-        knot_source("last", last, partial(_code, "last", own), __file__),
+        knot_source("stage", stage, partial(_code, "stage", block), __file__),
+        knot_source("last", last, partial(_code, "last", block), __file__),
     )
 
 
@@ -74,9 +74,9 @@ def cost_arrays(problem: Problem, source: CostSource, shared: tuple[Tensor, Tens
     `shared` are the numbers that all problems share, of stages and last knot.
     """
     cost, factor, shift = unscaled(problem)
-    own = own_tensors(cost)
-    stage = source.stage.numbers(problem.B, own, shared[0], lambda: spans_of_cost(problem)[0])
-    last = source.last.numbers(problem.B, own, shared[1], lambda: spans_of_cost(problem)[1])
+    tensors = own_tensors(cost)
+    stage = source.stage.numbers(problem.B, tensors, shared[0], lambda: spans_of_cost(problem)[0])
+    last = source.last.numbers(problem.B, tensors, shared[1], lambda: spans_of_cost(problem)[1])
     scale = torch.stack((factor, shift), dim=-1).unsqueeze(1)
     numbers = {TracedCost.FACTOR: scale, TracedCost.STAGE: stage, TracedCost.LAST: last}
     arrays = [array(numbers[which], knots=True) for which in TracedCost]
@@ -87,40 +87,40 @@ def spans_of_cost(problem: Problem) -> tuple[Span, Span]:
     """Stages and last knot, traced: the value, followed by the block (s, s) of the cost's own `expand`, if any."""
     (cost, *_), N, n, m = unscaled(problem), problem.N, problem.n, problem.m
     cost = apart(cost)
-    own = own_tensors(cost)
+    tensors = own_tensors(cost)
 
     def stage(i: Tensor, X: Tensor, U: Tensor) -> Tensor:
-        part = cost.take(i)
-        value = part.stage(X, U, torch.arange(N))
+        single = cost.take(i)
+        value = single.stage(X, U, torch.arange(N))
         if tuple(value.shape) != (1, N):
             raise InputError(_named("stage", cost), f"costs (1, {N}) of states (1, {N}, {n})", tuple(value.shape))
-        return _with_blocks(part, value, torch.cat((X, X.new_zeros(1, 1, n)), dim=1), U, slice(0, N))
+        return _with_blocks(single, value, torch.cat((X, X.new_zeros(1, 1, n)), dim=1), U, slice(0, N))
 
     def last(i: Tensor, X: Tensor, U: Tensor) -> Tensor:
-        part = cost.take(i)
-        value = part.terminal(X[:, 0])
+        single = cost.take(i)
+        value = single.terminal(X[:, 0])
         if tuple(value.shape) != (1,):
             raise InputError(_named("terminal", cost), f"costs (1,) of states (1, {n})", tuple(value.shape))
         X = torch.cat((X.new_zeros(1, N, n), X), dim=1)
-        return _with_blocks(part, value.unsqueeze(-1), X, X.new_zeros(1, N, m), slice(N, N + 1))
+        return _with_blocks(single, value.unsqueeze(-1), X, X.new_zeros(1, N, m), slice(N, N + 1))
 
     def span(name: str, function: Callable[..., Tensor], states: int, controls: int) -> Span:
         examples = problem.x0.new_zeros(1, states, n), problem.x0.new_zeros(1, controls, m)
         with cost.precision(problem.x0.dtype):
-            traced = Traced(_named(name, cost), function, *examples, own=own)
+            traced = Traced(_named(name, cost), function, *examples, own=tensors)
         return Span(traced, n, m, states, controls, range(states))
 
     return span("stage", stage, N, N), span("terminal", last, 1, 0)
 
 
-def _with_blocks(part: Cost, value: Tensor, X: Tensor, U: Tensor, knots: slice) -> Tensor:
+def _with_blocks(cost: Cost, value: Tensor, X: Tensor, U: Tensor, knots: slice) -> Tensor:
     """Values (1, K) followed by what the cost's own `expand` writes at these knots, (1, K, 1 [+ s * s])."""
     value = value.unsqueeze(-1)
-    if type(part).expand is Cost.expand:
+    if type(cost).expand is Cost.expand:
         return value
     s = X.shape[-1] + 1 + U.shape[-1]
     H = X.new_zeros(1, X.shape[1], s, s)
-    part.expand(X, U, H)
+    cost.expand(X, U, H)
     return torch.cat((value, H[:, knots].flatten(2)), dim=-1)
 
 
@@ -128,17 +128,17 @@ def _named(method: str, cost: Cost) -> str:
     return f"cost.{method} ({type(cost).__name__})"
 
 
-def _code(name: str, own: int | None, knot: Knot, _: str) -> str:
+def _code(name: str, block: int | None, knot: Knot, _: str) -> str:
     import casadi as ca
 
     inputs, value = knot.inputs, knot.rows[0]
-    gradient, hessian, stages = _derivatives(knot) if own is None else _blocks(knot, own)
+    gradient, hessian, stages = _derivatives(knot) if block is None else _blocks(knot, block)
     size = knot.x.numel() + knot.u.numel()
     slopes = [(i, gradient[i]) for i in range(size) if not gradient[i].is_zero()]
     curvatures = [
         (i * size + j, hessian[i, j]) for i in range(size) for j in range(i, size) if not hessian[i, j].is_zero()
     ]
-    places, entries = [[part[at] for part in (*slopes, *curvatures)] for at in (0, 1)]
+    places, entries = [[pair[which] for pair in (*slopes, *curvatures)] for which in (0, 1)]
     column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *entries)))
     return "\n".join(
         [

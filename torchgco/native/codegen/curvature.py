@@ -53,14 +53,14 @@ def _model_code(model: DynamicsSource) -> str:
     return emit.checked(traced.field, store.made(key, make, f"curvature {traced.kin}").content["code"])
 
 
-def _step_code(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> str:
+def _step_code(inputs: Sequence[Any], ahead: Any, net_calls: Sequence[Call]) -> str:
     """Of a step `ahead` (n), CasADi's column, with calls of networks."""
     import casadi as ca
 
     y = ca.SX.sym("y", ahead.numel())
-    if not found:
+    if not net_calls:
         return _curves("tgco_curve", [*inputs, y], ca.dot(y, ahead))
-    tangents = calls.Ahead(found, ca.vertcat(*inputs[:2]))
+    tangents = calls.Ahead(net_calls, ca.vertcat(*inputs[:2]))
     slopes = computed_entries(tangents.jacobian(ahead))
     code = _curves("tgco_together", [*inputs, y], ca.dot(y, ahead), tangents, slopes)
     return f"{code}\n#define TGCO_TOGETHER"
@@ -114,9 +114,9 @@ def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | No
         stages, hessian = tangents.hessian(total, lambda total, z: _hessian(total, z, ca.symvar(total), made))
     else:
         hessian = ca.sparsify(_hessian(total, z, inputs))
-    found: list[Any] = hessian.nonzeros()
+    nonzeros: list[Any] = hessian.nonzeros()
     rows, columns = hessian.sparsity().get_triplet()
-    upper = [(i, j, entry) for i, j, entry in zip(rows, columns, found, strict=True) if j >= i]
+    upper = [(i, j, entry) for i, j, entry in zip(rows, columns, nonzeros, strict=True) if j >= i]
     column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *(entry for *_, entry in upper))))
     arguments = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
     passed = ", ".join(f"in{i}" for i in range(len(inputs)))
@@ -128,7 +128,7 @@ def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | No
         f"__attribute__((noinline)) static void {name}({arguments}, V *H) {{",
         f"    V e[{max(1, len(upper))}];",
         f"    {name}_entries({passed}, e);",
-        *(f"    H[{i * size + j}] += e[{at}];" for at, (i, j, _) in enumerate(upper)),
+        *(f"    H[{i * size + j}] += e[{k}];" for k, (i, j, _) in enumerate(upper)),
         "}",
     ]
     return "\n".join(lines)
@@ -157,34 +157,34 @@ def _has_hidden_pole(function: Any, poles: Container[int] = ()) -> bool:
 
     A pole that is needed without any branch, too, makes the value itself infinite or NaN, in either mode.
     """
-    at, (operations, needs) = emit.codes(), emit.instructions(function)
-    smooth = {at[name] for name in SMOOTH_OPERATIONS}
+    code_of, (operations, needs) = emit.codes(), emit.instructions(function)
+    smooth = {code_of[name] for name in SMOOTH_OPERATIONS}
     always, ever = (_reached(operations, needs, through) for through in (False, True))
     hidden = [(operations[i], function.instruction_input(i)) for i in ever - always]
-    return any(what not in smooth or (what == at["INPUT"] and read[0] in poles) for what, read in hidden)
+    return any(what not in smooth or (what == code_of["INPUT"] and read[0] in poles) for what, read in hidden)
 
 
 def _reached(operations: list[int], needs: list[list[int]], through: bool) -> set[int]:
     """The instructions that outputs need; those of branches, too, with `through`."""
-    at = emit.codes()
-    open_ = [i for i, operation in enumerate(operations) if operation == at["OUTPUT"]]
-    found = set(open_)
+    code_of = emit.codes()
+    open_ = [i for i, operation in enumerate(operations) if operation == code_of["OUTPUT"]]
+    reached = set(open_)
     while open_:
         i = open_.pop()
-        branch = operations[i] == at["IF_ELSE_ZERO"] and not through
+        branch = operations[i] == code_of["IF_ELSE_ZERO"] and not through
         for j in needs[i][:1] if branch else needs[i]:
-            if j not in found:
-                found.add(j)
+            if j not in reached:
+                reached.add(j)
                 open_.append(j)
-    return found
+    return reached
 
 
 def _push(model: DynamicsSource) -> str:
     """`model_push(f, z, out)`: out = F z."""
     lines = ["void model_push(const V *restrict f, const V *restrict z, V *restrict out) {"]
     lines.append("    for (int i = 0; i < NX; i++) out[i] = SET(0.0);")
-    for row, column, place, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
-        factor = f"f[{place}]" if place >= 0 else f"SET({emit.literal(value)})"
+    for row, column, index, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
+        factor = f"f[{index}]" if index >= 0 else f"SET({emit.literal(value)})"
         lines.append(f"    ADD(out[{row}], {factor}, z[{column}]);")
     return "\n".join([*lines, "}"])
 
@@ -195,7 +195,7 @@ def _switches(rows: Iterable[tuple[int, KnotSource]]) -> str:
     for i, source in rows:
         models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, w, by, cc, lam, g, H); break;")
         alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, w, z, out); break;")
-    given = "int i, const V *x, const V *u, const V *p, const double *w"
-    of_model = f"void model_bend_rows({given},\n    const V *by, const V *cc, const V *lam, V *const *g, V *H)"
-    along = f"void model_along_rows(\n    {given}, const V *z, V *out)"
+    arguments = "int i, const V *x, const V *u, const V *p, const double *w"
+    of_model = f"void model_bend_rows({arguments},\n    const V *by, const V *cc, const V *lam, V *const *g, V *H)"
+    along = f"void model_along_rows(\n    {arguments}, const V *z, V *out)"
     return f"{emit.switch(of_model, models)}\n{emit.switch(along, alongs)}"

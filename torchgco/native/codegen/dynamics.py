@@ -52,7 +52,7 @@ class DynamicsSource:
     @property
     def computed(self) -> int:
         """Number of the Jacobian's entries that `tgco_jacobian` writes."""
-        return sum(place >= 0 for place in self.places)
+        return sum(index >= 0 for index in self.places)
 
     def numbers(self, B: int, of: Dynamics, shared: Tensor) -> Tensor:
         """The own numbers (B|1, K|1, count) of B problems with the model `of`, with an axis of stages; `shared` are
@@ -110,9 +110,9 @@ def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any, list[Call]]
     x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
     p, w = ca.SX.sym("p", traced.count), ca.SX.sym("w", len(traced.pattern))
     shared = np.where(np.isnan(traced.pattern), elements(w), traced.pattern)
-    found: list[Call] = []
-    ahead = traced(elements(p), elements(x)[None], elements(u)[None], shared=shared, calls=found).reshape(-1)
-    return [x, u, p, w], ca.densify(ca.vertcat(*ahead)), found
+    net_calls: list[Call] = []
+    ahead = traced(elements(p), elements(x)[None], elements(u)[None], shared=shared, calls=net_calls).reshape(-1)
+    return [x, u, p, w], ca.densify(ca.vertcat(*ahead)), net_calls
 
 
 def step_parts(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> dict[str, Any]:

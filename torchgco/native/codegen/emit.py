@@ -84,13 +84,13 @@ def _statements(function: ca.Function, shared: int | None) -> tuple[list[str], i
     for k, read in enumerate(needs):
         if k in taken:
             continue
-        given = [names[one] for one in read]
-        free += [names.pop(one) for one in dict.fromkeys(read) if last[one] == k]
+        operands = [names[j] for j in read]
+        free += [names.pop(j) for j in dict.fromkeys(read) if last[j] == k]
         if operations[k] == codes()["OUTPUT"]:
-            place, entry = function.instruction_output(k)
-            lines.append(f"out{place}[{entry}] = {given[0]};")
+            output, entry = function.instruction_output(k)
+            lines.append(f"out{output}[{entry}] = {operands[0]};")
             continue
-        value = sums[k][1].format(*given) if k in sums else _value(function, k, given, shared)
+        value = sums[k][1].format(*operands) if k in sums else _value(function, k, operands, shared)
         if not free:
             free.append(f"w{size}")
             size += 1
@@ -101,14 +101,14 @@ def _statements(function: ca.Function, shared: int | None) -> tuple[list[str], i
 
 def instructions(function: ca.Function) -> tuple[list[int], list[list[int]]]:
     """The operations of all instructions, and the instructions that have made what each of them reads."""
-    at, operations, reads = codes(), [], []
+    code_of, operations, reads = codes(), [], []
     written: dict[int, int] = {}
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
-        given = operation in (at["INPUT"], at["CONST"])
+        leaf = operation in (code_of["INPUT"], code_of["CONST"])
         operations.append(operation)
-        reads.append([] if given else [written[place] for place in function.instruction_input(k)])
-        if operation != at["OUTPUT"]:
+        reads.append([] if leaf else [written[variable] for variable in function.instruction_input(k)])
+        if operation != code_of["OUTPUT"]:
             written[function.instruction_output(k)[0]] = k
     return operations, reads
 
@@ -117,34 +117,34 @@ def _sums(operations: list[int], reads: list[list[int]]) -> dict[int, tuple[int,
     """Sums and differences that take a product nobody else reads, which is rounded once with them: the product's
     instruction, and text and operands of both together.
     """
-    at, uses = codes(), Counter(one for read in reads for one in read)
-    found: dict[int, tuple[int, str, list[int]]] = {}
+    code_of, uses = codes(), Counter(j for read in reads for j in read)
+    sums: dict[int, tuple[int, str, list[int]]] = {}
     for k, operation in enumerate(operations):
-        if operation not in (at["ADD"], at["SUB"]):
+        if operation not in (code_of["ADD"], code_of["SUB"]):
             continue
-        for own, other in ((1, 0), (0, 1)):
-            product, rest = reads[k][own], reads[k][other]
-            if operations[product] not in (at["MUL"], at["SQ"]) or uses[product] > 1:
+        for side, other in ((1, 0), (0, 1)):
+            product, rest = reads[k][side], reads[k][other]
+            if operations[product] not in (code_of["MUL"], code_of["SQ"]) or uses[product] > 1:
                 continue
-            signs = ("", "") if operation == at["ADD"] else ("-", "") if own else ("", "-")
+            signs = ("", "") if operation == code_of["ADD"] else ("-", "") if side else ("", "-")
             factors = (reads[product] * 2)[:2]
-            found[k] = product, f"tgco_fused({signs[0]}{{0}}, {{1}}, {signs[1]}{{2}})", [*factors, rest]
+            sums[k] = product, f"tgco_fused({signs[0]}{{0}}, {{1}}, {signs[1]}{{2}})", [*factors, rest]
             break
-    return found
+    return sums
 
 
 def _value(function: ca.Function, k: int, read: list[str], shared: int | None) -> str:
     """What an instruction makes of the variables that it reads."""
-    at, operation = codes(), function.instruction_id(k)
-    if operation == at["INPUT"]:
-        place, entry = function.instruction_input(k)
-        value = f"in{place}[{entry}]"
-        return f"SET({value})" if place == shared else value
-    if operation == at["CONST"]:
+    code_of, operation = codes(), function.instruction_id(k)
+    if operation == code_of["INPUT"]:
+        argument, entry = function.instruction_input(k)
+        value = f"in{argument}[{entry}]"
+        return f"SET({value})" if argument == shared else value
+    if operation == code_of["CONST"]:
         return f"SET({literal(function.instruction_constant(k))})"
     if operation in _templates():
         return _templates()[operation].format(*read)
-    (meant,) = (word for word, code in at.items() if code == operation)
+    (meant,) = (word for word, code in code_of.items() if code == operation)
     raise ValueError(f"{function.name()}: no counterpart in C for CasADi's operation {meant}")
 
 

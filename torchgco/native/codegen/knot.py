@@ -82,11 +82,11 @@ class KnotSource:
 
         None where one of them is computed, or isn't a problem's own.
         """
-        found = self.span.traced.picks if self._is_own else None
-        return None if found is None or bool((self.places >= len(found)).any()) else found[self.places]
+        picks = self.span.traced.picks if self._is_own else None
+        return None if picks is None or bool((self.places >= len(picks)).any()) else picks[self.places]
 
-    def numbers(self, B: int, own: Sequence[Tensor], shared: Tensor, again: Callable[[], Span]) -> Tensor:
-        """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `own`.
+    def numbers(self, B: int, tensors: Sequence[Tensor], shared: Tensor, again: Callable[[], Span]) -> Tensor:
+        """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `tensors`.
 
         Args:
             shared: `Traced.shared_numbers`.
@@ -98,7 +98,7 @@ class KnotSource:
         fixed = torch.cat((torch.from_numpy(self.span.traced.constants), shared))
         if not self._is_own:
             return fixed[self.places - self.span.traced.count].unsqueeze(0)
-        traced = self.span.traced.rebound(own, B)
+        traced = self.span.traced.rebound(tensors, B)
         if traced is None:
             traced = again().traced
             if traced.fingerprint() != self.span.traced.fingerprint():
@@ -166,7 +166,7 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
         calls=calls.all,
     ).reshape(len(span.knots), -1)
     x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
-    at = {number.element_hash(): i for i, number in enumerate(each)}
+    index = {number.element_hash(): i for i, number in enumerate(each)}
     reads, places, forms, common = [], [], {}, None
     first: Any = None
     columns, width = ca.densify(ca.vertcat(ca.SX(0, 1), *found.ravel())), found.shape[1]
@@ -175,7 +175,7 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
         made = [call.outputs for call in inside]
         results = [column, *(call.inputs for call in inside)]
         # Its own numbers alone: functions of those of all knots would together be as long as the horizon squared.
-        reads.append([at[name] for name in _names(*results) if name in at])
+        reads.append([index[name] for name in _names(*results) if name in index])
         inputs = [
             X[k],
             U[k] if k < span.controls else u,
@@ -196,17 +196,17 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
         if form != common:
             raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
     differ = [len(set(column)) > 1 for column in zip(*places, strict=True)]
-    own = [i for i, place in enumerate(places[0]) if place < count or differ[i]]
-    p, w = ca.SX.sym("p", len(own)), ca.SX.sym("w", len(pattern))
+    varying = [i for i, position in enumerate(places[0]) if position < count or differ[i]]
+    p, w = ca.SX.sym("p", len(varying)), ca.SX.sym("w", len(pattern))
     values: list[Any] = [0.0] * count + constants.tolist()
     values += [w[i] if np.isnan(value) else value for i, value in enumerate(pattern.tolist())]
-    for i, place in enumerate(own):
-        values[places[0][place]] = p[i]
+    for i, slot in enumerate(varying):
+        values[places[0][slot]] = p[i]
     inside = calls.first
     made = [ca.SX.sym(f"o{i}", call.net.size) for i, call in enumerate(inside)]
     read = ca.vertcat(ca.SX(0, 1), *(values[i] for i in reads[0]))
     rows, *points = first.call([x, u, read, *made])
-    chosen = [[used[i] for i in own] for used in (places if any(differ) else places[:1])]
+    chosen = [[used[i] for i in varying] for used in (places if any(differ) else places[:1])]
     found = [Call(call.net, point, out) for call, point, out in zip(inside, points, made, strict=True)]
     return Knot(x, u, p, w, rows, found), chosen
 
@@ -231,10 +231,10 @@ class _Calls:
             read = {self._owners[name] for name in _names(open_.pop()) if name in self._owners} - places
             places |= read
             open_ += [self.all[i].inputs for i in read]
-        found = [self.all[i] for i in sorted(places)]
+        reached = [self.all[i] for i in sorted(places)]
         if not self._asked:
-            self._asked, self.first = True, found
-        return found
+            self._asked, self.first = True, reached
+        return reached
 
     def key(self, call: Call) -> str:
         """What a call computes."""

@@ -98,15 +98,15 @@ class NetSource:
         """The loop over the neurons of layer i, with their slopes and curvatures."""
         layer = self.net.layers[i - 1]
         assert isinstance(layer, Neurons)
-        vectors = [f"    REAL w{j}[NET_SIZE({layer.h})]; net_weights(w + {at}, {layer.h}, w{j});"
-                   for j, at in enumerate(layer.vectors)]  # fmt: skip
-        given = [f"net_lanes(a{j} + i)" for j in layer.sources]
-        given += [f"net_lanes(w{j} + i)" for j in range(len(layer.vectors))]
-        given += [f"SET(w[{at}])" for at in layer.singles]
-        names = [f"e{j}" for j in range(len(given))]
+        vectors = [f"    REAL w{j}[NET_SIZE({layer.h})]; net_weights(w + {offset}, {layer.h}, w{j});"
+                   for j, offset in enumerate(layer.vectors)]  # fmt: skip
+        operands = [f"net_lanes(a{j} + i)" for j in layer.sources]
+        operands += [f"net_lanes(w{j} + i)" for j in range(len(layer.vectors))]
+        operands += [f"SET(w[{offset}])" for offset in layer.singles]
+        names = [f"e{j}" for j in range(len(operands))]
         targets = [f"a{i}", *(self._places(i) if derived else ())]
         lines = ["    {", *vectors, f"    for (int i = 0; i < NET_SIZE({layer.h}); i += LANES) {{"]
-        lines += [f"        V {name}[1] = {{{value}}};" for name, value in zip(names, given, strict=True)]
+        lines += [f"        V {name}[1] = {{{value}}};" for name, value in zip(names, operands, strict=True)]
         lines.append(f"        V e[{len(targets)}];")
         lines.append(f"        tgco_net_KEY_{'g' if derived else 'f'}{i}({', '.join((*names, 'e'))});")
         lines += [f"        net_store({target} + i, e[{j}]);" for j, target in enumerate(targets)]
@@ -129,26 +129,26 @@ class NetSource:
         return "\n".join([*lines, *self._copied("o"), "}"])
 
     def _copied(self, to: str) -> list[str]:
-        lines, place = [], 0
+        lines, offset = [], 0
         for i in self.net.outputs:
-            lines.append(f"    memcpy({to} + {place}, a{i}, {self.net.sizes[i]} * sizeof(REAL));")
-            place += self.net.sizes[i]
+            lines.append(f"    memcpy({to} + {offset}, a{i}, {self.net.sizes[i]} * sizeof(REAL));")
+            offset += self.net.sizes[i]
         return lines
 
     @property
     def _bent(self) -> list[int]:
         """The layers whose tangents the second derivatives need."""
-        found = set()
+        bent = set()
         for layer, derived in zip(self.net.layers, self._derived, strict=True):
             if isinstance(layer, Neurons) and derived is not None:
-                found |= {layer.sources[j] for pair in derived.curvatures for j in pair}
-        return sorted(found)
+                bent |= {layer.sources[j] for pair in derived.curvatures for j in pair}
+        return sorted(bent)
 
     def _structure(self) -> str:
         arrays = [f"    REAL t{i}[{self._even} * NET_SIZE({self.net.sizes[i]})];" for i in self._bent]
         for i, layer in enumerate(self.net.layers, 1):
             if isinstance(layer, Neurons):
-                names = [place.removeprefix("kept->") for place in self._places(i)]
+                names = [path.removeprefix("kept->") for path in self._places(i)]
                 arrays += [f"    REAL {name}[NET_SIZE({layer.h})];" for name in names]
         return "\n".join(["typedef struct {", *arrays, "    int none;", "} tgco_net_KEY_point;"])
 
@@ -164,56 +164,54 @@ class NetSource:
             lines.append(f"    REAL *t{i} = kept->t{i};" if i in self._bent else f"    REAL t{i}[{size}];")
             if isinstance(layer, Linear):
                 lines.append(_affine(i, layer))
-                given = f"{_matrices(layer)}, {layer.k}, {layer.h}, {self.d}, t{layer.source}, t{i}"
+                arguments = f"{_matrices(layer)}, {layer.k}, {layer.h}, {self.d}, t{layer.source}, t{i}"
                 if self.plain and layer.source == 0:
                     row, to = f"w + {layer.matrix} + c * {layer.h}", f"t{i} + c * NET_SIZE({layer.h})"
                     lines.append(f"    for (int c = 0; c < {self.d}; c++) net_weights({row}, {layer.h}, {to});")
                 else:
-                    lines.append(f"    net_columns({given});")
+                    lines.append(f"    net_columns({arguments});")
             else:
                 lines += [*self._neurons(i, True), self._tangents(i)]
-        place = 0
+        offset = 0
         for i in self.net.outputs:
             size = self.net.sizes[i]
-            row, column = f"to + c * {self.net.size} + {place}", f"t{i} + c * NET_SIZE({size})"
+            row, column = f"to + c * {self.net.size} + {offset}", f"t{i} + c * NET_SIZE({size})"
             lines.append(f"    for (int c = 0; c < {self.d}; c++) memcpy({row}, {column}, {size} * sizeof(REAL));")
-            place += size
+            offset += size
         return "\n".join([*lines, *self._copied("o"), "}"])
 
-    def _slope(self, i: int, j: int, at: str) -> str:
-        """The slope of neuron `at` of layer i by its source j; empty: 1."""
+    def _slope(self, i: int, j: int, index: str) -> str:
+        """The slope of neuron `index` of layer i by its source j; empty: 1."""
         derived = self._derived[i - 1]
         assert derived is not None
         slope = derived.slopes[j]
         if not slope.is_constant():
-            return f"kept->d{i}_{j}[{at}]"
+            return f"kept->d{i}_{j}[{index}]"
         return "" if float(slope) == 1.0 else f"(REAL){emit.literal(float(slope))}"
 
     def _tangents(self, i: int) -> str:
         layer = self.net.layers[i - 1]
         assert isinstance(layer, Neurons)
-        at = f"c * NET_SIZE({layer.h}) + i"
+        k = f"c * NET_SIZE({layer.h}) + i"
         slopes = [self._slope(i, j, "i") for j in range(len(layer.sources))]
-        parts = [f"{slope}{' * ' if slope else ''}t{j}[{at}]" for slope, j in zip(slopes, layer.sources, strict=True)]
+        parts = [f"{slope}{' * ' if slope else ''}t{j}[{k}]" for slope, j in zip(slopes, layer.sources, strict=True)]
         total = " + ".join(parts)
-        return (
-            f"    for (int c = 0; c < {self.d}; c++) for (int i = 0; i < {layer.h}; i++) t{i}[{at}] = {total or '0'};"
-        )
+        return f"    for (int c = 0; c < {self.d}; c++) for (int i = 0; i < {layer.h}; i++) t{i}[{k}] = {total or '0'};"
 
     def _backward(self) -> str:
         sizes = self.net.sizes
         lines = ["static void tgco_net_KEY_back_one(", "    const double *w, const tgco_net_KEY_point *kept,"]
         lines.append("    const REAL *y, REAL *v, REAL *H) {")
         lines += [f"    REAL v{i}[NET_SIZE({size})] = {{0}};" for i, size in enumerate(sizes)]
-        place = 0
+        offset = 0
         for i in self.net.outputs:
-            lines.append(f"    for (int i = 0; i < {sizes[i]}; i++) v{i}[i] += y[{place} + i];")
-            place += sizes[i]
+            lines.append(f"    for (int i = 0; i < {sizes[i]}; i++) v{i}[i] += y[{offset} + i];")
+            offset += sizes[i]
         for i in range(len(self.net.layers), 0, -1):
             layer = self.net.layers[i - 1]
             if isinstance(layer, Linear):
-                given = f"{_matrices(layer)}, {layer.k}, {layer.h}, v{i}, v{layer.source}"
-                lines.append(f"    {{ REAL s[NET_SIZE({layer.k})]; net_back({given}, s); }}")
+                arguments = f"{_matrices(layer)}, {layer.k}, {layer.h}, v{i}, v{layer.source}"
+                lines.append(f"    {{ REAL s[NET_SIZE({layer.k})]; net_back({arguments}, s); }}")
             else:
                 lines += self._bend(i, layer)
         lines.append(f"    memcpy(v, v0, {sizes[0]} * sizeof(REAL));")
@@ -231,8 +229,8 @@ class NetSource:
                 lines.append(f"    net_congruence({layer.h}, {self.d}, by, kept->t{s}, kept->t{t}, H);")
             lines.append("    }")
         for j, source in enumerate(layer.sources):
-            part = f"net_counted(v{i}[i], {self._slope(i, j, 'i') or '1'})"
-            lines.append(f"    for (int i = 0; i < {layer.h}; i++) v{source}[i] += {part};")
+            term = f"net_counted(v{i}[i], {self._slope(i, j, 'i') or '1'})"
+            lines.append(f"    for (int i = 0; i < {layer.h}; i++) v{source}[i] += {term};")
         return lines
 
 

@@ -103,13 +103,13 @@ class Form:
 
     @property
     def _key(self) -> tuple[Any, ...]:
-        at = self.position
+        p = self.position
         cost = None if self.cost is None else (self.cost.stage.key, self.cost.last.key)
         functions = tuple((i, rows.key) for i, rows in self.functions)
-        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
+        return self.dynamics.key, p and (p.start, p.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
 
     def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
-        model, at = self.dynamics, self.position
+        model, position = self.dynamics, self.position
         sizes = {
             "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]), "QUADRATIC_FULL": int(self.dense),
@@ -119,7 +119,7 @@ class Form:
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
             units.append(Unit(_text(vectors | sizes, generated, *library.curvature), own=True))
-        return (*units, _shared_unit(vectors, at, library))
+        return (*units, _shared_unit(vectors, position, library))
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
@@ -152,8 +152,8 @@ class CalledForm:
 
 def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
     """The C file of a unit."""
-    given = {"constants.h": constants(), "code.h": "\n".join(generated)}
-    return joined(defines(sizes) + included(*files), given=given) + HEADER.layout
+    headers = {"constants.h": constants(), "code.h": "\n".join(generated)}
+    return joined(defines(sizes) + included(*files), given=headers) + HEADER.layout
 
 
 def _shared_unit(vectors: dict[str, Any], at: slice | None, library: Library) -> Unit:
@@ -178,8 +178,8 @@ def _looped(model: DynamicsSource) -> str:
 
 def _written_out(model: DynamicsSource) -> str:
     by_column: list[list[tuple[int, str]]] = [[] for _ in range(model.n + model.m)]
-    for row, column, place, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
-        factor = f"f[{place}]" if place >= 0 else "" if value == 1.0 else f"SET({literal(value)})"
+    for row, column, index, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
+        factor = f"f[{index}]" if index >= 0 else "" if value == 1.0 else f"SET({literal(value)})"
         by_column[column].append((row, factor))
 
     def total(entries: list[tuple[int, str]], source: str) -> str:
@@ -221,11 +221,11 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
             slopes.append(f"        *columns = {name}_columns; return {name}_count;")
         else:
             adds.append(f"    case {i}: {name}_add(x, u, p, w, by_c, by_cc, g, H); break;")
-    given = "int i, const V *x, const V *u, const V *p, const double *w"
+    arguments = "int i, const V *x, const V *u, const V *p, const double *w"
     return "\n".join(
         (
-            switch(f"void model_rows({given}, V *c)", values),
-            switch(f"void model_add_rows(\n    {given}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
-            switch(f"int model_slopes(\n    {given}, V *e, const int **columns)", slopes, "    return 0;"),
+            switch(f"void model_rows({arguments}, V *c)", values),
+            switch(f"void model_add_rows(\n    {arguments}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
+            switch(f"int model_slopes(\n    {arguments}, V *e, const int **columns)", slopes, "    return 0;"),
         )
     )

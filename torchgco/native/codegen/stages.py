@@ -51,10 +51,10 @@ def trace_model(problem: Problem) -> DynamicsSource:
 def _span(model: Dynamics, N: int) -> Span:
     """The steps of all stages of one problem, traced together."""
     model, stages = apart(model), torch.arange(N)
-    own = own_tensors(model)
+    tensors = own_tensors(model)
     X, U = (torch.zeros(1, N, size, dtype=torch.float64) for size in (model.n, model.m))
     with whole_numbers_become(X.dtype):  # 0.3 * k as for a single stage, where k is an int
-        traced = Traced("dynamics.step", lambda i, X, U: model.take(i).at(stages).step(X, U), X, U, own=own)
+        traced = Traced("dynamics.step", lambda i, X, U: model.take(i).at(stages).step(X, U), X, U, own=tensors)
     # A signature has N, and so the stages.
     traced.outside = [tensor for tensor in traced.outside if tensor is not stages]
     return Span(traced, model.n, model.m, N, N, range(N))

@@ -1,0 +1,257 @@
+"""Fleets: what is sound by a simulation of its own, batches, different vehicles, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from tests.fleets.scenes import DISC, DT, D, disc, pushed, ring, swaps
+from torchgco import Boxes, Fleet, FreeTime, FunctionDynamics, InputError, Moved, Problem, Spheres, judge
+from torchgco.fleets.fleet import _forms
+from torchgco.fleets.guesses import bent, in_conflict, late, widths
+from torchgco.fleets.joint import Halfway, VehicleRows, joint_problem
+from torchgco.fleets.plans import Plans
+from torchgco.fleets.prioritised import Prioritised
+from torchgco.fleets.solve import alone
+from torchgco.fleets.verdict import judge_fleet
+
+
+def dense(U: Tensor, x0: Tensor, dt: float, steps: int = 40) -> np.ndarray:
+    """Places (N steps + 1, 2) of a disc under controls (N, 2) held over each stage, in closed form."""
+    p, v, found = x0[:2].numpy(), x0[2:].numpy(), [x0[:2].numpy()]
+    for u in U.numpy():
+        for s in np.arange(1, steps + 1) / steps * dt:
+            found.append(p + s * v + 0.5 * s * s * u)
+        p, v = p + dt * v + 0.5 * dt * dt * u, v + dt * u
+    return np.array(found)
+
+
+def nearest(fleet: Fleet, solutions: Any, b: int = 0) -> float:
+    ways = [dense(one.U[b], problem.x0[b], DT) for one, problem in zip(solutions, fleet.members, strict=True)]
+    return min(
+        np.linalg.norm(ways[i] - ways[j], axis=1).min()
+        for i in range(len(ways)) for j in range(i) if fleet.distances[i, j] > 0
+    )  # fmt: skip
+
+
+def test_four_discs_swap_places() -> None:
+    fleet = Fleet(swaps(4, 2), apart=0.4)
+    found = torchgco.solve(fleet)
+    assert len(found) == 4 and bool(found.sound.all()) and len(fleet.forms) == 1
+    for b in range(2):
+        own = nearest(fleet, found, b)
+        assert own >= 0.95 * 0.4 - 1e-3
+        assert abs(own - float(found.least_distance[b])) < 2e-3
+    costs = torch.stack([judge(one, each.U).cost for one, each in zip(fleet.members, found, strict=True)])
+    torch.testing.assert_close(found.cost, costs.sum(0))
+    torch.testing.assert_close(torch.stack([one.cost for one in found]).sum(0), found.cost)
+    assert bool((found.cost > _alone(fleet)).all()) and bool((found.cost < 1.1 * _alone(fleet)).all())
+    away = torch.stack([(one.X[..., :2] - p.goal.position.unsqueeze(1)).norm(dim=-1) for one, p in zip(found, fleet.members, strict=True)])  # type: ignore[union-attr]  # fmt: skip
+    for b in range(2):
+        last = max(k for k in range(51) if bool((away[:, b, k] > 0.3).any()))
+        assert float(found.makespan[b]) == pytest.approx(DT * (last + 1))
+
+
+def _alone(fleet: Fleet) -> Tensor:
+    return sum((torchgco.solve(one, verbose=False).cost for one in fleet.members), torch.zeros(fleet.B, dtype=D))
+
+
+def test_one_batch_whose_problems_are_the_vehicles_is_a_single_fleet() -> None:
+    starts, ends = ring(4)
+    batch = disc(starts[:, 0], ends[:, 0])
+    found, listed = torchgco.solve(Fleet(batch, 0.4)), torchgco.solve(Fleet(swaps(4), 0.4))
+    assert len(found) == 4 and len(found[0].X) == 1 and bool(found.sound.all())
+    torch.testing.assert_close(found.cost, listed.cost, rtol=1e-6, atol=0)
+
+
+def test_results_do_not_depend_on_the_other_fleets_of_a_batch() -> None:
+    fleet, second = Fleet(swaps(3, 3), apart=0.4), torch.tensor([1])
+    whole = torchgco.solve(fleet)
+    one = torchgco.solve(Fleet([member.take(second) for member in fleet.members], 0.4), ids=second)
+    for v in range(3):
+        assert torch.equal(one[v].U[0], whole[v].U[1])
+    assert torch.equal(one.least_distance[0], whole.least_distance[1])
+
+
+def test_who_is_in_nobodys_way_flies_as_if_alone() -> None:
+    fleet = Fleet([disc([0, 3.0 * v], [3, 3.0 * v]) for v in range(3)], apart=0.4)
+    found = torchgco.solve(fleet)
+    for v, (one, member) in enumerate(zip(found, fleet.members, strict=True)):
+        assert torch.equal(one.U, torchgco.solve(member, ids=torch.tensor([v])).U)
+    assert bool(found.sound.all()) and float(found.least_distance[0]) == pytest.approx(3.0, abs=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")  # of guesses, which is repaired
+def test_prioritised_planning_alone() -> None:
+    """Larger fleets aren't one problem: each vehicle plans among the motions of those before it."""
+    fleet = Fleet(swaps(5, 2), apart=0.4)
+    first = alone(fleet, torchgco.solve, 0, torch.arange(2), "gco")
+    assert not bool(judge_fleet(fleet, first.U).feasible.any())
+    plans = Prioritised(fleet, first, torchgco.solve, 0, torch.arange(2), "gco").run()
+    verdict = judge_fleet(fleet, plans.U)
+    assert bool(verdict.reached.all())
+    for b in range(2):
+        assert nearest(fleet, plans.solutions(fleet), b) >= 0.95 * 0.4 - 1e-3
+    second = torch.tensor([1])
+    one = Fleet([member.take(second) for member in fleet.members], 0.4)
+    again = Prioritised(one, first.take(second), torchgco.solve, 0, second, "gco").run()
+    assert all(torch.equal(mine[0], yours[1]) for mine, yours in zip(again.U, plans.U, strict=True))
+
+
+def test_different_vehicles_distances_and_obstacles() -> None:
+    """A slow one with drag, one that nobody minds, a wall with a door, and something that moves."""
+
+    def dragged(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((x[..., 2:], u - 0.5 * x[..., 2:]), dim=-1)
+
+    walls = Boxes([[0.0, 2.5], [0.0, -2.5]], [[0.1, 2.0], [0.1, 2.0]], 0.2)
+    path = np.stack([np.full(51, 1.0), np.linspace(2.0, -2.0, 51)], axis=-1)[:, None]
+    slow = FunctionDynamics(dragged, 4, 2, DT, "rk4", position=slice(0, 2))
+    fleet = Fleet(
+        [
+            disc([-1.5, 0.0], [1.5, 0.0], walls, Moved(path, 0.2, 0.2)),
+            disc([1.5, 0.3], [-1.5, 0.2], walls, model=slow),
+            disc([-1.5, 0.1], [1.5, 0.1], walls, weight=0.2),
+        ],
+        apart=[0.5, 0.3],
+        pairs=[(1, 0), (1, 2)],
+    )
+    assert len(fleet.forms) == 3 or len(fleet.forms) == 2
+    found = torchgco.solve(fleet)
+    assert bool(found.sound.all()) and float(found.least_distance[0]) >= 0.95 * 0.3
+    p = fleet.places([one.X for one in found])[0]
+    assert (
+        float((p[0] - p[1]).norm(dim=-1).min()) >= 0.5 - 1e-3 and float((p[1] - p[2]).norm(dim=-1).min()) >= 0.3 - 1e-3
+    )
+
+
+def test_two_that_pass_between_the_knots_are_seen() -> None:
+    starts, ends = [[-2.45, 0.0], [2.55, 0.0]], [[2.55, 0.0], [-2.45, 0.0]]
+    fleet = Fleet([disc(*pair) for pair in zip(starts, ends, strict=True)], apart=0.2)
+    X = [torch.cat((one.x0[:, :2], torch.tensor([[sign * 2.4, 0.0]], dtype=D)), -1) for one, sign in zip(fleet.members, (1, -1), strict=True)]  # fmt: skip
+    moving = Fleet([replace(one, x0=x) for one, x in zip(fleet.members, X, strict=True)], apart=0.2)
+    still = [torch.zeros(1, 50, 2, dtype=D)] * 2
+    verdict = judge_fleet(moving, still)
+    at_knots = min(abs(-2.45 + 0.24 * k - (2.55 - 0.24 * k)) for k in range(51))
+    assert at_knots > 0.039 and float(verdict.least_distance[0]) < 1e-9
+    assert float(verdict.clearance[0]) == pytest.approx(-0.19, abs=1e-9) and not bool(verdict.feasible[0])
+
+
+def test_the_joint_problem_is_that_of_all_vehicles() -> None:
+    """Steps, costs and rows are the vehicles' own; derivatives are those of autodiff."""
+    rng = np.random.default_rng(0)
+    fleet = Fleet([*swaps(2, 2), *swaps(3, 2)[2:]], apart=[0.4, 0.5, 0.6])
+    problem = joint_problem(fleet, True)
+    assert problem is not None and problem.n == 12 and problem.m == 6
+    X, U = (torch.from_numpy(rng.normal(size=(2, k, n))) for k, n in ((51, 12), (50, 6)))
+    own = [(X[..., 4 * v : 4 * v + 4], U[..., 2 * v : 2 * v + 2]) for v in range(3)]
+    costs = [one.cost.total(x, u) for one, (x, u) in zip(fleet.members, own, strict=True)]
+    torch.testing.assert_close(problem.cost.total(X, U), sum(costs))
+    steps = [one.dynamics.step(x[:, :-1], u) for one, (x, u) in zip(fleet.members, own, strict=True)]
+    torch.testing.assert_close(problem.dynamics.step(X[:, :-1], U), torch.cat(steps, -1))
+    worst = torch.stack([part.worst(X, U) for part in problem.constraints if not isinstance(part, Halfway)]).amax(0)
+    theirs = [part.worst(x, u) for one, (x, u) in zip(fleet.members, own, strict=True) for part in one.constraints]
+    p = torch.stack([x[..., :2] for x, _ in own], 1)
+    for (i, j), keep in zip(((0, 1), (0, 2), (1, 2)), (0.4, 0.5, 0.6), strict=True):
+        theirs.append((keep - (p[:, i] - p[:, j])[:, 1:].norm(dim=-1)).clamp(min=0).amax(-1))
+        middle = [x[:, :-1, :2] + 0.05 * x[:, :-1, 2:] + 0.5 * 0.05**2 * u for x, u in own]
+        halfway = (keep - (middle[i] - middle[j]).norm(dim=-1)).clamp(min=0)
+        row = [(0, 1), (0, 2), (1, 2)].index((i, j))
+        torch.testing.assert_close(problem.constraints[-1].violation(X, U)[..., row], halfway)
+    torch.testing.assert_close(worst, torch.stack(theirs).amax(0))
+    for part in (problem.constraints[-1], *(one for one in problem.constraints if isinstance(one, VehicleRows))):
+        _check_derivatives(part, X, U)
+
+
+def _check_derivatives(part: Any, X: Tensor, U: Tensor) -> None:
+    g = torch.rand(part.value(X, U).shape, dtype=D, generator=torch.Generator().manual_seed(0))
+    H = X.new_zeros(2, 51, 19, 19)
+    part.accumulate(X, U, g, torch.zeros_like(g), H)
+    by_x, by_u = torch.func.grad(lambda X, U: (g * part.value(X, U)).sum(), argnums=(0, 1))(X, U)
+    torch.testing.assert_close(H[:, :, :12, 12], by_x)
+    torch.testing.assert_close(H[:, :-1, 13:, 12], by_u)
+
+
+def test_guesses_bend_to_one_side_and_wait() -> None:
+    problem = disc([0.0, 0.0], [4.0, 0.0])
+    X = torch.zeros(1, 51, 4, dtype=D)
+    X[..., 0] = torch.linspace(0, 4, 51)
+    right = bent(X, slice(0, 2), 1.0, torch.tensor([0.5], dtype=D))
+    assert torch.allclose(right[0, [0, -1]], X[0, [0, -1]]) and float(right[0, 25, 1]) == pytest.approx(-0.5)
+    U = torch.arange(50, dtype=D).view(1, 50, 1).expand(1, 50, 2)
+    later = late(X, U, 10)
+    assert torch.equal(later[0][:, 10:], X[:, :41]) and bool((later[1][:, :11] == 0).all())
+    fleet = Fleet([problem, disc([4.0, 0.0], [0.0, 0.0]), disc([0.0, 3.0], [4.0, 3.0])], 0.4)
+    conflicts = in_conflict(fleet, alone(fleet, torchgco.solve, 0, torch.arange(1), "gco"))
+    assert conflicts.tolist() == [[True, True, False]]
+    assert widths(fleet, conflicts).tolist() == [[0.2, 0.2, 0.0]]
+
+
+def test_problems_of_one_form_are_one_batch() -> None:
+    stones = [Spheres([[0.0, 0.2 * v]], [0.3], 0.2) for v in range(3)]
+    members = tuple(disc([-2, 0.5 * v], [2, 0.5 * v], stone) for v, stone in enumerate(stones))
+    ((batch, whose),) = _forms((members[0], members[1], members[2]))
+    assert whose == (0, 1, 2) and batch.B == 3
+    X, U = torch.randn(3, 51, 4, dtype=D), torch.randn(3, 50, 2, dtype=D)
+    for v, one in enumerate(members):
+        for part, own in zip(batch.constraints, one.constraints, strict=True):
+            torch.testing.assert_close(part.value(X, U)[v], own.value(X[[v]], U[[v]])[0])
+        torch.testing.assert_close(batch.cost.total(X, U)[v], one.cost.total(X[[v]], U[[v]])[0])
+    other = disc([-2, 0], [2, 0], model=FunctionDynamics(lambda x, u: pushed(x, u), 4, 2, DT, "rk4", slice(0, 2)))
+    assert len(_forms((members[0], other))) == 2
+
+
+def test_time_is_kept() -> None:
+    fleet = Fleet(swaps(4), apart=0.4)
+    found = torchgco.solve(fleet, max_seconds=1e-3)
+    assert not bool(found.sound.any()) and bool(torch.isfinite(found.cost).all())
+
+
+def test_a_figure_has_a_colour_for_each_vehicle() -> None:
+    fleet = Fleet(swaps(3), apart=0.4)
+    plans = Plans.at_rest(fleet)
+    found = torchgco.fleets.FleetSolution(fleet, plans.solutions(fleet), judge_fleet(fleet, plans.U))
+    figure = torchgco.plot(fleet, found)
+    colours = {line.get_color() for ax in figure.axes for line in ax.lines if len(line.get_xdata()) > 2}  # type: ignore[arg-type]
+    assert len(colours) >= 3
+    with pytest.raises(InputError, match="b: expected the place of a fleet, 0 to 0"):
+        torchgco.plot(fleet, found, 1)
+
+
+def one_of(**changes: Any) -> Problem:
+    return disc([0.0, 2.0], [1.0, 2.0], **changes)
+
+
+FIRST = disc([0.0, 0.0], [1.0, 0.0])
+BAD: dict[str, tuple[Any, Any, str]] = {
+    "one": ([FIRST], {}, "fleet.vehicles: expected at least two"),
+    "kinds": ("a fleet", {}, "fleet.vehicles: expected a problem per vehicle"),
+    "N": ([FIRST, one_of(N=40)], {}, r"fleet.vehicles\[1\]: expected N 50 as of vehicle 0, got 40"),
+    "dt": ([FIRST, one_of(model=replace(DISC, dt=0.2))], {}, r"vehicles\[1\]: expected dt 0.1 as of vehicle 0"),
+    "batch": ([FIRST, disc([[0, 2], [0, 3]], [[1, 2], [1, 3]])], {}, "expected a batch of 1 as of vehicle 0, got 2"),
+    "apart": ([FIRST, one_of()], {"apart": -0.4}, "fleet.apart: expected finite distances above 0 m"),
+    "shape": ([FIRST, one_of()], {"apart": [0.4, 0.4]}, "fleet.apart: expected a number, or one for each of 1 pairs"),
+    "pairs": ([FIRST, one_of()], {"pairs": [(0, 2)]}, r"fleet.pairs: expected pairs of two vehicles within 0..1"),
+    "twice": ([FIRST, one_of()], {"pairs": [(0, 1), (1, 0)]}, "fleet.pairs: expected .* none twice"),
+    "starts": ([FIRST, disc([0.2, 0.0], [3, 0])], {}, "expected starts 0.4 m apart, got vehicles 0 and 1 of fleet 0"),
+    "time": ([FIRST, replace(one_of(), time=FreeTime(3.0, 6.0))], {}, r"vehicles\[1\].time: expected None"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_wrong_with_a_fleet_is_named(case: str) -> None:
+    vehicles, more, message = BAD[case]
+    with pytest.raises(InputError, match=message):
+        Fleet(vehicles, **({"apart": 0.4} | more))
+
+
+def test_arguments_that_fleets_do_not_take_are_named() -> None:
+    fleet = Fleet(swaps(2), 0.4)
+    with pytest.raises(InputError, match=r"solve.U0: expected None of a fleet"):
+        torchgco.solve(fleet, U0=torch.zeros(1, 50, 2))  # type: ignore[call-overload]
