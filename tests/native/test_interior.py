@@ -28,7 +28,7 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
-from torchgco.kernels import interior_of
+from torchgco.kernels import interior_of, use_native
 from torchgco.maps import OccupancyGrid
 from torchgco.problem.carried import with_carried
 from torchgco.problem.scale import CostScale
@@ -252,12 +252,17 @@ def length_of(step: Array, moved: Array, longest: float) -> float:
 @pytest.mark.parametrize(
     "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.slow) for name in MAKERS]
 )
-def test_steps_are_those_of_a_dense_system(name: str, warm: bool) -> None:
+@pytest.mark.parametrize("called", [False, True], ids=["compiled", "called"])
+def test_steps_are_those_of_a_dense_system(name: str, warm: bool, called: bool) -> None:
     """Four iterations: states, controls, all multipliers, slacks, mu and the shift of indefinite curvature."""
     problem = MAKERS[name](3)
     X, U = guess(problem, 1)
     lam, mu = multipliers(problem, X, U, 5 if warm else None), 0.05 if warm else 0.1
-    found = [iterates(problem, X, U, lam, mu, count, warm) for count in (1, 2, 3, 4)]
+    use_native(not called)
+    try:
+        found = [iterates(problem, X, U, lam, mu, count, warm) for count in (1, 2, 3, 4)]
+    finally:
+        use_native(True)
     lengths, shifts = [], []
     for b in LOOKED_AT:
         program = Program(problem.take(slice(b, b + 1)))
