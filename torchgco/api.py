@@ -122,13 +122,12 @@ def solve(
     """
     check_untransformed("solve")
     if isinstance(problem, Fleet):
-        others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing} | misplaced
+        others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing, **misplaced}
         return _solve_fleet(problem, others, solver, seed, ids, max_seconds)
     asked = problem = current_problem(problem)
     warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
-    _refuse(misplaced, problem, solver)
-    name = solver if isinstance(solver, str) else None
+    name = _refuse(misplaced, problem, solver)
     X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
     (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
@@ -242,8 +241,12 @@ def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
     return made.recording() if record else made
 
 
-def _refuse(misplaced: Mapping[str, Any], problem: Problem, solver: Solver | str) -> None:
-    """Raise InputError for an argument that `solve` doesn't have: where the solver has it, or which one is like it."""
+def _refuse(misplaced: Mapping[str, Any], problem: Problem, solver: Solver | str) -> str | None:
+    """Raise InputError for an argument that `solve` doesn't have: where the solver has it, or which one is like it.
+
+    Returns:
+        The name of the solver, if it is given by that.
+    """
     for name, value in misplaced.items():
         made = option_places(_solver(solver, problem, False))
         near = get_close_matches(name, inspect.signature(solve).parameters, n=1)
@@ -252,6 +255,7 @@ def _refuse(misplaced: Mapping[str, Any], problem: Problem, solver: Solver | str
             whose = f"presets.{solver}(problem)" if isinstance(solver, str) else "your solver"
             expected = f"an option of the solver in its place: {', '.join(places)} of {whose}, by dataclasses.replace"
         raise InputError(f"solve.{name}", expected, shown(value))
+    return solver if isinstance(solver, str) else None
 
 
 def _checked(warm: Any) -> Solution | None:
@@ -395,6 +399,8 @@ def show(problem: Problem, solution: Solution) -> HtmlPage:
     """
     from torchgco.view import notebook  # slow to load
 
+    if isinstance(problem, Fleet):
+        raise InputError("problem", "a Problem, such as fleet.members[0] with solution[0]", "Fleet")
     return notebook.show(problem, solution.detach())
 
 

@@ -77,6 +77,7 @@ def gco_fast(space: Space) -> Restarts:
         local=replace(_local(space), guidance=guidance),
         passes=Passes({
             "guess": gco(space).passes.guess,
+            "timed": Timed(ways=2),
             "path": one,
             "closer": replace(one, when="unproposed", roadmaps=(), follow=(closer(follow),)),
             "attempt": FromProposal(),

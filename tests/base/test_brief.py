@@ -27,7 +27,7 @@ def test_a_problem_takes_a_few_lines(make) -> None:
 def test_solvers_are_short_and_name_changed_options(name: str) -> None:
     assert len(repr(presets.PRESETS[name](2))) <= TEXT_LETTERS
     changed = replace(presets.al_ilqr(2), max_outer_iterations=17)
-    assert "max_outer_iterations=17" in repr(changed) and "patience" not in repr(changed)
+    assert "max_outer_iterations=17" in repr(changed) and "initial_penalty" not in repr(changed)
 
 
 def test_parts_show_few_numbers_and_shapes_of_more() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from torchgco import (
     Unicycle,
     judge,
 )
-from torchgco.baselines import PathPursuit
+from torchgco.baselines import PathPursuit, pursuit
 from torchgco.baselines.drivers import WITHIN, Track, drive_unicycle
 from torchgco.baselines.pursuit import evenly, smoothed
 from torchgco.dynamics import Dynamics
@@ -35,7 +35,6 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import compose
 from torchgco.kernels import chord_clearance
 from torchgco.scenarios import Floors
-from torchgco.solvers.interior import InteriorPoint
 
 D = torch.float64
 UNICYCLE = Unicycle(dt=0.1)
@@ -152,30 +151,28 @@ def test_without_obstacles_it_drives_straight() -> None:
     torch.testing.assert_close(solution.cost, same.cost, rtol=1e-6, atol=0)
 
 
-def test_what_touches_between_knots_is_cleared() -> None:
+def test_what_touches_between_knots_is_cleared(monkeypatch: pytest.MonkeyPatch) -> None:
     """A post that a long stage steps over."""
     problem = task(VELOCITY, parts=[Spheres([[[3.0, 3.97]]] * 2, [[0.02]] * 2, 0.05)], N=25)
     problem = replace(problem, constraints=[*problem.constraints[:1], ControlBounds([-4.0] * 2, [4.0] * 2)])
-    cut = PathPursuit(rounds=0).solve(problem, rest(problem))
+    with monkeypatch.context() as patched:
+        patched.setattr(pursuit, "ROUNDS", 0)
+        cut = PathPursuit().solve(problem, rest(problem))
     clear = PathPursuit().solve(problem, rest(problem))
     assert bool((chord_clearance(problem, cut.X) < 0).any()), "or there is nothing to clear"
     assert bool((chord_clearance(problem, clear.X) >= 0).all()) and bool(judge(problem, clear.U).reached.all())
     assert bool((clear.iterations >= cut.iterations).all()) and bool((clear.iterations > cut.iterations).any())
 
 
-OPTIONS: dict[str, Any] = {
-    "near": 0.5, "weight": 20.0, "smoothing": 0.0, "lookahead": 1.0, "share": 0.4,
-    "solver": InteriorPoint(max_iterations=3),
-}  # fmt: skip
+CONSTANTS = {"NEAR": 0.5, "NEARNESS": 20.0, "SMOOTHING": 0.0, "LOOKAHEAD": 1.0, "DRIVEN": 0.4}
 
 
-def test_every_option_is_read() -> None:
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_every_constant_of_the_recipe_counts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = task().take(torch.tensor([0]))
-    base = PathPursuit()
-    found = base.solve(problem, rest(problem)).U
-    for name, value in OPTIONS.items():
-        assert not torch.equal(replace(base, **{name: value}).solve(problem, rest(problem)).U, found), name
-    assert {field.name for field in fields(PathPursuit)} == {*OPTIONS, "rounds"}  # which the test above reads
+    usual = PathPursuit().guess(problem, rest(problem))[0]
+    monkeypatch.setattr(pursuit, name, CONSTANTS[name])
+    assert not torch.equal(PathPursuit().guess(problem, rest(problem))[0], usual)
 
 
 MOVING = Spheres([[[3.0, 2.0]]] * 2, [[0.2]] * 2, RADIUS, velocities=[[[0.1, 0.0]]] * 2)
@@ -201,14 +198,6 @@ def test_other_problems_are_refused_in_one_line(make: Any, said: str) -> None:
     with pytest.raises(InputError) as caught:
         torchgco.solve(problem, solver="path_pursuit")
     assert said in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"share": 0.0}, {"share": 1.1}, {"lookahead": 0.0}, {"rounds": -1}, {"weight": -1.0}]
-)
-def test_wrong_options_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=f"solver.{next(iter(wrong))}: expected"):
-        PathPursuit(**wrong)
 
 
 def test_a_unicycle_turns_before_it_drives() -> None:

@@ -38,6 +38,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # un
 D = torch.float64
 B, N = 3, 30
 STATES = [[0, 1], [4, 5], [8, 9]]  # of three carts in the plane, (position, velocity) each
+PAIRS = [[0, 1], [0, 2], [1, 2]]
 KEPT = torch.tensor([0.6, 0.8, 1.0], dtype=D)
 
 
@@ -205,6 +206,24 @@ def test_bodies_that_touch_at_the_start_are_no_valid_start() -> None:
     assert carts(Separation(STATES, 1.0), x0=x0).start_is_clear.tolist() == [False, True]
 
 
+def test_each_pair_keeps_a_distance_of_its_own() -> None:
+    X, U = points(3)
+    every = carts(Separation(STATES, [[0.6, 0.8, 1.0]])).constraints[0]
+    single = [
+        carts(Separation(STATES, d, [pair])).constraints[0] for d, pair in zip((0.6, 0.8, 1.0), PAIRS, strict=True)
+    ]
+    assert isinstance(every, Separation)
+    for name in ("value", "violation"):
+        rows = torch.cat([getattr(one, name)(X, U) for one in single], dim=-1)
+        torch.testing.assert_close(getattr(every, name)(X, U), rows)
+    by = torch.full((B,), 0.1, dtype=D)
+    for part, alone in ((every, single), (every.grown(by), [one.grown(by) for one in single])):
+        nearest = torch.stack([one.chord_clearance(X) for one in alone]).amin(0)  # type: ignore[attr-defined]
+        torch.testing.assert_close(part.chord_clearance(X), nearest)
+        judged = torch.stack([one.clearances(X)[1] for one in alone]).amin(0)  # type: ignore[attr-defined]
+        torch.testing.assert_close(part.clearances(X)[1], judged)
+
+
 WRONG: dict[str, list[Any]] = {
     "positions": [
         Separation(p, 1.0) for p in (None, 5, [], [[0, 1]], [[0, 1], [4]], [[0, 1], [1, 4]], [[0, 12], [4, 5]],
@@ -216,7 +235,7 @@ WRONG: dict[str, list[Any]] = {
     ],
     "min_distance": [
         Separation(STATES, d)
-        for d in (None, "a", 0.0, -1.0, torch.nan, torch.inf, [1.0, 2.0], [[1.0] * 3], KEPT.float())
+        for d in (None, "a", 0.0, -1.0, torch.nan, torch.inf, [1.0, 2.0], [[1.0] * 2], KEPT.float())
     ],
     "knots": [Separation(STATES, 1.0, knots=k) for k in ([], [31], [2, 2], "ab")],
 }  # fmt: skip

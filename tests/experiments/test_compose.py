@@ -26,12 +26,20 @@ DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
 EXPERIMENTS = options_of("experiment")
 MISSIONS = ("mission", "mission_study", "mission_unknown")
+SHARED = (
+    "conveyor",
+    "floors",
+    "revolving",
+    "sliding",
+    "traffic",
+    "walkers",
+)  # positions alone: any model
 OF_MODEL = {
-    "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("floors", "yard"),
+    "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": (*SHARED, "yard"),
     "car": ("parking",),
     "quadrotor": (
-        "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "gates", "mazes", "rooms", "trefoils",
-        "walls", "woods",
+        "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "gates", "mazes", "rooms", "swarm",
+        "trefoils", "walls", "woods",
     ),
     "rotors": ("race",),
 }  # fmt: skip
@@ -109,7 +117,7 @@ def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment:
 
 @pytest.mark.parametrize("scenario", mostly(MODEL, *set(MODEL) - set(tuple(MODEL)[::3])))
 def test_a_model_that_cannot_fly_a_scenario_is_refused_with_one_that_can(scenario: str) -> None:
-    fitting = ("planar", "unicycle", "car") if scenario == "floors" else (MODEL[scenario],)  # each rests there
+    fitting = ("planar", "unicycle", "car") if scenario in SHARED else (MODEL[scenario],)  # each rests there
     wanted = " or ".join(f"model={model}" for model in fitting)
     for other in options_of("model"):
         if other not in fitting:

@@ -52,7 +52,8 @@ def test_four_discs_swap_places() -> None:
     torch.testing.assert_close(found.cost, costs.sum(0))
     torch.testing.assert_close(torch.stack([one.cost for one in found]).sum(0), found.cost)
     assert bool((found.cost > _alone(fleet)).all()) and bool((found.cost < 1.1 * _alone(fleet)).all())
-    away = torch.stack([(one.X[..., :2] - p.goal.position.unsqueeze(1)).norm(dim=-1) for one, p in zip(found, fleet.members, strict=True)])  # type: ignore[union-attr]  # fmt: skip
+    ends = torch.stack([one.x0[:, :2] for one in fleet.members]).neg().unsqueeze(2)
+    away = (torch.stack([one.X[..., :2] for one in found]) - ends).norm(dim=-1)
     for b in range(2):
         last = max(k for k in range(51) if bool((away[:, b, k] > 0.3).any()))
         assert float(found.makespan[b]) == pytest.approx(DT * (last + 1))
@@ -125,16 +126,16 @@ def test_different_vehicles_distances_and_obstacles() -> None:
     assert len(fleet.forms) == 3 or len(fleet.forms) == 2
     found = torchgco.solve(fleet)
     assert bool(found.sound.all()) and float(found.least_distance[0]) >= 0.95 * 0.3
-    p = fleet.places([one.X for one in found])[0]
-    assert (
-        float((p[0] - p[1]).norm(dim=-1).min()) >= 0.5 - 1e-3 and float((p[1] - p[2]).norm(dim=-1).min()) >= 0.3 - 1e-3
-    )
+    first, second, third = fleet.places([one.X for one in found])[0]
+    assert float((first - second).norm(dim=-1).min()) >= 0.5 - 1e-3
+    assert float((second - third).norm(dim=-1).min()) >= 0.3 - 1e-3
 
 
 def test_two_that_pass_between_the_knots_are_seen() -> None:
     starts, ends = [[-2.45, 0.0], [2.55, 0.0]], [[2.55, 0.0], [-2.45, 0.0]]
     fleet = Fleet([disc(*pair) for pair in zip(starts, ends, strict=True)], apart=0.2)
-    X = [torch.cat((one.x0[:, :2], torch.tensor([[sign * 2.4, 0.0]], dtype=D)), -1) for one, sign in zip(fleet.members, (1, -1), strict=True)]  # fmt: skip
+    speeds = torch.tensor([[2.4, 0.0], [-2.4, 0.0]], dtype=D)
+    X = [torch.cat((one.x0[:, :2], speeds[[v]]), -1) for v, one in enumerate(fleet.members)]
     moving = Fleet([replace(one, x0=x) for one, x in zip(fleet.members, X, strict=True)], apart=0.2)
     still = [torch.zeros(1, 50, 2, dtype=D)] * 2
     verdict = judge_fleet(moving, still)
@@ -240,6 +241,7 @@ BAD: dict[str, tuple[Any, Any, str]] = {
     "pairs": ([FIRST, one_of()], {"pairs": [(0, 2)]}, r"fleet.pairs: expected pairs of two vehicles within 0..1"),
     "twice": ([FIRST, one_of()], {"pairs": [(0, 1), (1, 0)]}, "fleet.pairs: expected .* none twice"),
     "starts": ([FIRST, disc([0.2, 0.0], [3, 0])], {}, "expected starts 0.4 m apart, got vehicles 0 and 1 of fleet 0"),
+    "single": ([FIRST, one_of().cast(torch.float32)], {}, r"vehicles\[1\].x0: expected float64 on the CPU"),
     "time": ([FIRST, replace(one_of(), time=FreeTime(3.0, 6.0))], {}, r"vehicles\[1\].time: expected None"),
 }
 
@@ -255,3 +257,5 @@ def test_arguments_that_fleets_do_not_take_are_named() -> None:
     fleet = Fleet(swaps(2), 0.4)
     with pytest.raises(InputError, match=r"solve.U0: expected None of a fleet"):
         torchgco.solve(fleet, U0=torch.zeros(1, 50, 2))  # type: ignore[call-overload]
+    with pytest.raises(InputError, match=r"a Problem, such as fleet.members\[0\]"):
+        torchgco.show(fleet, None)  # type: ignore[arg-type]

@@ -262,12 +262,12 @@ def test_a_constant_of_the_lifted_search_changes_both_kernels(name: str, value: 
 
 def test_every_option_reaches_the_library() -> None:
     """Each field has the value of the option, or of the constant, that bears its name."""
-    inner = ILQR(tolerance=0.011, max_iterations=13, damp_below=0.17, line_search=LineSearch(back=2))
+    inner = ILQR(tolerance=0.011, max_iterations=13, line_search=LineSearch(back=2))
     options, search = native_options(inner.descent), inner.line_search
     want = {
         "rungs": len(search.ladder(False)), "back": 2, "max_iterations": 13, "accept_last": 0, "tolerance": 0.011,
         "absolute_tolerance": 0.0, "ratio_min": search.ratio_min, "ratio_max": search.ratio_max,
-        "smallest": search.smallest, "damp_below": 0.17, "rounding": descent.ROUNDED_OFF, "lost": lifted.LOST_BY,
+        "smallest": search.smallest, "rounding": descent.ROUNDED_OFF, "lost": lifted.LOST_BY,
         "regularisation_first": descent.REGULARISATION_FIRST, "regularisation_growth": descent.REGULARISATION_GROWTH,
         "regularisation_max": descent.REGULARISATION_MAX, "damping": descent.DAMPING,
         "damping_growth": descent.DAMPING_GROWTH, "damping_decay": descent.DAMPING_DECAY,

@@ -28,7 +28,6 @@ from torchgco.solvers.contracts import Call
 STANDARD = AugmentedLagrangian(ILQR(max_iterations=12), initial_penalty=0.3, max_outer_iterations=8)
 SOLVERS = {
     "standard": STANDARD,
-    "stalled": replace(STANDARD, stalled_growth=10.0, patience=2, max_outer_iterations=30),
     "as printed": replace(STANDARD, inner=ILQR(as_printed=True, tolerance=0.1, max_iterations=8)),
     "slots": replace(STANDARD, slots=2),
 }

@@ -205,6 +205,47 @@ def test_numbers_that_depend_on_the_axes_before_a_state_are_refused(field: str) 
     assert told.value.field == field.strip()
 
 
+def beside(x: Tensor, u: Tensor) -> Tensor:
+    return u.square().sum(-1)
+
+
+# Code that knows how many axes it is given, and reads other stages where these are there.
+OF_STAGES: dict[str, Callable[[Tensor], Tensor]] = {
+    "mean": lambda x: (x[..., 0] - x[..., 0].mean(-1, keepdim=True)).square(),
+    "neighbour": lambda x: (x[..., 0] - x[..., 0].roll(1, -1)).abs(),
+    "changes": lambda x: torch.nn.functional.pad(x[..., 0].diff(dim=-1), (0, 1)).square(),
+    "first": lambda x: (x[..., 0] - x[:, :1, 0]).square(),
+    "cumulated": lambda x: x[..., 0].cumsum(-1) - x[..., 0],
+    "how many": lambda x: x[..., 0] * (x.shape[-2] - 1),
+    "hidden": lambda x: torch.relu(x[..., 0].amax(-1, keepdim=True) - x[..., 0] - 50.0),
+}
+
+
+@pytest.mark.parametrize("takes_k", [False, True])
+@pytest.mark.parametrize("kind", OF_STAGES)
+def test_costs_of_stages_that_depend_on_other_stages_are_refused(kind: str, takes_k: bool) -> None:
+    of_others = lambda x, u: beside(x, u) + (OF_STAGES[kind](x) if x.dim() == 3 else 0.0 * x[..., 0])
+    with_k = lambda x, u, k: of_others(x, u) + 0.01 * k
+    with pytest.raises(InputError, match=r"cost\.stage: expected numbers of a stage that depend on its own state"):
+        problem(FunctionCost(with_k if takes_k else of_others, lambda x: x[..., 0]))
+
+
+@pytest.mark.parametrize("part", ["model", "rows"])
+def test_numbers_that_depend_on_how_many_problems_there_are_are_refused(part: str) -> None:
+    """Of two problems, where the numbers differ from three on."""
+    many = lambda x: x[..., 0] if x.shape[0] > 2 else 0.0 * x[..., 0]
+    with pytest.raises(InputError):
+        if part == "model":
+            field = lambda x, u: x + 0.1 * u + many(x).unsqueeze(-1)
+            Problem(
+                FunctionDynamics(field, 2, 2, 0.1, "none"), QuadraticCost([1] * 2, [1] * 2, [1] * 2), [], WEIGHTS, N
+            )
+        else:
+            rows = [FunctionConstraint(lambda x: many(x).unsqueeze(-1) - 1.0)]
+            model = FunctionDynamics(lambda x, u: x + 0.1 * u, 2, 2, 0.1, "none")
+            Problem(model, QuadraticCost([1.0] * 2, [0.1] * 2, [5.0] * 2), rows, WEIGHTS, N)
+
+
 def test_a_long_horizon_takes_no_more_calls_of_a_cost_than_a_short_one() -> None:
     """Numbers of each knot come by `knot_values`: only code that takes k is asked at every knot."""
     calls: list[int] = []

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import pytest
 import torch
 from torch import Tensor
 
 import torchgco
 from torchgco import (
-    ILQR,
     AugmentedLagrangian,
     ControlBounds,
     FunctionConstraint,
@@ -21,7 +19,6 @@ from torchgco import (
     Solution,
     StateBounds,
     Status,
-    kernels,
     presets,
 )
 
@@ -102,30 +99,6 @@ def test_a_problem_without_a_solution_is_infeasible_and_soon() -> None:
 def test_a_problem_keeps_its_bits_in_any_batch() -> None:
     whole, part = torchgco.solve(parking(3)), parking(3).take(torch.tensor([1]))
     assert torch.equal(torchgco.solve(part, ids=torch.tensor([1])).U[0], whole.U[1])
-
-
-@pytest.mark.slow
-def test_short_steps_raise_the_regularisation() -> None:
-    problem = brachistochrone()
-    inner = ILQR(max_iterations=25)
-    runs = {}
-    for native in (True, False):
-        kernels.use_native(native)
-        try:
-            for share in (0.0, 0.125):
-                damped = replace(inner, damp_below=share)
-                local = AugmentedLagrangian(damped, initial_penalty=1e3, max_outer_iterations=1, record=True)
-                runs[native, share] = local.solve(problem, torch.zeros(1, 50, 2, dtype=D)).trace
-        finally:
-            kernels.use_native(True)
-    for native in (True, False):
-        plain, damped = runs[native, 0.0], runs[native, 0.125]
-        first = damped.index[(damped["alpha"] > 0) & (damped["alpha"] < 0.125)][0]
-        same = damped["inner"].shift(-1)[first] > 0
-        assert same and damped["regularisation"][first + 1] > damped["regularisation"][first]
-        assert not plain["alpha"].equals(damped["alpha"])
-    a, b = (runs[native, 0.125]["cost"].to_numpy()[:9] for native in (True, False))
-    assert abs(a - b).max() < 1e-6 * abs(a).max()
 
 
 def rocket() -> Problem:

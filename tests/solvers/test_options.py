@@ -22,7 +22,7 @@ BASE = AugmentedLagrangian(
 CHANGES = {
     AugmentedLagrangian: dict(
         inner=ILQR(max_iterations=2), guidance=None, initial_penalty=50.0, penalty_growth=5.0,
-        max_outer_iterations=3, violation_tolerance=0.2, record=False, stalled_growth=50.0, patience=1,
+        max_outer_iterations=3, violation_tolerance=0.2, record=False,
     ),
     ILQR: dict(as_printed=False, tolerance=1e3, max_iterations=3),
     GCO: dict(
@@ -34,9 +34,9 @@ CHANGES = {
     ),
 }  # fmt: skip
 # `slots` changes no result (test_batch_contract); test_ilqr tests the line search, test_restarts replaced iterates,
-# test_finish damping after short steps, test_reported_figures violations by the kernels.
+# test_reported_figures violations by the kernels.
 ELSEWHERE = {
-    (AugmentedLagrangian, "slots"), (AugmentedLagrangian, "by_kernels"), (ILQR, "line_search"), (ILQR, "damp_below"),
+    (AugmentedLagrangian, "slots"), (AugmentedLagrangian, "by_kernels"), (ILQR, "line_search"),
     (GCO, "start_from_sample"),
 }  # fmt: skip
 PLACES = {
@@ -85,9 +85,6 @@ def test_no_option_is_forgotten_above() -> None:
         (lambda: AugmentedLagrangian(max_outer_iterations=0), "solver.max_outer_iterations"),
         (lambda: AugmentedLagrangian(violation_tolerance=0.0), "solver.violation_tolerance"),
         (lambda: AugmentedLagrangian(slots=0), "solver.slots"),
-        (lambda: AugmentedLagrangian(patience=0), "solver.patience"),
-        (lambda: AugmentedLagrangian(stalled_growth=0.5), "solver.stalled_growth"),
-        (lambda: ILQR(damp_below=1.5), "ilqr.damp_below"),
         (lambda: IteratedMPPI(iterations=0), "solver.iterations"),
         (lambda: IteratedMPPI(violation_tolerance=0.0), "solver.violation_tolerance"),
     ],

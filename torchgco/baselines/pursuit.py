@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Above, AtMost, Natural, NonNegative, Positive
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_model
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -36,6 +34,12 @@ GRID_SPACING = 0.5  # radii between nodes of the grid, at most
 GRID_NODES = 2**18  # of a grid, about, at most: a search of as many takes a second
 LEAST_NODES = 2**14  # and where there is no radius to go by
 PATH_SPACING = 0.25  # radii between the points of a path
+NEAR = 2.0  # radii from contact within which a way costs more
+NEARNESS = 2.0  # at contact a metre costs so much more
+SMOOTHING = 2.0  # radii, the standard deviation of the Gaussian that rounds a path's corners
+LOOKAHEAD = 2.4  # radii that the controller looks ahead along the path
+DRIVEN = 0.75  # share of the horizon in which the path is driven
+ROUNDS = 4  # of solves with larger obstacles at most
 GRID_REACH = 4.0  # radii that the grid reaches beyond start, goal and obstacles
 
 
@@ -48,27 +52,15 @@ class PathPursuit(Solver, named="solver"):
     direction (points). The recipe uses nothing of `gco`'s search.
 
     Args:
-        near: radii from contact within which a way costs more.
-        weight: of this: at contact a metre costs so much more.
-        smoothing: standard deviation of the Gaussian that rounds a path's corners, radii.
-        lookahead: radii that the controller looks ahead along the path.
-        share: of the horizon in which the path is driven.
         solver: solves each problem from the trajectory along its path, and, by its `warm_barrier`, again where the
             result touches an obstacle between knots.
-        rounds: of these at most, each with larger obstacles.
 
     Raises:
         InputError: a field out of its range; on `solve`, other models, no goal, obstacles that move or of kinds that no
             path is sought among.
     """
 
-    near: NonNegative = 2.0
-    weight: NonNegative = 2.0
-    smoothing: NonNegative = 2.0
-    lookahead: Positive = 2.4
-    share: Annotated[float, Above(0), AtMost(1)] = 0.75
     solver: InteriorPoint = InteriorPoint(max_iterations=3000, initial_barrier=1e-3, warm_barrier=1e-4)
-    rounds: Natural = 4
 
     def announce(self, problem: Problem) -> None:
         """As the interior point."""
@@ -129,10 +121,10 @@ class PathPursuit(Solver, named="solver"):
         long, duration = length(way), float(problem.stages[0]) * float(problem.dynamics.dt)
         unit = R or long / 100.0
         step = min(PATH_SPACING * unit, long / 10.0)
-        points = smoothed(evenly(way, step), self.smoothing * unit / step)
-        speed = length(points) / (self.share * duration)
+        points = smoothed(evenly(way, step), SMOOTHING * unit / step)
+        speed = length(points) / (DRIVEN * duration)
         braking = speed / (BRAKING * duration)
-        return Track(points, step, max(1, round(self.lookahead * unit / step)), speed, braking)
+        return Track(points, step, max(1, round(LOOKAHEAD * unit / step)), speed, braking)
 
     def _way(self, problem: Problem, scene: Scene, start: Array, goal: Array, R: float) -> Array | None:
         """The cheapest way (P, d) over a grid, first by steps that are free for the vehicle, then by nodes that are."""
@@ -144,9 +136,9 @@ class PathPursuit(Solver, named="solver"):
         nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
         places = problem.x0.new_tensor(low) + spacing * nodes.to(problem.x0)
         away = clearance(problem, places.reshape(1, -1, d)).reshape(nodes.shape[:-1]).double().cpu().numpy()
-        near = self.near * (R or spacing)
+        near = NEAR * (R or spacing)
         for depth in (0.0, 0.5 * spacing * d**0.5):
-            way = Ways(away, low, spacing, -depth, near + depth, self.weight).way(start, goal)
+            way = Ways(away, low, spacing, -depth, near + depth, NEARNESS).way(start, goal)
             if way is not None:
                 return way
         return None
@@ -169,7 +161,7 @@ class PathPursuit(Solver, named="solver"):
             return serves, clearance
 
         if problem.obstacles:
-            cleared(call, best, self.rounds, ADMITTED, once)
+            cleared(call, best, ROUNDS, ADMITTED, once)
         return end
 
 

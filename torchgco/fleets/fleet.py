@@ -34,16 +34,17 @@ class Fleet:
         pairs: which vehicles keep it, (Q, 2) whole numbers; None: all, in the order (0, 1), (0, 2), ..., (1, 2), ...
 
     Raises:
-        InputError: fewer than two vehicles, another N, dt, batch, precision or dimension of space, a free time, a
-            horizon or free starts, pairs of unknown vehicles or given twice, distances that aren't above 0, starts that
-            touch.
+        InputError: fewer than two vehicles, another N, dt, batch or dimension of space, problems that aren't float64 on
+            the CPU, a free time, a horizon or free starts, pairs of unknown vehicles or given twice, distances that
+            aren't above 0, starts that touch.
     """
 
     vehicles: Sequence[Problem] | Problem
     apart: Any
     pairs: Any = None
     members: tuple[Problem, ...] = field(init=False, repr=False)  # a problem per vehicle, (B,) each
-    forms: tuple[tuple[Problem, tuple[int, ...]], ...] = field(init=False, repr=False)  # see `rows_of`
+    # Problems of those that are alike as one batch, (vehicles, B) after each other, and whose they are.
+    forms: tuple[tuple[Problem, tuple[int, ...]], ...] = field(init=False, repr=False)
     distances: Tensor = field(init=False, repr=False)  # (V, V), m; 0 of pairs that keep none
 
     def __post_init__(self) -> None:
@@ -123,8 +124,6 @@ ALIKE = {
     "N": lambda one: one.N,
     "dt": lambda one: one.dynamics.dt,
     "a batch of": lambda one: one.B,
-    "dtype": lambda one: one.x0.dtype,
-    "device": lambda one: one.x0.device,
     "a position of dimension": lambda one: one.position.stop - one.position.start,
 }
 
@@ -132,6 +131,8 @@ ALIKE = {
 def _check_served(one: Problem, where: str) -> None:
     if one.dynamics.position is None or getattr(one.dynamics, "dt", None) is None:
         raise InputError(where, "dynamics with a position and a time step", type(one.dynamics).__name__)
+    if one.x0.dtype != torch.float64 or one.x0.device.type != "cpu":
+        raise InputError(f"{where}.x0", "float64 on the CPU", f"{one.x0.dtype} on {one.x0.device}")
     for name in ("time", "horizon", "free_start"):
         if getattr(one, name) is not None:
             raise InputError(f"{where}.{name}", "None: all vehicles of a fleet have the same, given times", name)

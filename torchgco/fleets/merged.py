@@ -29,7 +29,8 @@ def merged(one: Problem, other: Problem) -> Problem | None:
         }
     except _Unlike:
         return None
-    return one._with(parts | {"x0": torch.cat((one.x0, other.x0))})
+    parts["x0"] = torch.cat((one.x0, other.x0))
+    return one._with(parts)
 
 
 def _rows(a: Any, b: Any, A: int, B: int) -> Any:

@@ -20,5 +20,4 @@ class Descent:
     line_search: LineSearch
     tolerance: float
     max_iterations: int
-    damp_below: float
     as_printed: bool

@@ -30,8 +30,7 @@ def iterate(how: Descent, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
     refused = _lift(how, s, lagrangian, step, refused)
     change, used = (s.merit - old_merit).abs(), s.regularisation
     s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
-    hard = refused | (moving & (alpha < how.damp_below))
-    s.regularisation = torch.where(step.failed, used, _damping(how, used, hard))
+    s.regularisation = torch.where(step.failed, used, _damping(how, used, refused))
     stuck = refused & (s.regularisation == 0)
     flat = _is_flat(how, change, expected, s.merit)
     if not how.as_printed:

@@ -198,7 +198,7 @@ def native_options(how: Descent) -> Options:
         absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,
         regularisation_first=descent.REGULARISATION_FIRST, regularisation_growth=descent.REGULARISATION_GROWTH,
         regularisation_max=descent.REGULARISATION_MAX, damping=0.0 if printed else descent.DAMPING,
-        damping_growth=descent.DAMPING_GROWTH, damping_decay=descent.DAMPING_DECAY, damp_below=how.damp_below,
+        damping_growth=descent.DAMPING_GROWTH, damping_decay=descent.DAMPING_DECAY,
     )  # fmt: skip
 
 

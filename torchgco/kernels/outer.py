@@ -59,8 +59,7 @@ class NativeOuter:
         goal = {} if near is None or problem.goal is None else {"goal": problem.goal.position, "near": near}
         self.packed = packed
         self.outer = Outer(
-            of=packed, outer=s.outer, waited=s.waited, outcome=self.outcome,
-            last_cost=s.last_cost, last_violation=s.last_violation, mark=s.mark,
+            of=packed, outer=s.outer, outcome=self.outcome, last_cost=s.last_cost,
             best_X=best.X, best_U=best.U, best_mu=best.multipliers.mu, best_cost=best.cost,
             best_violation=best.violation, base=base.contiguous(),
             **{name: values.contiguous() for name, values in goal.items()},

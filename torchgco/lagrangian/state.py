@@ -62,9 +62,6 @@ class State(InnerState):
     guided: Tensor  # outer iterations with guidance on
     replaced: Tensor  # bool: guidance replaced the iterate, and isn't called again
     last_cost: Tensor  # J_var at the end of the previous inner solve
-    last_violation: Tensor  # at the end of the previous inner solve
-    mark: Tensor  # (b, 2): violation and J_var at the end of the last inner solve that made progress
-    waited: Tensor  # inner solves since then
     best: Iterate  # best iterate that ended an inner solve; infinite violation before the first
 
 

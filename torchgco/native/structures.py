@@ -7,7 +7,7 @@ from enum import IntEnum
 from torch import Tensor
 
 from torchgco.base.draws import MURMUR_1, MURMUR_2, WEYL
-from torchgco.base.status import STALLED, STOPPED, Status
+from torchgco.base.status import STOPPED, Status
 from torchgco.lagrangian.barrier import FILTERED, GOLDEN, LEAST_SIZE, LONGEST_FALL, NUDGE, ORDINARY, ROUNDINGS
 from torchgco.native.declarations import Header, Structure, defines, enumerations
 from torchgco.native.includes import C
@@ -36,7 +36,7 @@ CONSTANTS = {
     "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": FILTERED, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
     "COST_ARRAYS": len(Quadratic),
     "NUDGE": NUDGE, "GOLDEN": GOLDEN, "ROUNDINGS": ROUNDINGS, "ORDINARY": ORDINARY, "LEAST_SIZE": LEAST_SIZE,
-    "STOPPED": STOPPED, "STALLED": STALLED,
+    "STOPPED": STOPPED,
     **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
         ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
     )},

@@ -39,6 +39,7 @@ ANY_AXES = (
     "the same numbers of a state and control whatever axes lie before the last, (B, n), (B, K, n) or (B, S, n), and "
     "whether k is a number or a tensor (K,)"
 )
+ONE_STAGE = "numbers of a stage that depend on its own state and control alone (changes along the way: an extra state)"
 ONE_KNOT = (
     "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; two knots: Link; "
     "numbers per knot: `knot_values`, or an argument k)"
@@ -150,6 +151,8 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
     row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
+    if type(cost).total is Cost.total:
+        _check_cost_of_stages(cost, takes_k, rows, k, X[:, :-1], U)
     _check_axes("cost.stage", lambda k, x, u: row_cost.stage(x, u, k), takes_k, k, X[:, :-1], U)
     _check_axes("cost.terminal", lambda _, x: row_cost.terminal(x), False, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
@@ -166,6 +169,21 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
         return _along(H, dX, dU)
 
     _check_slope("cost.expand", row_cost.total, X, U, own)
+
+
+def _check_cost_of_stages(cost: Cost, takes_k: bool, rows: Tensor, k: Tensor, X: Tensor, U: Tensor) -> None:
+    """Check that the costs of all stages at once are those of each stage: of three, unless code takes their numbers."""
+    together = lambda i, k, x, u: cost.take(i).stage(x, u, k).unsqueeze(-1)
+
+    def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
+        joint = together(i, k, *z).clone()
+        for j in range(len(k)) if takes_k else (0, len(k) // 2, len(k) - 1):
+            joint[:, [j]] = together(i, k[j : j + 1], *(arg[:, [j]] for arg in z))
+        return joint
+
+    index = called("cost.stage", ONE_STAGE, joined_knots, together, alone, rows, k, (X, U))
+    if index is not None:
+        raise InputError("cost.stage", ONE_STAGE, f"others at stage {index}, or where other states lie beside")
 
 
 def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: int) -> None:

@@ -63,12 +63,14 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
             break  # else it refuses such states
     else:
         joint, each = together(rows, k, *arguments), alone(rows, k, *arguments)
-    exempt = False
-    if (index := _place(each, joint)) is not None:
-        if take_same_branches((alone, more, k, *drawn), (together, more, k, *drawn)):
+    exempt, alike, few = False, (together, more, k, *drawn), (together, rows, k, *arguments)
+    for changed, values in (((alone, *alike[1:]), each), (few, _tried(*few))):
+        if values is None or (index := _place(values, joint[: len(values)])) is None:
+            continue
+        if take_same_branches(changed, alike):
             return index
         exempt = True
-    first, alike = rows[:1], (together, more, k, *drawn)
+    first = rows[:1]
     # Any two knots differ in a digit of their places, so that one of them is kept where the other is foreign. The last
     # two rows are kept as a whole, and foreign as a whole: another problem.
     K = len(k)

@@ -15,6 +15,12 @@ from torchgco.scenarios.layouts import Layouts as Layouts
 from torchgco.scenarios.layouts import concatenate as concatenate
 from torchgco.scenarios.maps import MapFile as MapFile
 from torchgco.scenarios.mazes import Mazes as Mazes
+from torchgco.scenarios.moving import Conveyor as Conveyor
+from torchgco.scenarios.moving import Revolving as Revolving
+from torchgco.scenarios.moving import Sliding as Sliding
+from torchgco.scenarios.moving import Swarm as Swarm
+from torchgco.scenarios.moving import Traffic as Traffic
+from torchgco.scenarios.moving import Walkers as Walkers
 from torchgco.scenarios.parking import Parking as Parking
 from torchgco.scenarios.planar import PlanarRandom as PlanarRandom
 from torchgco.scenarios.planar import PlanarTrap as PlanarTrap
@@ -31,5 +37,5 @@ from torchgco.scenarios.yard import Yard as Yard
 # The random families, each an option `scenario=` of the command line under its `name`.
 FAMILIES: tuple[type[Scenario], ...] = (
     Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
-    Floors, GateForest, Race, Parking,
+    Floors, GateForest, Race, Parking, Traffic, Sliding, Walkers, Revolving, Conveyor, Swarm,
 )  # fmt: skip

@@ -38,7 +38,8 @@ FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the latt
 GAP = 0.02  # share by which what has arrived may cost more than without obstacles, and is left as it is
 DEARER = 0.5  # share by which ways that are solved may cost more than the cheapest, on the lattice
 SMALL = 1e-4  # change of a control by which its effect is looked at
-ROUNDS = 4  # of solves, at most, each among larger obstacles: what is clear at knots may touch between them
+ALIKE = 1e-4  # share by which the costs of two candidates may differ that count as the same
+ROUNDS = 5  # of solves, at most, each among larger obstacles: what is clear at knots may touch between them
 
 
 @dataclass(frozen=True)
@@ -137,24 +138,20 @@ def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor
     each = each.to(rows.device)
     X, U = _guesses(search.call.problem.take(rows), each, found)
     call = replace(search.call.take(rows[each]), U0=U, warm=None, callback=None)
-    grown, made, left = (
-        torch.zeros_like(X[:, 0, 0]),
-        torch.zeros_like(each),
-        torch.arange(len(each), device=each.device),
-    )
+    grown, left = torch.zeros_like(X[:, 0, 0]), torch.arange(len(each), device=each.device)
     least = torch.full_like(search.best.end.best.cost[rows], torch.inf)
     for _ in range(ROUNDS):
         part = call.take(left)
         end = _solved(part, X[left], grown[left])
-        made[left] = end.iterations
         good, clearance = _rated(search, part.problem, end)
         clear = good & (clearance >= 0.0)
-        found_now = _keep(search, rows, each[left], torch.where(clear, end.best.cost, torch.inf), end)
-        done |= found_now
-        least = least.scatter_reduce(0, each[left], torch.where(clear, end.best.cost, torch.inf), "amin")
-        again = good & ~clear & (end.best.cost < least[each[left]])
-        grown[left] += torch.where(again, -EXTRA * clearance, 0.0).nan_to_num(0.0)
+        merit = torch.where(clear, end.best.cost, torch.inf)
+        done |= _keep(search, rows, each[left], merit, end)
+        least = least.scatter_reduce(0, each[left], merit, "amin")
+        again = good & ~clear & (end.best.cost < least[each[left]]) & ~_repeated(each[left], end.best.cost)
+        more = torch.maximum(grown[left] - EXTRA * clearance, 2.0 * grown[left])
         left = left[again]
+        grown[left] = more[again]
         if left.numel() == 0 or search.call.late:
             break
     return done
@@ -178,6 +175,12 @@ def _rated(search: Search, problem: Problem, end: SolveEnd) -> tuple[Tensor, Ten
     if some.numel() > 0:  # others may end anywhere
         clearance[some] = path_clearance(problem.take(some), best.X[some], best.U[some])
     return good, clearance
+
+
+def _repeated(each: Tensor, cost: Tensor) -> Tensor:
+    """Which candidates (C,) cost as much as one before them of the same problem, `each` (C,): ways to one optimum."""
+    pairs = (each.unsqueeze(1) == each) & ((cost.unsqueeze(1) - cost).abs() <= ALIKE * cost.abs())
+    return pairs.tril(-1).any(1)
 
 
 def _keep(search: Search, rows: Tensor, each: Tensor, merit: Tensor, end: SolveEnd) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive
-from torchgco.base.status import STALLED, STOPPED, Status
+from torchgco.base.status import STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import kernels_of, measured, open_loop, value
 from torchgco.kernels.outer import NativeOuter
@@ -30,7 +30,6 @@ from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.session import Session
 
 PENALTY_MAX = 1e12  # ceiling of mu
-HALVED = 0.5  # of a violation: the least that an outer iteration with a growing penalty should give
 SETTLED = 1e-3  # share of J_var: a solve ends once an inner solve changes it by less and is feasible
 PASSES_AT_ONCE = 256  # problems times passes in one native call: between calls, an interrupt can end the solve
 HOLD = 2.0  # penalty on an abandoned trajectory, as a multiple of the extra cost of its replacement
@@ -51,10 +50,7 @@ class AugmentedLagrangian(Solver, named="solver"):
             iterate; None: no guidance.
         initial_penalty, penalty_growth: mu and its factor eta per outer iteration; mu in units of the cost with
             `inner.as_printed`, else of `Problem.cost_unit`.
-        stalled_growth: the factor where an inner solve has not halved the violation; None: penalty_growth.
         max_outer_iterations: outer limit; the only end of the paper's loop.
-        patience: outer iterations without progress after which a solve ends: an infeasible trajectory makes progress
-            where its violation has halved, a feasible one where its cost has fallen by 0.1 %. None: only the limit.
         violation_tolerance: violation (metres for lengths) up to which a trajectory counts as feasible.
         slots: problems that run at the same time; the others wait for a free slot. None: all. No result depends on it.
         record: keep the history of every problem in `solution.trace`.
@@ -69,9 +65,7 @@ class AugmentedLagrangian(Solver, named="solver"):
     guidance: Guidance | None = None
     initial_penalty: Annotated[float, Above(0), AtMost(PENALTY_MAX)] = 20.0
     penalty_growth: Annotated[float, AtLeast(1)] = 2.2
-    stalled_growth: Annotated[float, AtLeast(1)] | None = None
     max_outer_iterations: Count = 10
-    patience: Count | None = None
     violation_tolerance: Positive = ADMITTED
     slots: Count | None = None
     record: bool = False
@@ -166,8 +160,7 @@ class OuterLoop:
             X=X, U=U, cost=cost, merit=merit.clone(), multipliers=multipliers, penalty=penalty,
             regularisation=torch.zeros_like(cost),
             inner=none, outer=none.clone(), iterations=none.clone(), rung=none.clone(), guided=none.clone(),
-            replaced=torch.zeros_like(none, dtype=torch.bool), last_cost=worst.clone(), last_violation=worst.clone(),
-            mark=torch.stack((worst, worst), dim=-1), waited=none.clone(),
+            replaced=torch.zeros_like(none, dtype=torch.bool), last_cost=worst.clone(),
             best=copied(Iterate(X, U, multipliers, cost, worst)),
         )  # fmt: skip
         status = start_status(problem, X, merit, problem.start_is_clear)
@@ -206,9 +199,8 @@ class OuterLoop:
                 self.problem, s, solver.inner.descent, phr=not self.as_printed, base=self.call.outer[s.rows],
                 by_arrival=self.by_arrival, stops=stop is not None, single_after=-1 if after is None else after,
                 ends=not self.as_printed, max_outer=solver.max_outer_iterations,
-                patience=-1 if solver.patience is None else solver.patience, growth=solver.penalty_growth,
-                stalled_growth=solver.stalled_growth or 0.0, penalty_max=PENALTY_MAX,
-                tolerance=solver.violation_tolerance, halved=HALVED, settled=SETTLED,
+                growth=solver.penalty_growth, penalty_max=PENALTY_MAX, tolerance=solver.violation_tolerance,
+                settled=SETTLED,
             )  # fmt: skip
         return self._passes
 
@@ -248,8 +240,6 @@ class OuterLoop:
         solver, problem, X, U = self.solver, self.problem.take(rows), s.X[rows], s.U[rows]
         worst = measured(problem, X, U)
         growth = torch.full_like(worst, solver.penalty_growth)
-        if solver.stalled_growth is not None:
-            growth = growth.masked_fill(worst > HALVED * s.last_violation[rows], solver.stalled_growth)
         if not self.as_printed:
             growth = growth.masked_fill(worst <= solver.violation_tolerance, 1.0)
         multipliers = update_and_raise_penalty(problem, X, U, take(s.multipliers, rows), growth, PENALTY_MAX)
@@ -257,9 +247,8 @@ class OuterLoop:
         s.multipliers = copied(s.multipliers)
         put(s.multipliers, rows, multipliers)
         s.outer[rows] += 1
-        self._measure_progress(s, rows, worst)
         end.status[rows] = self._status(s, rows, end, worst)
-        s.last_cost[rows], s.last_violation[rows] = s.cost[rows], worst
+        s.last_cost[rows] = s.cost[rows]
         going = rows[end.status[rows] == Status.RUNNING]
         if going.numel() > 0:
             self._ask_guidance(self.problem, s, going, end.status)
@@ -271,21 +260,10 @@ class OuterLoop:
         over = s.outer[rows] >= self.solver.max_outer_iterations
         status[over & end.stuck[rows]] = Status.LINE_SEARCH_FAILED
         status[over & ~end.stuck[rows]] = Status.MAX_ITERATIONS
-        if self.solver.patience is not None:
-            status[s.waited[rows] >= self.solver.patience] = STALLED
         if not self.as_printed:
             settled = (s.cost[rows] - s.last_cost[rows]).abs() <= SETTLED * s.cost[rows].abs()
             status[end.converged[rows] & settled & (worst <= self.solver.violation_tolerance)] = Status.CONVERGED
         return status
-
-    def _measure_progress(self, s: State, rows: Tensor, worst: Tensor) -> None:
-        """Count the outer iterations of `rows` since the violation has halved, or the cost of a feasible one fallen."""
-        (violation, cost), now = s.mark[rows].unbind(-1), s.cost[rows]
-        limit = self.solver.violation_tolerance
-        feasible, cheaper = worst <= limit, now < cost - SETTLED * cost.abs()
-        progress = torch.where(feasible, (violation > limit) | cheaper, worst <= HALVED * violation)
-        s.mark[rows] = torch.where(progress.unsqueeze(-1), torch.stack((worst, now), dim=-1), s.mark[rows])
-        s.waited[rows] = torch.where(progress, 0, s.waited[rows] + 1)
 
     def _keep_best(self, s: State, rows: Tensor, problem: Problem, new: Iterate) -> None:
         old = take(s.best, rows)

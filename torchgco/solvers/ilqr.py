@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Count, NonNegative, Share
+from torchgco.base.options import Count, NonNegative
 from torchgco.base.status import STALLED, Status
 from torchgco.base.tree import Rows, put, take
 from torchgco.ilqr.descent import Descent
@@ -41,8 +41,6 @@ class ILQR(Solver, named="ilqr"):
             as printed: where the actual change is below it, in units of cost.
         max_iterations: inner limit.
         line_search: how step lengths are chosen.
-        damp_below: an accepted step length below it raises mu_r too, as a failed line search does: where dynamics are
-            curved and multipliers large, steps of a thousandth would use up all iterations. As printed: never.
 
     Raises:
         InputError: a field out of its range.
@@ -52,12 +50,11 @@ class ILQR(Solver, named="ilqr"):
     tolerance: NonNegative = 1e-6
     max_iterations: Count = 50
     line_search: LineSearch = LineSearch()
-    damp_below: Share = 0.0
 
     @property
     def descent(self) -> Descent:
         """The options as kernels read them."""
-        return Descent(self.line_search, self.tolerance, self.max_iterations, self.damp_below, self.as_printed)
+        return Descent(self.line_search, self.tolerance, self.max_iterations, self.as_printed)
 
     def run(self, call: Call) -> Solution:
         """One inner solve of a checked call."""

@@ -101,8 +101,7 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
         V up = SET(o->damping_growth) * before, down = before / SET(o->damping_decay);
         up = tgco_choose(up < SET(o->damping), SET(o->damping), up);
         up = tgco_choose(up > SET(o->regularisation_max), zero, up);
-        I crawls = accepted & (s->alpha < SET(o->damp_below));
-        next = tgco_choose(*refused | crawls, up, tgco_choose(down < SET(o->damping), zero, down));
+        next = tgco_choose(*refused, up, tgco_choose(down < SET(o->damping), zero, down));
     }
     s->mu_r = tgco_choose(failed | ~running, s->mu_r, next);
     I stuck = *refused & (s->mu_r == zero);

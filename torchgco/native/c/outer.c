@@ -157,15 +157,10 @@ static void keep(const Outer *o, int64_t e, double violation) {
 /* Why problem e ends after an inner solve that left `violation`; RUNNING where it goes on. */
 static int64_t tested(const Outer *o, int64_t e, double violation, int caught) {
     const Problem *p = o->of;
-    double cost = p->cost[e], *mark = o->mark + 2 * e;
+    double cost = p->cost[e];
     int fits = violation <= o->tolerance;
-    int cheaper = cost < mark[1] - o->settled * fabs(mark[1]);
-    int progress = fits ? mark[0] > o->tolerance || cheaper : violation <= o->halved * mark[0];
-    if (progress) { mark[0] = violation; mark[1] = cost; }
-    o->waited[e] = progress ? 0 : o->waited[e] + 1;
     int64_t why = RUNNING;
     if (o->outer[e] >= o->max_outer) why = p->refused[e] ? LINE_SEARCH_FAILED : MAX_ITERATIONS;
-    if (o->patience >= 0 && o->waited[e] >= o->patience) why = STALLED;
     int settled = fabs(cost - o->last_cost[e]) <= o->settled * fabs(cost);
     if (o->ends && p->converged[e] && settled && fits) why = CONVERGED;
     return why == RUNNING && o->stops && caught ? STOPPED : why;
@@ -186,7 +181,6 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
     for (int l = 0; l < count && !failed; l++) {
         int64_t e = number[l];
         double growth = o->growth;
-        if (o->stalled_growth > 0 && violation[l] > o->halved * o->last_violation[e]) growth = o->stalled_growth;
         if (o->ends && violation[l] <= o->tolerance) growth = 1;
         s->mu[l] *= growth;
         if (s->mu[l] > o->penalty_max) s->mu[l] = o->penalty_max;
@@ -209,7 +203,6 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
     int going = 0;
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];
-        o->last_violation[e] = violation[l];
         going |= o->outcome[e] == RUNNING;
         if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= DBL_MAX)) keep(o, e, violation[l]);
     }

@@ -42,7 +42,7 @@ typedef struct {
     const double *ladder; /* (rungs): step lengths */
     int64_t rungs, back, max_iterations; /* back: -1 where each search begins with a full step */
     int32_t accept_last;
-    double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest, damp_below, rounding, lost;
+    double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest, rounding, lost;
     double regularisation_first, regularisation_growth, regularisation_max;
     double damping, damping_growth, damping_decay;
 } Options;
@@ -71,15 +71,15 @@ typedef struct {
 /* The outer loop of the augmented Lagrangian (see solvers.augmented_lagrangian). */
 typedef struct {
     const Problem *of;
-    int64_t *outer, *waited, *outcome; /* (E): outcome is RUNNING until a problem ends */
-    double *last_cost, *last_violation, *mark; /* (E); mark (E, 2) */
+    int64_t *outer, *outcome; /* (E): outcome is RUNNING until a problem ends */
+    double *last_cost; /* (E) */
     double *best_X, *best_U, *best_mu, *best_cost, *best_violation; /* (E, ...) */
     const int64_t *base; /* (E): outer iterations before this solve, for `single_after` */
     const double *goal, *near; /* (E, DIM), (E); NULL: arrival doesn't count */
     int32_t solves, updates; /* whether a pass makes the inner solves, and the outer iterations of those ended */
-    int64_t passes, max_outer, patience, single_after; /* -1: no patience, or never a single contact */
+    int64_t passes, max_outer, single_after; /* -1: never a single contact */
     int32_t ends, stops; /* stops: a caught iterate ends its problem's solve */
-    double growth, stalled_growth, penalty_max, tolerance, halved, settled; /* stalled_growth: 0: none */
+    double growth, penalty_max, tolerance, settled;
     int64_t lifted_steps;
     double lifted_gain;
 } Outer;

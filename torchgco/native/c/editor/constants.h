@@ -12,7 +12,6 @@
 #define ORDINARY 0x1.47ae147ae147bp-7
 #define LEAST_SIZE 0x1.0c6f7a0b5ed8dp-20
 #define STOPPED -1
-#define STALLED -2
 #define MURMUR_1 0x85ebca6bu
 #define MURMUR_2 0xc2b2ae35u
 #define WEYL 0x9e3779b9u
