@@ -45,8 +45,10 @@ def way_through(
     first, last = tuple(first.astype(int)), tuple(last.astype(int))
 
     def free(size: float, counts: np.ndarray, time: float) -> np.ndarray:
-        at = low + size * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, d)
-        return (distances(layout, at, time) >= float(layout.vehicle_radius or 0.0) + room).reshape(counts)
+        cells = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, d)
+        return (distances(layout, low + size * cells, time) >= float(layout.vehicle_radius or 0.0) + room).reshape(
+            counts
+        )
 
     here = np.zeros(shape, bool)
     here[first] = free(cell, shape, 0.0)[first]
@@ -58,9 +60,9 @@ def way_through(
             cell, shape, k * step
         )
         if k > count - waits - 1:  # it has to be there by now
-            held = np.zeros(shape, bool)
-            held[last] = here[last]
-            here = held
+            at_goal = np.zeros(shape, bool)
+            at_goal[last] = here[last]
+            here = at_goal
         if not here.any():
             return None
     return Way(low + cell * _backwards(steps, last), step * np.arange(count + 1))
@@ -86,12 +88,11 @@ def _reached(here: np.ndarray, half: np.ndarray, moves: np.ndarray) -> np.ndarra
 
 def _backwards(steps: Sequence[tuple[np.ndarray, np.ndarray]], last: tuple[int, ...]) -> np.ndarray:
     """The cells (T, d) of a way that ends at `last`."""
-    at, cells, moves = np.array(last), [np.array(last)], _moves(len(last))
+    cells, moves = [np.array(last)], _moves(len(last))
     for here, half in reversed(steps):
-        tried = at - moves
-        inside = ((tried >= 0) & (tried < here.shape)).all(axis=1)
-        at = next(cell for cell in tried[inside] if here[tuple(cell)] and half[tuple(cell + at)])
-        cells.append(at)
+        before = cells[-1] - moves
+        inside = ((before >= 0) & (before < here.shape)).all(axis=1)
+        cells.append(next(cell for cell in before[inside] if here[tuple(cell)] and half[tuple(cell + cells[-1])]))
     return np.array(cells[::-1])
 
 

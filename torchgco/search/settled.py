@@ -54,16 +54,15 @@ def _better_guesses(search: Search) -> tuple[Tensor, Iterate]:
     problem, best = call.problem, end.best
     X, sound = open_loop(problem, call.U0), is_sound(problem, best, limit)
     rows = ((~sound | ~_falls_short(problem, X, best.X)) & (end.status != Status.INVALID_START)).nonzero().flatten()
-    part, X, U = problem.take(rows), X[rows], call.U0[rows]
-    cost, violation, old = part.cost.total(X, U), measured(part, X, U), take(best, rows)
+    asked, X, U, old = problem.take(rows), X[rows], call.U0[rows], take(best, rows)
+    cost, violation = asked.cost.total(X, U), measured(asked, X, U)
     cheaper = cost < old.cost - _worth(search, violation, old.violation) * old.cost.abs()
-    better = ~sound[rows] | _falls_short(part, old.X, X) | cheaper
-    better &= (violation <= limit) & torch.isfinite(cost)
-    some = better.nonzero().flatten()
-    none = Multipliers(tuple(torch.zeros_like(lam[some]) for lam in old.multipliers.lam), old.multipliers.mu[some])
-    guess = Iterate(X[some], U[some], none, cost[some], violation[some])
-    some = is_sound(part.take(some), guess, limit).nonzero().flatten()
-    return rows[better.nonzero().flatten()[some]], take(guess, some)
+    better = ~sound[rows] | _falls_short(asked, old.X, X) | cheaper
+    better = (better & (violation <= limit) & torch.isfinite(cost)).nonzero().flatten()
+    lam = tuple(torch.zeros_like(rows_of[better]) for rows_of in old.multipliers.lam)
+    guess = Iterate(X[better], U[better], Multipliers(lam, old.multipliers.mu[better]), cost[better], violation[better])
+    clear = is_sound(asked.take(better), guess, limit).nonzero().flatten()
+    return rows[better[clear]], take(guess, clear)
 
 
 def _falls_short(problem: Problem, X: Tensor, other: Tensor) -> Tensor:
