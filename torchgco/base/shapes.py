@@ -83,8 +83,8 @@ def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
         raise InputError(field, "a tensor", type(value).__name__)
     if value.dtype not in (torch.float64, torch.float32):
         raise InputError(field, f"a {'float64 or float32' if like is None else like.dtype} tensor", describe(value))
-    if value.layout != torch.strided or value.is_meta:
-        raise InputError(field, "a dense tensor that holds numbers", value.device if value.is_meta else value.layout)
+    if value.layout != torch.strided:
+        raise InputError(field, "a dense tensor", value.layout)
     if not is_recording() and asks(value):
         expected = "a tensor without gradients, `.detach()`: no solution is differentiated with respect to it"
         raise InputError(field, expected, describe(value))
