@@ -13,7 +13,7 @@ import torchgco
 from tests.problems import planar_batch
 from torchgco import Hold, InteriorPoint, Problem, Solution, Status
 from torchgco.kernels import EagerWarning, use_native
-from torchgco.native.compiler import find_compiler
+from torchgco.native.compiler import NativeError, find_compiler
 
 
 def problem_of(obstacles: bool, dtype: torch.dtype = torch.float64) -> Problem:
@@ -66,3 +66,14 @@ def test_only_the_time_is_warned_of_and_only_where_a_part_or_a_compiler_is_the_r
     monkeypatch.setenv("TORCHGCO_CC", "none")
     (slower,) = said(problem_of(False), "gco")[1]
     assert "many times slower" in slower and "no C compiler" in slower
+
+
+@pytest.mark.parametrize("obstacles", [True, False])
+def test_without_a_compiler_a_search_goes_on_with_al_ilqr(monkeypatch: pytest.MonkeyPatch, obstacles: bool) -> None:
+    whole = torchgco.solve(problem_of(obstacles), verbose=False)
+    monkeypatch.setenv("TORCHGCO_CC", "none")
+    solution, _ = said(problem_of(obstacles), "gco")
+    assert solution.statuses[0] in (Status.CONVERGED, Status.FEASIBLE)
+    torch.testing.assert_close(solution.cost, whole.cost, rtol=1e-3, atol=0)
+    with pytest.raises(NativeError, match="no C compiler"):
+        said(problem_of(obstacles), InteriorPoint())

@@ -13,6 +13,7 @@ from torchgco.base.tree import put
 from torchgco.kernels import is_convex, path_clearance
 from torchgco.lagrangian.quality import is_preferred, leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.native.compiler import find_compiler
 from torchgco.problem.problem import Problem
 from torchgco.search.nearby import Nearby
 from torchgco.search.search import Search
@@ -90,8 +91,8 @@ class Converge(Row):
 
     @staticmethod
     def worth(problem: Problem) -> bool:
-        """Whether these problems have more to them than AL-iLQR's inner solver."""
-        return bool(problem.constraints or problem.free_start is not None)
+        """Whether there is an interior point, which needs a compiler, and more to do than AL-iLQR's inner solver does."""
+        return bool(problem.constraints or problem.free_start is not None) and find_compiler() is not None
 
     @classmethod
     def begins(cls, problem: Problem) -> bool:

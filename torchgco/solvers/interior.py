@@ -17,6 +17,7 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
+from torchgco.native.compiler import NativeError
 from torchgco.native.interior import InteriorKernels
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -83,6 +84,7 @@ class InteriorPoint(Solver, named="solver"):
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         session, admitted = Session(call, own_units=True), self.admitted(call.problem)
+        interior_of(session.call.problem)  # or an error that says what is missing
         guess = guessed(session.call)
         end = self.no_worse(session.call, guess, self.solved(session.call, guess=guess, escapes=True))
         return session.finished(least_violated(session.call, end, admitted), admitted)
@@ -129,7 +131,12 @@ class InteriorPoint(Solver, named="solver"):
                 that a guess at rest never leaves, solve again from beside, and keep what costs less.
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
-        kernels = interior_of(problem)
+        try:
+            kernels = interior_of(problem)
+        except NativeError:  # no compiler: a search goes on with what its other solver finds
+            end = SolveEnd.blank(problem, call.U0)
+            end.status[:] = int(Status.MAX_ITERATIONS)
+            return replace(end, best=guess or guessed(call))
         if X0 is None:
             guess = guess or guessed(call)
             X = guess.X
