@@ -91,7 +91,7 @@ class Converge(Row):
 
     @staticmethod
     def worth(problem: Problem) -> bool:
-        """Whether there is an interior point, which needs a compiler, and more to do than AL-iLQR's inner solver does."""
+        """Whether an interior point is there, which needs a compiler, and there is more to do than AL-iLQR does."""
         return bool(problem.constraints or problem.free_start is not None) and find_compiler() is not None
 
     @classmethod

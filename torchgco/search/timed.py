@@ -62,6 +62,7 @@ class Timed(Row):
 
     label: ClassVar[str] = "timed"
     kinds: ClassVar[tuple[str, ...]] = ("moving",)
+    last: ClassVar[bool] = True
 
     @property
     def problems(self) -> str:
