@@ -131,7 +131,7 @@ class Constraint(PerElement):
         """Whether violations are lengths."""
         return self.geometric
 
-    def sizes(self, at_rest: Tensor, along: Tensor) -> Tensor:
+    def row_sizes(self, at_rest: Tensor, along: Tensor) -> Tensor:
         """Sizes (B, 1, p) of rows with these values (B, K, p) at rest, and along a trajectory, by their largest value.
 
         Of equalities at rest alone: along a trajectory they are met.

@@ -83,7 +83,7 @@ class _Bounds(Constraint):
             return expected, float(free[np.isfinite(free)][0])
         return None
 
-    def sizes(self, at_rest: Tensor, along: Tensor) -> Tensor:
+    def row_sizes(self, at_rest: Tensor, along: Tensor) -> Tensor:
         """Of both sides the larger one at rest, and along a trajectory their distance: none where they are equal."""
         every = torch.arange(self.upper.shape[-1], device=along.device)
         place = torch.cat((every[self.above], every[self.below])).expand_as(along)

@@ -44,7 +44,7 @@ def dwarfed(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         if before.numel() == 0:
             continue
         least = (constraint.value(*moved) - now).abs().amax(1, keepdim=True)
-        rows = constraint.sizes(before, now)
+        rows = constraint.row_sizes(before, now)
         size = torch.where(rows > least, rows, rows.amax(-1, keepdim=True))
         known = size > torch.maximum(least, free)
         unknown = torch.inf if constraint.joins_knots else LARGE_VIOLATION
