@@ -12,6 +12,7 @@ from torch import Tensor
 import torchgco
 from tests.trials import flights, trials
 from torchgco.dynamics import Dynamics, Unicycle
+from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.reports import report
 from torchgco.plotting.layouts import flights_of, layout_grid
 from torchgco.plotting.scene import scene_of
@@ -65,6 +66,7 @@ def drawn(seed: int) -> tuple[Vehicle, Layouts]:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle, layouts = drawn(seed)
+    setup = replace(torchgco.compose(["model=unicycle", "scenario=yard"]), vehicle=vehicle)
     task = vehicle.task(layouts)
     problem, (spheres, *_) = task.problem, task.problem.obstacles
     U = torch.randn(L, problem.N, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -88,7 +90,7 @@ def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: p
 
         monkeypatch.setattr(report, name, keep)
     monkeypatch.setattr(report, "_draw", lambda folder, name, figure: name[:5] in ("layou", "study") and figure())
-    report.write_report(tmp_path, lambda flown: states, printed="one", vehicle=vehicle)
+    report.write_report(tmp_path, lambda flown: states, printed="one", tasks=Tasks(setup, layouts))
 
     assert len(shown) == 3  # one of them as a png and as a pdf
     at = vehicle.dynamics.position

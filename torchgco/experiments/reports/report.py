@@ -94,15 +94,14 @@ def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any
     if tasks is None:
         return layouts.arrays(), {}
     groups = layouts.alike()
-    problems = [tasks.of(places, exact=True).problem for places in groups]  # the first of the study's own
-    first, arrays = problems[0], tasks.setup.vehicle.completed(layouts).arrays()
+    made = [tasks.of(places, exact=True) for places in groups]  # the first of the study's own
+    first, arrays = made[0].problem, tasks.setup.vehicle.completed(layouts).arrays()
     how = {"body": body_of(first), "position": first.dynamics.position}
     if first.dynamics.position is None:
         return arrays, how
     start, goal = (np.full((layouts.count, layouts.dimension), np.nan) for _ in range(2))
-    for places, problem in zip(groups, problems, strict=True):
-        assert problem.goal is not None
-        start[places], goal[places] = problem.x0[:, problem.position].numpy(), problem.goal.position.numpy()
+    for places, task in zip(groups, made, strict=True):
+        start[places], goal[places] = task.problem.x0[:, task.problem.position].numpy(), task.goal.numpy()
     return {**arrays, "start": start, "goal": goal}, how
 
 
