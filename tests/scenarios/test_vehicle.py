@@ -72,7 +72,7 @@ def test_the_built_in_models_are_those_of_the_configurations() -> None:
         (
             "model=quadrotor scenario=yard",
             "expected model=unicycle, as yard is 2-D with 4 states, or scenario=crossing or cylinders or forest or "
-            "forest_moving or gates or mazes or rooms or trefoils or walls or woods, got model=quadrotor",
+            "forest_moving or gates or mazes or rooms or swarm or trefoils or walls or woods, got model=quadrotor",
         ),
         ("model=unicycle scenario=forest", "expected model=quadrotor, as forest is 3-D with 14 states"),
     ],
