@@ -87,7 +87,9 @@ def test_it_says_that_nothing_is_solved_yet(tmp_path: Path) -> None:
     assert torch.equal(one.X, guess.X[1:2]) and torch.equal(one.multipliers.lam[2], guess.multipliers.lam[2][1:2])
     solution.save(tmp_path / "one.npz")
     torch.testing.assert_close(Solution.load(tmp_path / "one.npz").shifted().U, guess.U, rtol=0, atol=0)
-    for steps in (0, -1, 1.5, "two"):
+    part = 0.5 * (guess.U + solution.shifted(2).U)  # of a stage: the straight line between
+    torch.testing.assert_close(solution.shifted(1.5).U, part, rtol=1e-12, atol=1e-12)
+    for steps in (0, -1, float("inf"), "two"):
         with pytest.raises(InputError, match="steps"):
             solution.shifted(steps)  # type: ignore[arg-type]
 

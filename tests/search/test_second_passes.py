@@ -12,7 +12,7 @@ from torchgco import ControlBounds, PathProposals, Problem, Restarts, Status, co
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.roadmap.scene import has_paths
-from torchgco.search import Converge, Follow
+from torchgco.search import Converge, Follow, Timed
 from torchgco.search.following import Paths, followed
 from torchgco.search.proposals import Part, Proposal, propose
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -170,7 +170,7 @@ def test_a_converged_solve_is_enough_where_the_goal_is_assumed() -> None:
     problem = setup.task(setup.layouts(2)).problem
     given, assumed = problem, replace(problem, goal=None)
     assert assumed.goal is not None and assumed.goal.assumed
-    solver = without(presets.gco(3), Converge)
+    solver = without(presets.gco(3), Converge, Timed)  # which asks what the trajectory would cost without obstacles
     U0 = problem.cost.rest_controls(torch.zeros(2, problem.N, problem.m, dtype=torch.float64))
     alone = replace(solver.local, guidance=None).solve(assumed, U0)
     assert alone.statuses == [Status.CONVERGED] * 2 and float(assumed.goal.distance(alone.X[:, -1, :3]).min()) > 2

@@ -19,7 +19,7 @@ from torchgco.base.mixing import foreign, why
 from torchgco.base.options import Seconds, check_value
 from torchgco.base.shapes import MISTAKES, check_tensor, describe
 from torchgco.base.tree import is_users
-from torchgco.base.values import asks_for_knot
+from torchgco.base.values import asks_for_knot, whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost
@@ -151,9 +151,9 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
     row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
+    _check_axes("cost.stage", lambda k, x, u: row_cost.stage(x, u, k), takes_k, k, X[:, :-1], U)
     if type(cost).total is Cost.total:
         _check_cost_of_stages(cost, takes_k, rows, k, X[:, :-1], U)
-    _check_axes("cost.stage", lambda k, x, u: row_cost.stage(x, u, k), takes_k, k, X[:, :-1], U)
     _check_axes("cost.terminal", lambda _, x: row_cost.terminal(x), False, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
     _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
@@ -177,11 +177,12 @@ def _check_cost_of_stages(cost: Cost, takes_k: bool, rows: Tensor, k: Tensor, X:
 
     def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         joint = together(i, k, *z).clone()
-        for j in range(len(k)) if takes_k else (0, len(k) // 2, len(k) - 1):
-            joint[:, [j]] = together(i, k[j : j + 1], *(arg[:, [j]] for arg in z))
+        for j in range(len(k)) if takes_k else (0, len(k) // 2, len(k) - 1):  # a tensor k is that of all stages
+            joint[:, j] = together(i, int(k[j]), *(arg[:, j] for arg in z))
         return joint
 
-    index = called("cost.stage", ONE_STAGE, joined_knots, together, alone, rows, k, (X, U))
+    with whole_numbers_become(X.dtype):  # else 0.9**k of a tensor would be rounded to float32
+        index = called("cost.stage", ONE_STAGE, joined_knots, together, alone, rows, k, (X, U))
     if index is not None:
         raise InputError("cost.stage", ONE_STAGE, f"others at stage {index}, or where other states lie beside")
 

@@ -166,5 +166,6 @@ def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor) -> SolveEnd:
     found = solver.solved(near.call, X)
     wrong, end = near.wrong(found.best), replace(found, best=near.whole(found.best), last=near.whole(found.last))
     if wrong.numel() > 0:
-        put(end, wrong, solver.solved(call.take(wrong), X[wrong]))
+        again = solver.solved(call.take(wrong), X[wrong])
+        put(end, wrong, replace(again, iterations=end.iterations[wrong] + again.iterations))
     return end
