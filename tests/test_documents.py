@@ -189,7 +189,8 @@ def test_where_is_what_names_what_is_there() -> None:
         _, files, names = row.strip("| ").split(" | ")
         sources = [(ROOT / name).read_text() for name in re.findall(r"`([^`]+)`", files)]
         for name in re.findall(r"`([^`]+)`", names):
-            assert any(re.search(rf"(?:def|class|void|int) {name}\b|\b{name}(?::| =)", source) for source in sources), row
+            made = rf"(?:def|class|void|int) {name}\b|\b{name}(?::| =)"
+            assert any(re.search(made, source) for source in sources), row
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=name_of)

@@ -51,7 +51,7 @@ OFFSETS = (
 
 def gco(space: Space) -> Restarts:
     """The default: AL-iLQR and an interior point, with restarts along paths of several homotopy classes and samples."""
-    # In space samples mostly pass what moves, and compete; in the plane they seldom do, and would take most of the time.
+    # In space samples mostly pass what moves, and compete; in the plane they seldom do, and take most of the time.
     before, after = ({"timed": Timed()}, {}) if _in_the_plane(space) else ({}, {"timed": Timed()})
     return Restarts(
         local=replace(_local(space), guidance=_guidance(space)),

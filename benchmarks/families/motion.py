@@ -1,0 +1,71 @@
+"""python -m benchmarks.families.motion: scenes in which everything moves, by `gco` and by others.
+
+Layouts are drawn by the scenarios of `docs/studies.md`; each has a way for a point at a stated pace. The goal is
+stated, not required. All solvers start from the vehicle at rest and are judged by `torchgco.judge`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import torch
+
+import torchgco
+from benchmarks.lib.command import Command
+from benchmarks.lib.page import markdown, share
+from torchgco import Problem, compose
+
+SCENES = {
+    "traffic": "unicycle", "walkers": "unicycle", "sliding": "unicycle", "revolving": "unicycle",
+    "conveyor": "unicycle", "swarm": "quadrotor", "forest_moving": "quadrotor",
+}  # fmt: skip
+NEAR = 0.02  # share of the least cost
+
+
+def problem_of(scene: str, count: int, seed: int) -> Problem:
+    """The layouts of a scene as the command line poses them."""
+    words = [f"model={SCENES[scene]}", f"scenario={scene}", f"study.layouts={count}", f"seed={seed}"]
+    return compose(words).task().problem
+
+
+def text(count: int, seed: int, solvers: Sequence[str]) -> str:
+    """The table: a row for each solver of each scene."""
+    rows = []
+    for scene in SCENES:
+        problem = problem_of(scene, count, seed)
+        costs, spent = [], []
+        for solver in solvers:
+            torchgco.solve(problem.take([0]), solver=solver, verbose=False)  # compiles
+            began = time.process_time()
+            solution = torchgco.solve(problem, solver=solver, verbose=False)
+            spent.append((time.process_time() - began) / count)
+            verdict = torchgco.judge(problem, solution.U)
+            costs.append(torch.where(verdict.reached, verdict.cost, torch.inf))
+        least = torch.stack(costs).amin(0)
+        for solver, cost, seconds in zip(solvers, costs, spent, strict=True):
+            reached, near = torch.isfinite(cost), cost <= (1.0 + NEAR) * least
+            ratio = (cost / least)[reached]
+            worst = f"{float(ratio.median()):.3f} ({float(ratio.max()):.3f})" if reached.any() else "-"
+            shares = (share(int(rows_of.sum()), count) for rows_of in (reached, reached & near))
+            rows.append([scene, SCENES[scene], f"`{solver}`", *shares, worst, f"{seconds:.2f}"])
+    head = [
+        "scene",
+        "model",
+        "solver",
+        "reached",
+        "within 2 % of the least cost",
+        "cost / least (most)",
+        "s a layout",
+    ]
+    return markdown(head, rows)
+
+
+main = Command(
+    __doc__, "motion", text, "{count} drawn layouts a scene, seed {seed}",
+    count=(16, "layouts of each scene"), seed=(91, "of the layouts"),
+    solvers=(("gco", "gco_fast", "multistart", "interior_point"), "presets"),
+)  # fmt: skip
+
+if __name__ == "__main__":
+    raise SystemExit(main())
