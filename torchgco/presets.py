@@ -51,18 +51,15 @@ OFFSETS = (
 
 def gco(space: Space) -> Restarts:
     """The default: AL-iLQR and an interior point, with restarts along paths of several homotopy classes and samples."""
-    # In space samples mostly pass what moves, and compete; in the plane they seldom do, and take most of the time.
-    before, after = ({"timed": Timed()}, {}) if _in_the_plane(space) else ({}, {"timed": Timed()})
     return Restarts(
         local=replace(_local(space), guidance=_guidance(space)),
         passes=Passes({
             "guess": FirstSolve(single_contact_after=3 if _in_the_plane(space) else 6),
-            **before,
+            "timed": Timed(),
             "maps": Tube(among="maps"),
             "paths": _paths(space),
             "tube": Tube(among="bodies"),
             "samples": Samples(redraws=2 if _in_the_plane(space) else 3),
-            **after,
             "clear": ClearChords(),
             "tighten": Tighten(),
         }),
