@@ -51,20 +51,6 @@ def test_an_option_on_the_command_line_changes_that_option_alone() -> None:
         torchgco.compose(["solver.passes.paths.num_path=3"])
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_rows_come_in_the_order_of_their_space(model: str) -> None:
-    space, scenario = MODELS[model]
-    words = [f"model={model}", f"scenario={scenario}"]
-    names = presets.gco(space).passes.names
-    assert torchgco.compose(words).solver.passes.names == names
-    mine = "+solver.passes.mine={_target_: torchgco.search.IntoGoal}"  # a row of one's own is the last
-    assert torchgco.compose([*words, mine]).solver.passes.names == (*names, "mine")
-    for order in ("3", "null", "[3]"):
-        with pytest.raises(InputError, match=r"^solver\.passes\._order_: expected a list of texts, got "):
-            torchgco.compose([*words, f"solver.passes._order_={order}"])
-    assert presets.gco(2).passes.names != presets.gco(3).passes.names
-
-
 def test_a_row_is_left_out_on_the_command_line() -> None:
     setup = torchgco.compose(["~solver.passes.samples"])
     assert setup.solver.passes == presets.gco(3).passes.changed(samples=None)

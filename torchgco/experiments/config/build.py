@@ -20,7 +20,7 @@ from torchgco.base.memory import free_memory
 from torchgco.base.options import Checked, Count, Within, check_value
 from torchgco.dynamics import QuadrotorPlanning, QuadrotorThrusts
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
-from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, in_order, register, scenarios_for
+from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import settings_of
@@ -35,7 +35,7 @@ from torchgco.solvers.memory import least_bytes
 
 DEFAULT_LAYOUTS = 64
 FLOWN = (
-    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, swarm, trefoils, walls, "
+    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, trefoils, walls, "
     f"woods, or a layout file ({OTHER_MODELS})"
 )
 RACED = "race, or a layout file with gates and a free time, for mission=race"
@@ -123,9 +123,6 @@ def plain(config: DictConfig) -> dict[str, Any]:
     """A configuration as plain dicts, lists and numbers, resolved: no part of the library knows OmegaConf."""
     container = OmegaConf.to_container(config, resolve=True)
     assert isinstance(container, dict)
-    solver = container.get("solver")
-    if isinstance(solver, dict) and isinstance(solver.get("passes"), dict):
-        solver["passes"] = in_order(solver["passes"])
     return {str(key): value for key, value in container.items()}
 
 

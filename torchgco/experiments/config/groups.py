@@ -2,15 +2,14 @@
 
 Scenarios, solvers, missions and plants need no file in conf/: their options are the fields of their classes, with the
 defaults as values. A solver's option that differs between the plane and space becomes an interpolation that chooses by
-`model.dimension`; where the rows of its table come in another order, so does ORDER beside them. Files, of conf/ or of a
-user, add to them or extend them by name.
+`model.dimension`. Files, of conf/ or of a user, add to them or extend them by name.
 """
 
 from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from omegaconf import OmegaConf
 
-from torchgco.base.options import check_value
 from torchgco.base.version import PACKAGE
 from torchgco.dynamics import Airframe
 from torchgco.exploration import SensorMission
@@ -36,7 +34,6 @@ from torchgco.search import Passes
 
 ANYWHERE = {2: "unicycle", 3: "quadrotor"}  # the model for layouts that give positions alone
 BY_DIMENSION = "torchgco.by_dimension"
-ORDER = "_order_"  # key beside the rows of a table: their names in order, where that differs between plane and space
 SHARED_FIELDS = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each
 HELP_WIDTH = 100  # of the help page
 _targets: dict[str, set[str]] = {}  # paths of the classes that registered options make, by group
@@ -147,18 +144,6 @@ def _by_dimension(dimension: int, plane: Any, space: Any) -> Any:
     return OmegaConf.create(chosen) if isinstance(chosen, list | dict) else chosen
 
 
-def in_order(rows: dict[str, Any]) -> dict[str, Any]:
-    """The rows of a table in the order that they say; those that it doesn't name, such as a user's own, come last.
-
-    Raises:
-        InputError: an order that is no list of names.
-    """
-    order = rows.get(ORDER, [])
-    check_value(order, Sequence[str], f"solver.passes.{ORDER}")
-    names = dict.fromkeys([*(name for name in order if name in rows), *rows])
-    return {name: rows[name] for name in names if name != ORDER}
-
-
 def _drawn(count: int, _root_: Any) -> int | None:
     """A number of layouts where they are drawn; None, all of them, where they come from a file."""
     scenario = _root_.get("scenario")
@@ -193,10 +178,8 @@ def _tree(value: Any) -> Any:
 
 def _joined(plane: Any, space: Any) -> Any:
     """One tree for both: equal values as they are, others as interpolations."""
-    if isinstance(plane, dict) and isinstance(space, dict) and plane.keys() == space.keys():
-        both = {key: _joined(plane[key], space[key]) for key in plane}
-        orders = list(plane), list(space)
-        return both if orders[0] == orders[1] else both | {ORDER: _joined(*orders)}
+    if isinstance(plane, dict) and isinstance(space, dict) and list(plane) == list(space):
+        return {key: _joined(plane[key], space[key]) for key in plane}
     rows = isinstance(plane, list) and isinstance(space, list) and len(plane) == len(space)
     if rows and all(isinstance(item, dict) for item in plane):  # a table's rows: each option can be changed by itself
         return [_joined(a, b) for a, b in zip(plane, space, strict=True)]
