@@ -35,7 +35,7 @@ from torchgco.solvers.memory import least_bytes
 
 DEFAULT_LAYOUTS = 64
 FLOWN = (
-    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, trefoils, walls, "
+    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, swarm, trefoils, walls, "
     f"woods, or a layout file ({OTHER_MODELS})"
 )
 RACED = "race, or a layout file with gates and a free time, for mission=race"
