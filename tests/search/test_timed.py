@@ -157,3 +157,15 @@ def test_velocities_are_read_from_the_equations() -> None:
     velocity = Velocity.of(drives)
     assert velocity.by_heading and velocity.places == (2, 3)
     assert np.allclose(velocity.states(np.array([[0.0, 2.0]]))[0, 2:], [0.5 * np.pi, 2.0])
+
+
+def test_a_problem_whose_obstacles_are_all_absent_loses_nothing() -> None:
+    """Its goal is out of reach, so that it would be searched."""
+    nan = torch.nan
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 3:], u), -1), 6, 3, 0.1, "rk4", slice(0, 3))
+    cost = QuadraticCost([0.1] * 6, [0.01] * 3, [50.0] * 6, x_ref=[40.0, 0, 0, 0, 0, 0])
+    spheres = Spheres([[[nan] * 3], [[5.0, 0, 0]]], [[nan], [0.5]], 0.3, [[0.0, 1.0, 0.0]])
+    parts = [spheres, ControlBounds(-5.0, 5.0), StateBounds([-1e4] * 3 + [-3.0] * 3, [1e4] * 3 + [3.0] * 3)]
+    problem = Problem(model, cost, parts, torch.zeros(2, 6).double(), 50, Goal([40.0, 0, 0], 0.3))
+    solution = solve(problem, verbose=False)
+    assert bool(judge(problem, solution.U).feasible.all())

@@ -94,7 +94,8 @@ class Timed(Row):
         good = (best.violation <= limit) & (best.cost <= bound + GAP * bound.abs())
         if ranks_arrival(search.call.problem):
             good &= search.best.arrived()[rows]
-        left = (~good).nonzero().flatten()
+        present = torch.stack([~part.absent.all(-1) for part in search.call.problem.obstacles]).any(0)[rows]
+        left = (present & ~good).nonzero().flatten()
         if left.numel() == 0:
             return
         rows, X = rows[left], X[left]

@@ -91,9 +91,8 @@ def _costs(values: Array) -> Tensor:
 def _sizes(problem: Problem, free: Tensor, finer: float) -> Sizes:
     at, d = problem.position, problem.position.stop - problem.position.start
     radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
-    present = [part.margins[~part.absent] for part in problem.obstacles]
-    margins = torch.cat([part for part in present if part.numel() > 0])
-    spacing = finer * (radius if radius > 0.0 else THIN * float(margins.min()))
+    margins = [float(part.margins[~part.absent].min()) for part in problem.obstacles if not bool(part.absent.all())]
+    spacing = finer * (radius if radius > 0.0 else THIN * min(margins))
     p = free[:, at].double().cpu().numpy()
     dt, stages = float(problem.dynamics.dt), int(problem.stages[0])
     v = np.diff(p, axis=0)[:stages] / dt
