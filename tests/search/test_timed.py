@@ -26,6 +26,7 @@ from torchgco import (
     presets,
     solve,
 )
+from torchgco.base.errors import HorizonWarning
 from torchgco.dynamics.unicycle import Unicycle
 from torchgco.kernels import path_clearance
 from torchgco.problem.between import bulge
@@ -167,5 +168,6 @@ def test_a_problem_whose_obstacles_are_all_absent_loses_nothing() -> None:
     spheres = Spheres([[[nan] * 3], [[5.0, 0, 0]]], [[nan], [0.5]], 0.3, [[0.0, 1.0, 0.0]])
     parts = [spheres, ControlBounds(-5.0, 5.0), StateBounds([-1e4] * 3 + [-3.0] * 3, [1e4] * 3 + [3.0] * 3)]
     problem = Problem(model, cost, parts, torch.zeros(2, 6).double(), 50, Goal([40.0, 0, 0], 0.3))
-    solution = solve(problem, verbose=False)
+    with pytest.warns(HorizonWarning):
+        solution = solve(problem, verbose=False)
     assert bool(judge(problem, solution.U).feasible.all())
