@@ -22,14 +22,15 @@ class Ways:
     parts: int
     margin: float
     clearance: Array  # (layers * parts + 1, *counts)
-    cell_cost: Array  # (layers + 1, *counts); infinite where barred
+    cell_cost: Array  # (layers, *counts), paid when a cell is left; infinite where barred
+    end_cost: Array  # (some, *counts), at the last layers; infinite where no way ends
     move_cost: dict[Place, float]
     last_cost: dict[Place, float]
     change: Place | tuple[float, ...]
 
     @property
     def layers(self) -> int:
-        return len(self.cell_cost) - 1
+        return len(self.cell_cost)
 
     @property
     def moves(self) -> list[Place]:
@@ -54,7 +55,13 @@ class Ways:
             point = np.array(cell) + s / self.parts * np.array(move)
             if self.between(layer * self.parts + s, point) < self.margin:
                 return None
-        return to if np.isfinite(self.cell_cost[(layer + 1, *to)]) else None
+        is_last = layer + 1 == self.layers
+        return to if is_last or np.isfinite(self.cell_cost[(layer + 1, *to)]) else None
+
+    def ending(self, layer: int, cell: Place, move: Place) -> float:
+        """What it costs to end there after a move."""
+        late = layer - (self.layers + 1 - len(self.end_cost))
+        return float(self.end_cost[(late, *cell)]) + self.last_cost[move] if late >= 0 else np.inf
 
     def changed(self, before: Place, after: Place) -> float:
         more = [abs(a - b) for a, b in zip(after, before, strict=True)]
@@ -70,21 +77,24 @@ class Ways:
                     more = self.changed(before, move) + self.move_cost[move]
                     to = self.leads(layer, cell, move) if np.isfinite(more) else None
                     if to is not None:
-                        total = cost + more + self.cell_cost[(layer + 1, *to)]
+                        total = cost + more + self.cell_cost[(layer, *cell)]
                         new[to, move] = min(new.get((to, move), np.inf), total)
             there.append(new)
-        onward: list[dict[tuple[Place, Place], float]] = [{state: self.last_cost[state[1]] for state in there[-1]}]
+        onward: list[dict[tuple[Place, Place], float]] = [
+            {(cell, move): self.ending(self.layers, cell, move) for cell, move in there[-1]}
+        ]
         for layer in reversed(range(self.layers)):
             new = {}
             for cell, before in there[layer]:
+                new[cell, before] = self.ending(layer, cell, before)
                 for move in self.moves:
                     more = self.changed(before, move) + self.move_cost[move]
                     to = self.leads(layer, cell, move) if np.isfinite(more) else None
                     if to is not None and (to, move) in onward[0]:
-                        total = more + self.cell_cost[(layer + 1, *to)] + onward[0][to, move]
-                        new[cell, before] = min(new.get((cell, before), np.inf), total)
+                        total = more + self.cell_cost[(layer, *cell)] + onward[0][to, move]
+                        new[cell, before] = min(new[cell, before], total)
             onward.insert(0, new)
-        found = np.full(self.cell_cost.shape, np.inf)
+        found = np.full((self.layers + 1, *self.counts), np.inf)
         for layer in range(self.layers + 1):
             for (cell, move), cost in there[layer].items():
                 total = cost + onward[layer].get((cell, move), np.inf)

@@ -215,6 +215,11 @@ class Obstacles(Distance):
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
 
+    def solids_at(self, t: Tensor) -> Solids | None:
+        """Those of a batch of one at times t (K,), s, as of K problems, or of one where they rest; None where they are
+        neither spheres nor boxes."""
+        return None
+
     def shapes(self, b: int) -> RoundedBoxes | None:
         """How those of problem b look; None where nobody says: no page or sensor shows them then."""
         solids = self.inflated()

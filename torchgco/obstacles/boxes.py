@@ -190,6 +190,9 @@ class BoundBoxes(OwnKind):
         numbers = torch.cat((self.centers, self.axes.flatten(2), self.half_sizes, marked(radius, absent)), dim=-1)
         return torch.cat((bounds.flatten(1), 2.0 * self.depths, numbers.flatten(1)), dim=1)
 
+    def solids_at(self, t: Tensor) -> Cuboids:
+        return self.inflated()
+
     def inflated(self) -> Cuboids:
         return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)
 

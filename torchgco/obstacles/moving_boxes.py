@@ -62,6 +62,9 @@ class MovingBoxes(OwnKind):
         gap = gap + (self.beneath(share) - self.boxes.inflated_radii).unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
+    def solids_at(self, t: Tensor) -> Cuboids:
+        return replace(self._solids, centers=self.centers_at(t)[0])
+
     def grown(self, by: Tensor) -> Self:
         return replace(self, boxes=self.boxes.grown(by))  # type: ignore[type-var]
 

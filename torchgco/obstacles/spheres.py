@@ -234,6 +234,10 @@ class BoundSpheres(OwnKind):
     def inflated(self) -> Solids | None:
         return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
 
+    def solids_at(self, t: Tensor) -> Solids:
+        moved = 0.0 if self.velocities is None else t.view(-1, 1, 1) * self.velocities
+        return Solids(self.centers + moved, self.inflated_radii, self.absent)
+
     def shapes(self, b: int) -> RoundedBoxes:
         velocity = None if self.velocities is None or not bool(self.velocities[b].any()) else array(self.velocities[b])
         solids = Solids(self.centers, self.inflated_radii, self.absent)

@@ -28,6 +28,8 @@ from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
 from torchgco.native.declarations import Header, Structure, defines
 from torchgco.native.engine import run
 from torchgco.native.includes import included, joined
+from torchgco.obstacles.base import OwnKind, Solids
+from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.lattice import Array
 
 PARTS = 3  # of a move, at whose ends it is looked at
@@ -101,13 +103,32 @@ class TimedLattice:
 
 
 @dataclass(frozen=True, eq=False)
+class Field:
+    """What keeps ways off: solids at the times of a lattice, and distances from all else.
+
+    Args:
+        away: from all else at `PARTS` times a layer, (layers PARTS + 1, cells), float32, m; infinite without any.
+        center: of S solids at these times, (layers PARTS + 1, S, d), float32, m, from the first cell.
+        half, axes, radius: of rounded boxes, (S, d), (S, d, d), (S,), float32, m; rows of `axes` are sides' directions.
+        resting: so many of them come first, and rest.
+    """
+
+    away: Tensor
+    center: Tensor
+    half: Tensor
+    axes: Tensor
+    radius: Tensor
+    resting: int
+
+
+@dataclass(frozen=True, eq=False)
 class TimedScene:
     """What a lattice is searched for.
 
     Args:
-        clearance: distances to the obstacles at `PARTS` times a layer, (layers PARTS + 1, cells), float32, m.
-        cell_cost: of being at a cell at a layer, (layers + 1, cells), float32; `FAR` where nobody may be. That of the
-            last layer is the cost of ending there.
+        field: what is in the way.
+        cell_cost: of being at a cell from a layer to the next, (layers, cells), float32; `FAR` where nobody may be.
+        end_cost: of ending at a cell, at the last so many layers, (at least 1, cells), float32; `FAR` where nobody may.
         move_cost, last_cost: of each move, and of the last one, (moves,), float32; `FAR` for what is too fast.
         change: of one unit more or less along each axis, (3,), float32.
         start: the cell at the first layer.
@@ -116,8 +137,9 @@ class TimedScene:
     """
 
     lattice: TimedLattice
-    clearance: Tensor
+    field: Field
     cell_cost: Tensor
+    end_cost: Tensor
     move_cost: Tensor
     last_cost: Tensor
     change: Tensor
@@ -127,16 +149,19 @@ class TimedScene:
 
     def arguments(self, most: int, dearer: float) -> Timed:
         """What C reads and writes of up to `most` ways."""
-        a = self.lattice
+        a, field = self.lattice, self.field
         three = [np.ones(3, np.int64), np.zeros(3, np.int64), np.ones(3, np.int64)]
         for whole, part in zip(three, (a.counts, a.least, a.most - a.least + 1), strict=True):
             whole[: a.d] = part
         counts, least, moves = map(torch.from_numpy, three)
         return Timed(
             counts=counts, least=least, moves=moves, layers=a.layers, parts=PARTS, start=self.start, first=self.first,
-            spacing=a.spacing, margin=self.margin, dearer=dearer, clearance=self.clearance, cell_cost=self.cell_cost,
-            move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most, tries=TRIES,
-            way=torch.empty(most, a.layers + 1, dtype=torch.int32), cost=torch.empty(most), found=0, states=0,
+            earliest=a.layers + 1 - len(self.end_cost), spacing=a.spacing, margin=self.margin, dearer=dearer,
+            solids=len(field.radius), resting=field.resting, center=field.center, half=field.half, axes=field.axes,
+            radius=field.radius, clearance=field.away.clone(), cell_cost=self.cell_cost, end_cost=self.end_cost,
+            move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most, tries=TRIES, found=0,
+            way=torch.empty(most, a.layers + 1, dtype=torch.int32), end=torch.empty(most, dtype=torch.int32),
+            cost=torch.empty(most),
         )  # fmt: skip
 
 
@@ -145,12 +170,12 @@ class TimedWays:
     """Ways of one problem, each of a class of its own, the cheapest first.
 
     Args:
-        points: at the layers, (W, layers + 1, d), m.
+        points: of each way at its layers, (its layers + 1, d), m.
         costs: (W,).
         tau: between the layers, s.
     """
 
-    points: Array
+    points: list[Array]
     costs: Array
     tau: float
 
@@ -173,25 +198,52 @@ def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[T
     run(library.tgco_timed, len(own), 1, every)
     found = []
     for scene, one, end in zip(scenes, own, every, strict=True):
-        way, cost = one.kept[-2:]
-        cells = way[: end.found].numpy()
-        found.append(TimedWays(scene.lattice.points[cells], cost[: end.found].double().numpy(), scene.lattice.tau))
+        way, last, cost = (part[: end.found].numpy() for part in one.kept[-3:])
+        points = scene.lattice.points
+        ways = [points[cells[: layer + 1]] for cells, layer in zip(way, last, strict=True)]
+        found.append(TimedWays(ways, cost.astype(np.float64), scene.lattice.tau))
     return found
 
 
-def clearances(parts: Sequence[Any], lattice: TimedLattice) -> Tensor:
-    """Distances (layers PARTS + 1, cells), float32, m, of a lattice's cells at its times from the obstacles of one
-    problem: infinite where there is none.
+def field_of(parts: Sequence[Any], lattice: TimedLattice) -> Field:
+    """What the obstacles of one problem are at the times of a lattice.
 
     Args:
         parts: of a batch of one; those of a body stand for the ball about the position that it holds.
     """
-    count = lattice.layers * PARTS + 1
-    parts = moved(cast(list(parts), torch.float32), torch.device("cpu"))
+    count, d = lattice.layers * PARTS + 1, lattice.d
+    times = torch.arange(count, dtype=torch.float64) * (lattice.tau / PARTS)
+    solids: list[list[Tensor]] = []
+    others = []
+    for part in moved(list(parts), torch.device("cpu")):
+        own = part.solids_at(times) if isinstance(part, OwnKind) and not is_users(part) else None
+        others.append(part) if own is None else solids.append(_present(own, count))
+    if not solids:
+        solids = [[torch.empty(count, 0, d), torch.empty(0, d), torch.empty(0, d, d), torch.empty(0)]]
+    columns = enumerate(zip(*solids, strict=True))
+    center, half, axes, radius = (torch.cat(column, dim=int(i == 0)) for i, column in columns)
+    rests = (center == center[:1]).all(-1).all(0)
+    order = (~rests).to(torch.int8).argsort(stable=True)
+    center = (center - torch.from_numpy(lattice.origin))[:, order]
+    shaped = (part.float().contiguous() for part in (center, half[order], axes[order], radius[order]))
+    return Field(_away(others, lattice, times.float()), *shaped, int(rests.sum()))
+
+
+def _present(solids: Solids, count: int) -> list[Tensor]:
+    """Centres (count, S, d), half sides (S, d), axes (S, d, d) and radii (S,) of those that aren't absent; all at once
+    where they rest."""
+    here, d = ~solids.absent[0], solids.centers.shape[-1]
+    center, radius = solids.centers[:, here].double().expand(count, -1, -1), solids.radii[0, here].double()
+    if not isinstance(solids, Cuboids):
+        return [center, radius.new_zeros(len(radius), d), torch.eye(d).double().expand(len(radius), d, d), radius]
+    return [center, solids.half_sizes[0, here].double(), solids.axes[0, here].double(), radius]
+
+
+def _away(parts: Sequence[Any], lattice: TimedLattice, times: Tensor) -> Tensor:
+    """Distances (T, cells), float32, m, of the cells at times (T,) from obstacles of any kinds."""
+    found = torch.full((len(times), lattice.cells), torch.inf)
     points = torch.from_numpy(lattice.points).float().unsqueeze(0)
-    times = torch.arange(count, dtype=torch.float32) * (lattice.tau / PARTS)
-    found = torch.full((count, lattice.cells), torch.inf)
-    for part in parts:
+    for part in cast(list(parts), torch.float32):
         if part.absent.numel() > 0:
             for row, t in zip(found, times[: None if part.moving else 1].split(1), strict=False):
                 # A user's kind may need as many times as there are points.

@@ -17,6 +17,7 @@ from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_maps, has_paths
+from torchgco.search.arrivals import Arrivals
 from torchgco.search.chords import ClearChords
 from torchgco.search.converge import Converge
 from torchgco.search.freed import Freed
@@ -48,7 +49,6 @@ PASSES = Passes((Solve(), PathProposals(), FromProposal(), FromSamples("unpropos
 TABLE_COLUMNS = "name", "pass", "problems", "what it does"
 
 TIME_PACES = 0.7, 1.0, 1.4  # of the times found, where the time is free: each is a search of its own
-MOVING_PACES = 0.6, 0.7, 0.8, 0.9, 1.0, 1.2  # the same among obstacles that move: each gap opens at a time of its own
 
 
 @dataclass(frozen=True)
@@ -125,10 +125,12 @@ class Restarts(Solver):
             chooser = self.interior.choosing_time(problem)
             return replace(chooser, starts=count, others=count if every else count // 2)
         limit = self.local.violation_tolerance
-        paces = MOVING_PACES if any(part.moving for part in problem.obstacles) else TIME_PACES
         through = partial(solved_through_gates, self.interior, limit)
         rounds = max((one.rounds for one in self.passes.steps if isinstance(one, ClearChords)), default=0)
-        return Chooser(self._at_held_times(), Freed(self.interior, limit, rounds), limit, paces=paces, through=through)
+        return Chooser(
+            self._at_held_times(), Freed(self.interior, limit, rounds), limit, paces=TIME_PACES, through=through,
+            arrivals=Arrivals.of(self.passes.steps, problem),
+        )  # fmt: skip
 
     def _at_held_times(self) -> Restarts:
         """The same without further starts: a time that is too short has no trajectory, and the next one is tried."""

@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import numpy as np
-import scipy
 import torch
 from torch import Tensor
 
@@ -21,7 +19,6 @@ from torchgco.kernels import measured, path_clearance
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.lagrangian.state import SolveEnd
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.timed import TimedWays, library_for, timed_ways
 from torchgco.search.chords import EXTRA
 from torchgco.search.converge import solved_nearby
@@ -29,15 +26,14 @@ from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import SOLVER
 from torchgco.search.table import Row
+from torchgco.search.timed_guesses import guesses_along
 from torchgco.search.timed_scenes import can_search, scene_in_time
-from torchgco.search.velocity import Velocity
 from torchgco.solvers.contracts import Call
 
 PROBLEMS_AT_ONCE = 16  # searched together: bounds the memory
 FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the lattice is made finer once
 GAP = 0.02  # share by which what has arrived may cost more than without obstacles, and is left as it is
 DEARER = 0.5  # share by which ways that are solved may cost more than the cheapest, on the lattice
-SMALL = 1e-4  # change of a control by which its effect is looked at
 ALIKE = 1e-4  # share by which the costs of two candidates may differ that count as the same
 ROUNDS = 5  # of solves, at most, each among larger obstacles: what is clear at knots may touch between them
 
@@ -138,7 +134,7 @@ def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor
     if each.numel() == 0:
         return done
     each = each.to(rows.device)
-    X, U = _guesses(search.call.problem.take(rows), each, found)
+    X, U = guesses_along(search.call.problem.take(rows), each, found)
     call = replace(search.call.take(rows[each]), U0=U, warm=None, callback=None)
     grown, left = torch.zeros_like(X[:, 0, 0]), torch.arange(len(each), device=each.device)
     least = torch.full_like(search.best.end.best.cost[rows], torch.inf)
@@ -203,44 +199,6 @@ def _keep(search: Search, rows: Tensor, each: Tensor, merit: Tensor, end: SolveE
     if bool(done.any()):
         search.best.keep(rows[done], kept)
     return done
-
-
-def _guesses(problem: Problem, each: Tensor, found: list[TimedWays]) -> tuple[Tensor, Tensor]:
-    """States (C, N+1, n) and controls (C, N, m) along the ways of all problems in turn; `each` says whose way it is."""
-    states, t = [], float(problem.dynamics.dt) * np.arange(problem.N + 1.0)
-    for b, ways in enumerate(found):
-        if len(ways.points) == 0:
-            continue
-        velocity = Velocity.of(problem.take(torch.tensor([b], device=each.device)))
-        for points in ways.points:
-            p, v = _smooth(points, ways.tau, t, velocity.start)
-            states.append(velocity.states(v, problem.x0.new_tensor(p)))
-            states[-1][0] = problem.x0[b]
-    X, many = torch.stack(states), problem.take(each)
-    x, U, model = X[:, :-1], many.at_rest[1], many.along
-    then = model.step(x, U)
-    fu = torch.stack([model.step(x, U + SMALL * row) - then for row in torch.eye(many.m).to(U)], dim=-1) / SMALL
-    U = (U + (torch.linalg.pinv(fu) @ (X[:, 1:] - then).unsqueeze(-1)).squeeze(-1)).nan_to_num(0.0, 0.0, 0.0)
-    if many.control_bounds is not None:
-        lower, upper = many.control_bounds.over(problem.N)
-        U = torch.minimum(torch.maximum(U, lower), upper)
-    return X, U
-
-
-def _smooth(points: Array, tau: float, t: Array, first: Array) -> tuple[Array, Array]:
-    """Places and velocities (K, d) at times (K,) of the cubic spline through points (P, d) at times tau apart; at rest
-    after the last one.
-
-    Args:
-        first: the velocity (d,) at the beginning.
-    """
-    ends = (1, first), (2, np.zeros_like(first))
-    spline = scipy.interpolate.CubicSpline(tau * np.arange(len(points)), points, bc_type=ends)
-    last = tau * (len(points) - 1)
-    late = t > last + 1e-9
-    v = spline(np.minimum(t, last), 1)
-    v[late] = 0.0
-    return spline(np.minimum(t, last)), v
 
 
 def _dimension(problem: Problem) -> int:

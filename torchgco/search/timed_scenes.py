@@ -11,15 +11,17 @@ from torch import Tensor
 
 from torchgco.base.shapes import repeated
 from torchgco.constraints.gates import gates_of
+from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
-from torchgco.roadmap.timed import FAR, TimedLattice, TimedScene, clearances
+from torchgco.roadmap.timed import FAR, TimedLattice, TimedScene, field_of
 from torchgco.search.reach import bounds_at_inner_knots, push_of
 from torchgco.search.velocity import Velocity
 
 STATES = 2**24  # of a lattice, at most: 128 MiB
+MOVES = 256  # of a lattice, at most, before the constraints are asked: two sweeps look at each of them everywhere
 COARSER = 1.1  # times as wide cells, until there are so few
 PUSH_SHARE = 0.5  # share of the strongest acceleration by which the lattice changes its velocity at most
 ROOM = 0.1  # share of a cell's side that ways keep clear, as distances are interpolated between cells
@@ -56,19 +58,36 @@ def _with_distances(problem: Problem) -> list[Any]:
     return [part for part in parts if hasattr(part, "signed_distance")]
 
 
-def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedScene:
+class Span(NamedTuple):
+    """The times of one problem."""
+
+    step: float  # of the trajectory without obstacles, s
+    earliest: float  # at which it may end, s
+    latest: float
+    second: float = 0.0  # what a second costs
+
+    @classmethod
+    def of(cls, problem: Problem) -> Span:
+        """That of a batch of one whose time isn't free."""
+        dt, stages = float(problem.dynamics.dt), int(problem.stages[0])
+        return cls(dt, stages * dt, stages * dt)
+
+
+def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0, span: Span | None = None) -> TimedScene:
     """The scene of a batch of one.
 
     Args:
         free: states (N+1, n) of the trajectory without obstacles.
         finer: share of the usual spacing.
+        span: when ways may end; None: that of the problem.
     """
+    span = span or Span.of(problem)
     velocity, start = Velocity.of(problem), problem.x0[0, problem.position].double().cpu().numpy()
-    lattice = _lattice(_sizes(problem, free, finer), start, velocity)
+    lattice = _lattice(_sizes(problem, free, finer, span), start, velocity)
     stages = lattice.tau / float(problem.dynamics.dt)
     move, last = velocity.cost_of(lattice.velocities, stages)
     fast = ~velocity.admitted(lattice.velocities)
-    cell_cost, bend = _cell_costs(problem, lattice, stages)
+    cell_cost, end_cost, bend = _cell_costs(problem, lattice, stages, span)
     change = np.zeros(3)
     unit = lattice.spacing / lattice.tau
     own = velocity.cost_of_change(unit / lattice.tau, stages)
@@ -77,7 +96,7 @@ def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0) -> TimedSc
     if not change.any() and not move.any():  # the way alone counts
         move = (lattice.velocities**2).sum(1) * lattice.tau
     return TimedScene(
-        lattice, clearances(_with_distances(problem), lattice), cell_cost,
+        lattice, field_of(_with_distances(problem), lattice), cell_cost, end_cost,
         _costs(np.where(fast, FAR, move)), _costs(last), _costs(change), lattice.cell(start),
         lattice.move(velocity.start), ROOM * lattice.spacing,
     )  # fmt: skip
@@ -88,17 +107,16 @@ def _costs(values: Array) -> Tensor:
     return torch.from_numpy(np.nan_to_num(values, nan=FAR, posinf=FAR, neginf=FAR)).float().contiguous()
 
 
-def _sizes(problem: Problem, free: Tensor, finer: float) -> Sizes:
+def _sizes(problem: Problem, free: Tensor, finer: float, span: Span) -> Sizes:
     at, d = problem.position, problem.position.stop - problem.position.start
     radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
     margins = [float(part.margins[~part.absent].min()) for part in problem.obstacles if not bool(part.absent.all())]
     spacing = finer * (radius if radius > 0.0 else THIN * min(margins))
     p = free[:, at].double().cpu().numpy()
-    dt, stages = float(problem.dynamics.dt), int(problem.stages[0])
-    v = np.diff(p, axis=0)[:stages] / dt
+    v = np.diff(p, axis=0)[: int(problem.stages[0])] / span.step
     push = float(push_of(problem)[0])
     if not np.isfinite(push) or push <= 0.0:
-        push = float(np.abs(np.diff(v, axis=0)).max(initial=0.0)) / dt or 1.0
+        push = float(np.abs(np.diff(v, axis=0)).max(initial=0.0)) / span.step or 1.0
     ends = [problem.x0[:, at].double().cpu().numpy(), p]
     if problem.goal is not None:
         ends.append(problem.goal.position.double().cpu().numpy())
@@ -113,7 +131,7 @@ def _sizes(problem: Problem, free: Tensor, finer: float) -> Sizes:
     if d == 3 and len(v) > 0:
         slowest, fastest = v.min(0) - SIDEWAYS * speed, v.max(0) + SIDEWAYS * speed
     low, high = np.maximum(low, points.min(0) - beyond), np.minimum(high, points.max(0) + beyond)
-    return Sizes(spacing, push, stages * dt, low, high, slowest, fastest)
+    return Sizes(spacing, push, span.latest, low, high, slowest, fastest)
 
 
 def _largest(problem: Problem) -> float:
@@ -129,49 +147,78 @@ def _largest(problem: Problem) -> float:
 
 
 def _lattice(sizes: Sizes, start: Array, velocity: Velocity) -> TimedLattice:
-    """As fine as the sizes say, or as the memory allows; with the moves that the constraints admit."""
+    """As fine as the sizes say, or as memory and moves allow; with the moves that the constraints admit."""
     spacing = sizes.spacing
     while True:
-        tau = np.sqrt(spacing / (PUSH_SHARE * sizes.push))
-        layers = max(2, round(sizes.duration / tau))
-        tau = sizes.duration / layers
-        before, behind = (
-            np.floor(np.maximum(part, 0.0) / spacing + 1e-9).astype(np.int64)
-            for part in (start - sizes.low, sizes.high - start)
-        )
-        unit = spacing / tau
-        least, most = np.floor(sizes.slowest / unit + 0.5), np.ceil(sizes.fastest / unit - 0.5)
-        least, most = (part.astype(np.int64) for part in (np.minimum(least, -1), np.maximum(most, 1)))
-        lattice = TimedLattice(start - spacing * before, before + behind + 1, spacing, tau, layers, least, most)
-        v = lattice.velocities
-        some = np.rint(v[velocity.admitted(v)] / unit).astype(np.int64)
-        some = np.concatenate((some, np.zeros_like(some[:1])))
-        lattice = replace(lattice, least=some.min(0), most=some.max(0))
-        if lattice.states <= STATES:
+        lattice = _of_spacing(sizes, start, spacing)
+        # What the constraints admit of so few moves is soon known; it may leave fewer.
+        if lattice is not None and (lattice := _admitted(lattice, velocity)).states <= STATES:
             return lattice
         spacing *= COARSER
 
 
-def _cell_costs(problem: Problem, lattice: TimedLattice, stages: float) -> tuple[Tensor, Array]:
-    """What being at a cell at a layer costs, (layers + 1, cells), and what being a cell away from the best one does, by
-    axis (d,)."""
-    at, dt = problem.position, float(problem.dynamics.dt)
+def _of_spacing(sizes: Sizes, start: Array, spacing: float) -> TimedLattice | None:
+    """The lattice with cells of a width, m; None where it has too many moves, or cells and layers."""
+    layers = max(2.0, np.rint(sizes.duration / np.sqrt(spacing / (PUSH_SHARE * sizes.push))))
+    tau = sizes.duration / layers
+    before, behind = (
+        np.floor(np.maximum(part, 0.0) / spacing + 1e-9) for part in (start - sizes.low, sizes.high - start)
+    )
+    unit = spacing / tau
+    least = np.minimum(np.floor(sizes.slowest / unit + 0.5), -1.0)
+    most = np.maximum(np.ceil(sizes.fastest / unit - 0.5), 1.0)
+    counts = before + behind + 1.0
+    if (most - least + 1.0).prod() > MOVES or (layers + 1.0) * counts.prod() > STATES:
+        return None
+    whole = [part.astype(np.int64) for part in (counts, least, most)]
+    return TimedLattice(start - spacing * before, whole[0], spacing, tau, int(layers), whole[1], whole[2])
+
+
+def _admitted(lattice: TimedLattice, velocity: Velocity) -> TimedLattice:
+    """The same lattice without moves along an axis that the constraints admit nowhere."""
+    v = lattice.velocities
+    some = np.rint(v[velocity.admitted(v)] * (lattice.tau / lattice.spacing)).astype(np.int64)
+    some = np.concatenate((some, np.zeros((1, lattice.d), np.int64)))  # to rest
+    return replace(lattice, least=some.min(0), most=some.max(0))
+
+
+def _cell_costs(problem: Problem, lattice: TimedLattice, stages: float, span: Span) -> tuple[Tensor, Tensor, Array]:
+    """What being at a cell at a layer costs, (layers, cells), ending there at one of the last ones, (some, cells), and
+    being a cell away from the best one, by axis (d,)."""
+    dt = float(problem.dynamics.dt)
     x = repeated(problem.x0, lattice.cells)
     points = x.new_tensor(lattice.points)
-    x[..., at] = points
+    x[..., problem.position] = points
     u = problem.at_rest[1][:, :1].expand(-1, lattice.cells, -1)
-    K = int(problem.stages[0])
-    found = torch.empty(lattice.layers + 1, lattice.cells, dtype=torch.float64)
+    last = int(problem.stages[0]) - 1
+    found = torch.empty(lattice.layers, lattice.cells, dtype=torch.float64)
     for layer in range(lattice.layers):
-        k = min(K - 1, round(layer * lattice.tau / dt))
-        found[layer] = stages * problem.cost.stage(x, u, k)[0].double().cpu()
+        k = min(last, round(layer * lattice.tau / dt))
+        found[layer] = stages * (_stage_cost(problem, x, u, k, layer * lattice.tau) + span.second * dt).double().cpu()
         for part in problem.geometric:
             if not hasattr(part, "signed_distance") and k > 0 and part.holds_at(k):
                 found[layer][(part.at(x, k)[0] > 0).any(-1).cpu()] = FAR
-    found[-1] = problem.cost.terminal(x)[0].double().cpu()
     bend = _bend(found[0], lattice)
-    _bar(problem, lattice, points, found)
-    return found.nan_to_num(FAR, FAR, FAR).clamp(max=FAR).float(), bend
+    earliest = min(lattice.layers, int(np.ceil(span.earliest / lattice.tau - 1e-9)))
+    ends = [_end_cost(problem, x, layer * lattice.tau) for layer in range(earliest, lattice.layers + 1)]
+    end = torch.stack(ends).double().cpu()
+    _bar(problem, lattice, points, found, end)
+    numbers = (part.nan_to_num(FAR, FAR, FAR).clamp(max=FAR).float() for part in (found, end))
+    return *numbers, bend
+
+
+def _stage_cost(problem: Problem, x: Tensor, u: Tensor, k: int, t: float) -> Tensor:
+    """What a stage in states x (1, M, n) costs, (M,): stage k, with references of a time."""
+    if problem.time is None or k == 0 or not isinstance(problem.cost, QuadraticInFreeTime):
+        return problem.cost.stage(x, u, k)[0]
+    return problem.cost.stage_at(x, u, k, torch.full_like(x[..., 0], t / (k * float(problem.dynamics.dt))))[0]
+
+
+def _end_cost(problem: Problem, x: Tensor, t: float) -> Tensor:
+    """What ending in states x (1, M, n) at a time costs, (M,)."""
+    if problem.time is None or not isinstance(problem.cost, QuadraticInFreeTime):
+        return problem.cost.terminal(x)[0]
+    return problem.cost.terminal_at(x, torch.full_like(x[..., 0], t / (problem.N * float(problem.dynamics.dt))))[0]
 
 
 def _bend(cost: Tensor, lattice: TimedLattice) -> Array:
@@ -183,14 +230,14 @@ def _bend(cost: Tensor, lattice: TimedLattice) -> Array:
     return found
 
 
-def _bar(problem: Problem, lattice: TimedLattice, points: Tensor, cost: Tensor) -> None:
+def _bar(problem: Problem, lattice: TimedLattice, points: Tensor, cost: Tensor, end: Tensor) -> None:
     """Bar all cells but those at a goal that counts, at the end, and at gates, at their times; in place."""
     half = 0.5 * lattice.spacing * np.sqrt(lattice.d)  # the farthest that a place may be from a cell
     if problem.goal is not None and ranks_arrival(problem):
         near = goal_tolerance(problem)
         assert near is not None
         away = problem.goal.distance(points.unsqueeze(0))[0]
-        cost[-1, (away > max(float(near[0]), half)).cpu()] = FAR
+        end[:, (away > max(float(near[0]), half)).cpu()] = FAR
     gates = gates_of(problem)
     if gates is not None and gates.places is not None:
         dt = float(problem.dynamics.dt)
@@ -199,4 +246,4 @@ def _bar(problem: Problem, lattice: TimedLattice, points: Tensor, cost: Tensor) 
             away = (points - center).norm(dim=-1)
             late = abs(float(place) * dt - layer * lattice.tau)
             reach = max(float(size), half) + late * float(np.abs(lattice.velocities).max())
-            cost[layer, (away > reach).cpu()] = FAR
+            (end[-1] if layer == lattice.layers else cost[layer])[(away > reach).cpu()] = FAR

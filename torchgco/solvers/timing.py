@@ -67,6 +67,7 @@ class Chooser:
         starts: drawn guesses of the time and the controls, from which it is taken as a variable, too, in the end.
         others: so many of problems that have converged.
         rough: solves from these roughly, without a verdict; None: there are none.
+        arrivals: guesses with times of their own among obstacles that move: `search.arrivals`; None: there are none.
     """
 
     held: Runs
@@ -78,6 +79,7 @@ class Chooser:
     starts: int = 0
     others: int = 0
     rough: Callable[[Any], SolveEnd] | None = None
+    arrivals: Any = None
 
 
 class Timed:
@@ -90,6 +92,7 @@ class Timed:
     Attributes:
         best: the best trajectories, from the first attempt on, which is at all problems.
         clear: whether these touch no obstacle between two knots, (B,) bool.
+        found: whether these were begun from a way among obstacles that move, (B,) bool: there is no use in other times.
     """
 
     best: Solution
@@ -101,6 +104,7 @@ class Timed:
         self.time = problem.time
         self.through_gates = gates_of(problem) is not None and problem.dynamics.position is not None
         self.first = self._first()
+        self.found = torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
 
     @cached_property
     def _line(self) -> Tensor:
@@ -147,6 +151,8 @@ class Timed:
         rows, time = torch.arange(self.problem.B, device=self.problem.x0.device), self.time
         guess, again = self.first, torch.zeros_like(rows)
         has_states = self.call.X0 is not None
+        if self.chooser.arrivals is not None and time.count == 1 and self.call.warm is None:
+            rows = self._arrived(rows, guess)
         while rows.numel() > 0:
             self._tried(rows, guess[rows], has_states)
             best = self.best
@@ -164,6 +170,28 @@ class Timed:
         self._again()
         self._from_drawn()
         return self.best
+
+    def _arrived(self, rows: Tensor, guess: Tensor) -> Tensor:
+        """Take the time as a variable from the guess, and from ways that arrive at times of their own.
+
+        The problems (b,) are left of which no way leads to a feasible trajectory.
+        """
+        call = replace(self._at(rows, guess, self.call.X0 is not None), warm=None)
+        each, factors, X, U = self.chooser.arrivals.guesses(self.problem, call)
+        x0 = call.problem.x0[each]
+        x0[:, self.problem.n] = factors[:, 0]
+        many = call.take(each)
+        many = replace(many, problem=many.problem._with({"x0": x0}, many.problem.known), X0=X, U0=U, callback=None)
+        self._keep(rows, self.chooser.free.run(call))
+        ends, number = self.chooser.free.run(many), torch.zeros_like(each)
+        for b in each.unique():
+            number[each == b] = torch.arange(int((each == b).sum()), device=each.device)
+        for k in range(int(number.max()) + 1 if len(each) > 0 else 0):
+            self._keep(each[number == k], ends.take((number == k).nonzero().flatten()))
+        found = torch.zeros_like(self.clear)
+        found[each] = True
+        self.found = found & (self.best.violation <= self.chooser.limit)
+        return rows[~self.found]
 
     def _first(self) -> Tensor:
         """The factors (B, S) to begin with: the guess, else those that states to begin with take, else `own`.
@@ -252,7 +280,7 @@ class Timed:
             return
         far = ((self.first / self.own - 1.0).abs() > SAME_TIME).any(-1)
         for pace in (None, *self.chooser.paces):
-            feasible = self.best.violation <= self.chooser.limit
+            feasible = (self.best.violation <= self.chooser.limit) & ~self.found
             rows = (feasible & far if pace is None else feasible).nonzero().flatten()
             factors = self.own if pace is None else pace * factors_in(self.problem, self.best.X)
             if rows.numel() > 0 and not self.call.late:

@@ -1,25 +1,36 @@
 /* The cheapest ways through space and time, one of each class (roadmap/timed.py).
 
    A state is a layer of time, a cell, and the move that led there; a move differs from the one before by at most one
-   unit along each axis. Two sweeps of dynamic programming give the least cost through every state. Two dimensions are
-   three, with one cell and one move along the last axis. */
+   unit along each axis. Two sweeps of dynamic programming give the least cost through every state. A row of cells along
+   the last axis takes each move side by side. Being at a cell is paid for when it is left; the end has a cost of its
+   own. */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 #include "timed.h"
 
+#define CORNERS (1 << DIM)
+#define BESIDE (DIM == 3 ? 27 : 9) /* moves that one may follow */
+#define ROWS(x) for (int64_t r = 0; r < (x)->rows; r++)
+
+/* Where a move is at a part of it, between cells: how far these lie from the cell that it leaves, and their shares. */
+typedef struct { int64_t offset[CORNERS]; float share[CORNERS]; int64_t count; } Between;
+
 typedef struct {
     const Timed *t;
-    int64_t cells, moves, step[3], turn[3]; /* strides of cells and of moves */
-    const int32_t *move; /* (moves, 3) */
-    const float *length; /* (moves): m */
-    float *node; /* (layers + 1, cells): cell_cost, FAR where an obstacle is too near */
+    int64_t cells, moves, rows, width, last; /* width: cells of a row; last: moves along it */
+    int64_t step[DIM], turn[DIM]; /* strides of cells and of moves */
+    int32_t *move; /* (moves, DIM) */
+    Between *between; /* (moves, parts - 1) */
     float *ahead; /* (layers + 1, cells): no more than what any way costs from there on, without the changes of moves */
-    float *there, *onward; /* (layers + 1, cells, moves): the cheapest way to each state, and from it to the end */
-    uint8_t *seen; /* (layers + 1, cells): whether any way leads there */
-    float *row, *wide; /* (moves): scratch */
+    float *least; /* (layers + 1, cells): of the cheapest way there */
+    float *there, *onward; /* (layers + 1, moves, cells): the cheapest way to each state, and from it to the end */
+    int32_t *from, *to; /* (layers + 1, rows): between these cells of a row any way leads there */
+    float *row, *wide, *gap; /* (moves, width), (moves, width), (width): scratch */
     float limit; /* what a way may cost */
 } Sweep;
+
+static inline float lower(float a, float b) { return a < b ? a : b; }
 
 /* The clearance at a layer's part and at a point between cells, in cells. */
 static float clearance_at(const Sweep *w, int64_t part, const float *at) {
@@ -33,7 +44,7 @@ static float clearance_at(const Sweep *w, int64_t part, const float *at) {
         step[a] = i < last ? w->step[a] : 0;
         base += i * w->step[a];
     }
-    for (int corner = 0; corner < 1 << DIM; corner++) {
+    for (int corner = 0; corner < CORNERS; corner++) {
         float weight = 1.0f;
         int64_t place = base;
         for (int a = 0; a < DIM; a++) {
@@ -51,7 +62,7 @@ static void cell_of(const Sweep *w, int64_t cell, int64_t *at) {
 }
 
 /* Where a move leads from a cell at `at`; -1: out of the lattice. */
-static inline int64_t moved(const Sweep *w, const int64_t *at, int64_t cell, const int32_t *d) {
+static int64_t moved(const Sweep *w, const int64_t *at, int64_t cell, const int32_t *d) {
     for (int a = 0; a < DIM; a++) {
         if ((uint64_t)(at[a] + d[a]) >= (uint64_t)w->t->counts[a]) return -1;
         cell += d[a] * w->step[a];
@@ -59,219 +70,380 @@ static inline int64_t moved(const Sweep *w, const int64_t *at, int64_t cell, con
     return cell;
 }
 
-/* Whether a move from a cell keeps clear; the clearance changes no faster than the place does. */
-static int is_clear(const Sweep *w, int64_t layer, const int64_t *at, int64_t m, float room) {
-    if (w->length[m] <= room) return 1;
-    const Timed *t = w->t;
-    const int32_t *d = w->move + 3 * m;
-    for (int64_t s = 1; s < t->parts; s++) {
-        float point[DIM], share = (float)s / (float)t->parts;
-        for (int a = 0; a < DIM; a++) point[a] = (float)at[a] + share * (float)d[a];
-        if (clearance_at(w, layer * t->parts + s, point) < (float)t->margin) return 0;
+/* Lower the distances of a row of cells to those from one solid; `v` leads there from its centre, at the first cell. */
+static void lowered(const Timed *t, int64_t i, float *row, int64_t count, const float *v) {
+    const float *half = t->half + i * DIM, *axes = t->axes + i * DIM * DIM;
+    float radius = t->radius[i], h = (float)t->spacing, begin[DIM], along[DIM], square = 0.0f, size = 0.0f;
+    for (int k = 0; k < DIM; k++) {
+        begin[k] = 0.0f, along[k] = h * axes[k * DIM + DIM - 1], size += half[k];
+        for (int a = 0; a < DIM; a++) begin[k] += axes[k * DIM + a] * v[a];
+        if (k < DIM - 1) square += v[k] * v[k];
     }
-    return 1;
+    if (size == 0.0f) {
+        for (int64_t j = 0; j < count; j++) {
+            float x = v[DIM - 1] + h * (float)j, away = sqrtf(square + x * x) - radius;
+            row[j] = away < row[j] ? away : row[j];
+        }
+        return;
+    }
+    for (int64_t j = 0; j < count; j++) {
+        float deepest = -FAR, sum = 0.0f;
+        for (int k = 0; k < DIM; k++) {
+            float q = fabsf(begin[k] + along[k] * (float)j) - half[k], out = q > 0.0f ? q : 0.0f;
+            deepest = q > deepest ? q : deepest, sum += out * out;
+        }
+        float away = (deepest > 0.0f ? sqrtf(sum) : deepest) - radius;
+        row[j] = away < row[j] ? away : row[j];
+    }
 }
 
-/* How far, m, moves from a cell at a layer lead that keep clear for sure. */
-static float room_at(const Sweep *w, int64_t layer, int64_t cell) {
+/* Lower the distances of all cells nearer than `far` to a solid at one time. */
+static void lower_around(const Sweep *w, int64_t i, const float *center, float far, float *field) {
     const Timed *t = w->t;
-    float room = FAR;
-    for (int64_t s = 1; s < t->parts; s++) {
-        float gap = t->clearance[(layer * t->parts + s) * w->cells + cell] - (float)t->margin;
-        float far = gap * (float)t->parts / (float)s;
-        room = far < room ? far : room;
-    }
-    return room;
-}
-
-/* The least of what is at most one unit away along each axis, with the cost of the change. */
-static const float *changed(const Sweep *w, const float *row) {
-    const Timed *t = w->t;
-    float *to = w->wide, *other = w->row;
+    int64_t low[DIM], high[DIM];
     for (int a = 0; a < DIM; a++) {
-        int64_t n = t->moves[a], step = w->turn[a];
-        float more = t->change[a];
-        for (int64_t o = 0; o < w->moves; o += n * step)
+        double reach = far + t->radius[i];
+        for (int k = 0; k < DIM; k++) reach += fabsf(t->axes[(i * DIM + k) * DIM + a]) * t->half[i * DIM + k];
+        double first = ceil((center[a] - reach) / t->spacing), last = floor((center[a] + reach) / t->spacing);
+        if (!(first < (double)t->counts[a]) || !(last >= 0.0)) return;
+        low[a] = first > 0.0 ? (int64_t)first : 0;
+        high[a] = last < (double)t->counts[a] - 1.0 ? (int64_t)last : t->counts[a] - 1;
+    }
+    int64_t at[DIM];
+    memcpy(at, low, sizeof at);
+    for (;;) {
+        float v[DIM];
+        int64_t cell = 0;
+        for (int a = 0; a < DIM; a++) cell += at[a] * w->step[a], v[a] = (float)at[a] * (float)t->spacing - center[a];
+        lowered(t, i, field + cell, high[DIM - 1] - low[DIM - 1] + 1, v);
+        int a = DIM - 2;
+        for (; a >= 0 && ++at[a] > high[a]; a--) at[a] = low[a];
+        if (a < 0) return;
+    }
+}
+
+/* The clearance from the solids, too, no more than what matters: beyond it all cells beside are clear. */
+static void measure(const Sweep *w, float *rest) {
+    const Timed *t = w->t;
+    float far = (float)(t->margin + t->spacing * sqrt(DIM));
+    for (int64_t c = 0; c < w->cells; c++) rest[c] = far;
+    for (int64_t i = 0; i < t->resting; i++) lower_around(w, i, t->center + i * DIM, far, rest);
+    for (int64_t k = 0; k <= t->layers * t->parts; k++) {
+        float *field = t->clearance + k * w->cells;
+        for (int64_t c = 0; c < w->cells; c++) field[c] = lower(field[c], rest[c]);
+        for (int64_t i = t->resting; i < t->solids; i++)
+            lower_around(w, i, t->center + (k * t->solids + i) * DIM, far, field);
+    }
+}
+
+/* Of each move the cells beside its parts. */
+static void look_between(Sweep *w) {
+    const Timed *t = w->t;
+    for (int64_t m = 0; m < w->moves; m++)
+        for (int64_t s = 1; s < t->parts; s++) {
+            Between *b = w->between + m * (t->parts - 1) + s - 1;
+            b->count = 0;
+            for (int corner = 0; corner < CORNERS; corner++) {
+                float share = 1.0f;
+                int64_t offset = 0;
+                for (int a = 0; a < DIM; a++) {
+                    int64_t n = s * w->move[m * DIM + a], whole = (n - ((n % t->parts) + t->parts) % t->parts) / t->parts;
+                    float part = (float)(n - whole * t->parts) / (float)t->parts;
+                    int up = corner >> a & 1;
+                    share *= up ? part : 1.0f - part, offset += (whole + up) * w->step[a];
+                }
+                if (share > 0.0f) b->offset[b->count] = offset, b->share[b->count++] = share;
+            }
+        }
+}
+
+/* The least of what is at most one unit away along each axis, with the cost of the change, of `count` cells side by
+   side; `row` (moves, count) is lost. */
+static float *changed(const Sweep *w, float *row, float *other, int64_t count) {
+    for (int a = 0; a < DIM; a++) {
+        int64_t n = w->t->moves[a], step = w->turn[a] * count;
+        float more = w->t->change[a];
+        for (int64_t o = 0; o < w->moves * count; o += n * step)
             for (int64_t k = 0; k < n; k++) {
                 const float *mid = row + o + k * step, *low = k > 0 ? mid - step : mid, *high = k + 1 < n ? mid + step : mid;
-                float *out = to + o + k * step;
-                for (int64_t j = 0; j < step; j++) {
-                    float side = (low[j] < high[j] ? low[j] : high[j]) + more;
-                    out[j] = mid[j] < side ? mid[j] : side;
-                }
+                float *out = other + o + k * step;
+                for (int64_t j = 0; j < step; j++) out[j] = lower(mid[j], lower(low[j], high[j]) + more);
             }
-        row = to;
-        float *swap = to;
-        to = other;
-        other = swap;
+        float *swap = row;
+        row = other, other = swap;
     }
     return row;
 }
 
-/* What any way costs at least from each layer and cell on, by cells and moves alone. */
+/* What ending at a cell of a layer costs. */
+static inline float end_of(const Sweep *w, int64_t l, int64_t c) {
+    return l < w->t->earliest ? FAR : w->t->end_cost[(l - w->t->earliest) * w->cells + c];
+}
+
+/* The least of `row` (cells) within the moves along an axis. */
+static void reached(const Sweep *w, int a, const float *row, float *to) {
+    int64_t n = w->t->counts[a], step = w->step[a], low = w->t->least[a], high = low + w->t->moves[a] - 1;
+    for (int64_t c = 0; c < w->cells; c++) to[c] = FAR;
+    for (int64_t o = 0; o < w->cells; o += n * step)
+        for (int64_t k = low; k <= high; k++) {
+            int64_t first = k < 0 ? -k : 0, end = k > 0 ? n - k : n;
+            for (int64_t j = first * step; j < end * step; j++) to[o + j] = lower(to[o + j], row[o + j + k * step]);
+        }
+}
+
+/* What any way costs at least from each layer and cell on, by cells and moves alone; FAR where nobody may be. */
 static void look_ahead(const Sweep *w, float *scratch) {
     const Timed *t = w->t;
     float least = FAR, last = FAR, margin = (float)t->margin;
-    for (int64_t l = 0; l <= t->layers; l++) {
+    for (int64_t m = 0; m < w->moves; m++) least = lower(t->move_cost[m], least), last = lower(t->last_cost[m], last);
+    for (int64_t l = t->layers; l >= 0; l--) {
         const float *gap = t->clearance + l * t->parts * w->cells, *cost = t->cell_cost + l * w->cells;
-        for (int64_t c = 0; c < w->cells; c++)
-            w->node[l * w->cells + c] = gap[c] < margin || cost[c] >= FAR ? FAR : cost[c];
-    }
-    for (int64_t m = 0; m < w->moves; m++) {
-        least = t->move_cost[m] < least ? t->move_cost[m] : least;
-        last = t->last_cost[m] < last ? t->last_cost[m] : last;
-    }
-    for (int64_t c = 0; c < w->cells; c++) w->ahead[t->layers * w->cells + c] = last;
-    for (int64_t l = t->layers - 1; l >= 0; l--) {
-        float *own = w->ahead + l * w->cells, *from = scratch, *to = own;
-        for (int64_t c = 0; c < w->cells; c++) {
-            float cost = w->node[(l + 1) * w->cells + c] + own[w->cells + c];
-            from[c] = cost < FAR ? cost : FAR;
-        }
-        for (int a = 0; a < DIM; a++) {
-            int64_t n = t->counts[a], step = w->step[a], low = t->least[a], high = low + t->moves[a] - 1;
-            for (int64_t c = 0; c < w->cells; c++) {
-                int64_t i = c / step % n, first = i + low < 0 ? -i : low, end = i + high >= n ? n - 1 - i : high;
-                float cost = FAR;
-                for (int64_t k = first; k <= end; k++) cost = from[c + k * step] < cost ? from[c + k * step] : cost;
-                to[c] = cost;
+        float *own = w->ahead + l * w->cells, *from = own + w->cells, *to = scratch;
+        for (int64_t c = 0; c < w->cells; c++) own[c] = FAR;
+        if (l < t->layers) {
+            for (int a = 0; a < DIM; a++) {
+                reached(w, a, from, to);
+                from = to, to = a % 2 ? scratch : scratch + w->cells;
             }
-            float *swap = from;
-            from = to;
-            to = swap;
+            for (int64_t c = 0; c < w->cells; c++) own[c] = lower(from[c] + cost[c] + least, FAR);
         }
-        if (from != own) memcpy(own, from, sizeof(float) * (size_t)w->cells);
-        for (int64_t c = 0; c < w->cells; c++) own[c] = own[c] < FAR ? own[c] + least : FAR;
+        for (int64_t c = 0; c < w->cells; c++) {
+            int barred = (l > 0 && gap[c] < margin) || (l < t->layers && cost[c] >= FAR); /* a start may be near */
+            own[c] = barred ? FAR : lower(own[c], end_of(w, l, c) + last);
+        }
+    }
+}
+
+/* Between which cells of each row of the next layer moves may lead. */
+static void spread(const Sweep *w, int64_t l) {
+    const Timed *t = w->t;
+    int32_t *from = w->from + l * w->rows, *to = w->to + l * w->rows, width = (int32_t)w->width;
+    ROWS(w) from[w->rows + r] = width, to[w->rows + r] = 0;
+    ROWS(w) {
+        if (from[r] >= to[r]) continue;
+        int64_t at[DIM];
+        cell_of(w, r * w->width, at);
+        for (int64_t m = 0; m < w->moves; m += w->last) {
+            int32_t d[DIM];
+            memcpy(d, w->move + m * DIM, sizeof d);
+            d[DIM - 1] = 0;
+            int64_t cell = moved(w, at, r * w->width, d);
+            if (cell < 0) continue;
+            int32_t *low = from + w->rows + cell / w->width, *high = to + w->rows + cell / w->width;
+            int32_t first = from[r] + (int32_t)t->least[DIM - 1], end = to[r] + (int32_t)(t->least[DIM - 1] + w->last) - 1;
+            first = first < 0 ? 0 : first, end = end > width ? width : end;
+            *low = first < *low ? first : *low, *high = end > *high ? end : *high;
+        }
+    }
+}
+
+/* Leave out the cells at both ends of the rows of a layer that no way within the limit leads through. */
+static void trim(const Sweep *w, int64_t l, int is_known) {
+    int32_t *from = w->from + l * w->rows, *to = w->to + l * w->rows;
+    ROWS(w) {
+        const float *ahead = w->ahead + l * w->cells + r * w->width, *least = w->least + l * w->cells + r * w->width;
+#define SERVES(j) (ahead[j] < FAR && (!is_known || (least[j] < FAR && ahead[j] + least[j] <= w->limit)))
+        while (from[r] < to[r] && !SERVES(from[r])) from[r]++;
+        while (from[r] < to[r] && !SERVES(to[r] - 1)) to[r]--;
+    }
+}
+
+/* The least clearance of a move on its way from cells `begin` to `end` of a row at a layer, into w->gap. */
+static void pass(const Sweep *w, int64_t l, int64_t m, int64_t begin, int64_t end) {
+    const Timed *t = w->t;
+    float *gap = w->gap, *sum = w->gap + w->width;
+    for (int64_t j = 0; j < end - begin; j++) gap[j] = FAR;
+    for (int64_t s = 1; s < t->parts; s++) {
+        const Between *b = w->between + m * (t->parts - 1) + s - 1;
+        const float *field = t->clearance + (l * t->parts + s) * w->cells + begin;
+        for (int64_t j = 0; j < end - begin; j++) sum[j] = 0.0f;
+        for (int64_t i = 0; i < b->count; i++) {
+            const float *beside = field + b->offset[i];
+            float share = b->share[i];
+            for (int64_t j = 0; j < end - begin; j++) sum[j] += share * beside[j];
+        }
+        for (int64_t j = 0; j < end - begin; j++) gap[j] = lower(gap[j], sum[j]);
+    }
+}
+
+/* The cells of a row from which a move leads between those of the next layer that are looked at; returns the first of
+   these in the row, and by `begin` and `end` from which; an empty range where there is none. */
+static int64_t led(const Sweep *w, int64_t l, int64_t r, int64_t m, int64_t *begin, int64_t *end) {
+    int64_t at[DIM], d = w->move[m * DIM + DIM - 1];
+    int32_t flat[DIM];
+    memcpy(flat, w->move + m * DIM, sizeof flat);
+    flat[DIM - 1] = 0;
+    cell_of(w, r * w->width, at);
+    int64_t cell = moved(w, at, r * w->width, flat);
+    *begin = *end = 0;
+    if (cell < 0) return 0;
+    int64_t next = (l + 1) * w->rows + cell / w->width, own = l * w->rows + r;
+    int64_t first = w->from[next] - d, last = w->to[next] - d;
+    *begin = first > w->from[own] ? first : w->from[own], *end = last < w->to[own] ? last : w->to[own];
+    return cell + d;
+}
+
+/* The states of the next layer to which a row of cells leads. */
+static void lead(const Sweep *w, int64_t l, int64_t r) {
+    const Timed *t = w->t;
+    int64_t first = w->from[l * w->rows + r], count = w->to[l * w->rows + r] - first, M = w->moves;
+    float margin = (float)t->margin;
+    for (int64_t m = 0; m < M; m++)
+        memcpy(w->row + m * count, w->there + (l * M + m) * w->cells + r * w->width + first, sizeof(float) * (size_t)count);
+    const float *cost = changed(w, w->row, w->wide, count), *stay = t->cell_cost + l * w->cells + r * w->width;
+    for (int64_t m = 0; m < M; m++) {
+        if (t->move_cost[m] >= FAR) continue;
+        int64_t begin, end, cell = led(w, l, r, m, &begin, &end);
+        const float *so_far = cost + m * count - first;
+        float best = FAR;
+        for (int64_t j = begin; j < end; j++) best = lower(best, so_far[j]);
+        if (best >= FAR) continue;
+        pass(w, l, m, r * w->width + begin, r * w->width + end);
+        const float *gap = w->gap, *ahead = w->ahead + (l + 1) * w->cells + cell;
+        float *to = w->there + ((l + 1) * M + m) * w->cells + cell, *least = w->least + (l + 1) * w->cells + cell;
+        for (int64_t j = begin; j < end; j++) {
+            float v = so_far[j] + stay[j] + t->move_cost[m];
+            v = gap[j - begin] < margin || ahead[j] >= FAR || v >= FAR ? FAR : v;
+            to[j] = v, least[j] = lower(least[j], v);
+        }
     }
 }
 
 /* The cheapest ways to all states; returns what the cheapest to the end costs. */
 static float sweep_there(Sweep *w) {
     const Timed *t = w->t;
-    int64_t M = w->moves;
-    memset(w->seen, 0, (size_t)((t->layers + 1) * w->cells));
-    for (int64_t m = 0; m < M; m++) w->there[t->start * M + m] = FAR;
-    w->there[t->start * M + t->first] = 0.0f;
-    w->seen[t->start] = 1;
-    for (int64_t l = 0; l < t->layers; l++)
-        for (int64_t c = 0; c < w->cells; c++) {
-            if (!w->seen[l * w->cells + c] || w->ahead[l * w->cells + c] >= FAR) continue;
-            const float *cost = changed(w, w->there + (l * w->cells + c) * M);
-            float room = room_at(w, l, c);
-            int64_t at[DIM];
-            cell_of(w, c, at);
-            for (int64_t m = 0; m < M; m++) {
-                float so_far = cost[m] + t->move_cost[m];
-                int64_t to = so_far < FAR ? moved(w, at, c, w->move + 3 * m) : -1;
-                if (to < 0) continue;
-                int64_t next = (l + 1) * w->cells + to;
-                float node = w->node[next];
-                if (node >= FAR || w->ahead[next] >= FAR || !is_clear(w, l, at, m, room)) continue;
-                if (!w->seen[next]) {
-                    w->seen[next] = 1;
-                    for (int64_t k = 0; k < M; k++) w->there[next * M + k] = FAR;
-                }
-                w->there[next * M + m] = so_far + node; /* which no other cell's move leads to */
-            }
-        }
+    int64_t M = w->moves, C = w->cells;
     float best = FAR;
-    for (int64_t c = 0; c < w->cells; c++)
-        for (int64_t m = 0, at = t->layers * w->cells + c; w->seen[at] && m < M; m++) {
-            float cost = w->there[at * M + m] + t->last_cost[m];
-            best = cost < best ? cost : best;
+    for (int64_t i = 0; i < (t->layers + 1) * C; i++) w->least[i] = FAR;
+    ROWS(w) w->from[r] = w->to[r] = 0;
+    int64_t row = t->start / w->width, at = t->start % w->width;
+    w->from[row] = (int32_t)at, w->to[row] = (int32_t)at + 1;
+    for (int64_t m = 0; m < M; m++) w->there[m * C + t->start] = FAR;
+    w->there[t->first * C + t->start] = w->least[t->start] = 0.0f;
+    for (int64_t l = 0; l <= t->layers; l++) {
+        trim(w, l, 0);
+        ROWS(w) for (int64_t c = r * w->width + w->from[l * w->rows + r]; c < r * w->width + w->to[l * w->rows + r]; c++) {
+            float end = end_of(w, l, c);
+            for (int64_t m = 0; end < FAR && w->ahead[l * C + c] < FAR && m < M; m++)
+                best = lower(best, w->there[(l * M + m) * C + c] + end + t->last_cost[m]);
         }
+        if (l == t->layers) break;
+        spread(w, l);
+        trim(w, l + 1, 0);
+        for (int64_t m = 0; m < M; m++) ROWS(w) {
+            int64_t next = (l + 1) * w->rows + r;
+            float *to = w->there + ((l + 1) * M + m) * C + r * w->width;
+            for (int64_t j = w->from[next]; j < w->to[next]; j++) to[j] = FAR;
+        }
+        ROWS(w) if (w->from[l * w->rows + r] < w->to[l * w->rows + r]) lead(w, l, r);
+        /* What no way has led to is left out, and what one that has ended undercuts. */
+        w->limit = best < FAR && t->earliest < t->layers ? best + (float)t->dearer * fabsf(best) : FAR;
+        trim(w, l + 1, 1);
+    }
     return best;
+}
+
+/* The cheapest ways on from a row of cells, and through it. */
+static void go_on(const Sweep *w, int64_t l, int64_t r, float *through) {
+    const Timed *t = w->t;
+    int64_t first = w->from[l * w->rows + r], count = w->to[l * w->rows + r] - first, M = w->moves, C = w->cells;
+    for (int64_t i = 0; i < M * count; i++) w->row[i] = FAR;
+    for (int64_t m = 0; m < M && l < t->layers; m++) {
+        int64_t begin, end, cell = led(w, l, r, m, &begin, &end);
+        const float *there = w->there + ((l + 1) * M + m) * C + cell, *ahead = w->onward + ((l + 1) * M + m) * C + cell;
+        float *own = w->row + m * count - first, cost = t->move_cost[m];
+        for (int64_t j = begin; j < end; j++) own[j] = there[j] < FAR ? lower(cost + ahead[j], FAR) : FAR;
+    }
+    const float *best = changed(w, w->row, w->wide, count), *stay = t->cell_cost + l * C + r * w->width + first;
+    float *least = through + l * C + r * w->width + first;
+    for (int64_t m = 0; m < M; m++) {
+        const float *there = w->there + (l * M + m) * C + r * w->width + first;
+        float *to = w->onward + (l * M + m) * C + r * w->width + first;
+        for (int64_t j = 0; j < count; j++) {
+            float end = l < t->earliest ? FAR : end_of(w, l, r * w->width + first + j) + t->last_cost[m];
+            to[j] = lower(end, l < t->layers ? best[m * count + j] + stay[j] : FAR);
+            least[j] = lower(least[j], there[j] + to[j]);
+        }
+    }
 }
 
 /* The cheapest ways on from all states that a way within the limit may lead through. */
 static void sweep_onward(Sweep *w, float *through) {
-    const Timed *t = w->t;
-    int64_t M = w->moves;
-    float *ahead = w->onward; /* of the last layer, then of those before */
-    for (int64_t l = t->layers; l >= 0; l--)
-        for (int64_t c = 0; c < w->cells; c++) {
-            int64_t place = l * w->cells + c, at[DIM];
-            through[place] = FAR;
-            if (!w->seen[place]) continue;
-            const float *there = w->there + place * M;
-            float *own = ahead + place * M, least = FAR;
-            for (int64_t m = 0; m < M; m++) least = there[m] < least ? there[m] : least;
-            if (least + w->ahead[place] > w->limit) {
-                w->seen[place] = 0;
-                continue;
-            }
-            if (l == t->layers) memcpy(own, t->last_cost, sizeof(float) * (size_t)M);
-            else {
-                cell_of(w, c, at);
-                for (int64_t m = 0; m < M; m++) {
-                    int64_t to = moved(w, at, c, w->move + 3 * m), next = (l + 1) * w->cells + to;
-                    own[m] = FAR;
-                    if (to < 0 || !w->seen[next] || w->there[next * M + m] >= FAR) continue;
-                    float cost = t->move_cost[m] + w->node[next] + ahead[next * M + m];
-                    own[m] = cost < FAR ? cost : FAR;
-                }
-                memcpy(own, changed(w, own), sizeof(float) * (size_t)M);
-            }
-            for (int64_t m = 0; m < M; m++) {
-                float cost = there[m] + own[m];
-                through[place] = cost < through[place] ? cost : through[place];
-            }
-        }
-}
-
-/* The move, at most one unit per axis from `m`, that minimises `cost` with the change; -1 where none is finite. */
-static int64_t beside(const Sweep *w, int64_t m, const float *cost) {
-    const Timed *t = w->t;
-    int64_t best = -1;
-    float least = FAR;
-    for (int64_t k = 0; k < w->moves; k++) {
-        float sum = cost[k];
-        for (int a = 0; a < DIM; a++) {
-            int32_t more = w->move[3 * k + a] - w->move[3 * m + a];
-            sum += more == 0 ? 0.0f : more * more == 1 ? t->change[a] : FAR;
-        }
-        if (sum < least) least = sum, best = k;
+    for (int64_t l = w->t->layers; l >= 0; l--) {
+        trim(w, l, 1);
+        for (int64_t c = 0; c < w->cells; c++) through[l * w->cells + c] = FAR;
+        ROWS(w) if (w->from[l * w->rows + r] < w->to[l * w->rows + r]) go_on(w, l, r, through);
     }
-    return best;
 }
 
-/* The cells of the cheapest way through a cell at a layer; 0 where it doesn't lead to both ends. */
-static int trace(Sweep *w, int64_t layer, int64_t cell, int32_t *way) {
+/* Whether a cell of a layer is one that is looked at. */
+static int is_within(const Sweep *w, int64_t l, int64_t c) {
+    int64_t row = l * w->rows + c / w->width, at = c % w->width;
+    return at >= w->from[row] && at < w->to[row];
+}
+
+/* What a state costs, and how it goes on; FAR where it isn't looked at. */
+static float state(const Sweep *w, const float *costs, int64_t l, int64_t m, int64_t c) {
+    return is_within(w, l, c) ? costs[(l * w->moves + m) * w->cells + c] : FAR;
+}
+
+/* The i-th of the 3^DIM moves at most one unit per axis from `m`, and what the change costs; -1: there is none. */
+static int64_t beside(const Sweep *w, int64_t m, int64_t i, float *change) {
+    int64_t found = m;
+    *change = 0.0f;
+    for (int a = DIM - 1; a >= 0; a--, i /= 3) {
+        int64_t more = i % 3 - 1, at = w->move[m * DIM + a] - w->t->least[a] + more;
+        if (at < 0 || at >= w->t->moves[a]) return -1;
+        found += more * w->turn[a], *change += more ? w->t->change[a] : 0.0f;
+    }
+    return found;
+}
+
+/* The cells of the cheapest way through a cell at a layer, and the layer at which it ends; 0 where there is none. */
+static int trace(const Sweep *w, int64_t layer, int64_t cell, int32_t *way, int32_t *end) {
     const Timed *t = w->t;
-    int64_t M = w->moves, place = layer * w->cells + cell, m = 0, at[DIM];
-    float least = FAR;
-    for (int64_t k = 0; k < M; k++) {
-        float cost = w->there[place * M + k] + w->onward[place * M + k];
+    int64_t m = 0, at[DIM];
+    float least = FAR, change;
+    for (int64_t k = 0; k < w->moves; k++) {
+        float cost = state(w, w->there, layer, k, cell) + state(w, w->onward, layer, k, cell);
         if (cost < least) least = cost, m = k;
     }
+    if (least >= FAR) return 0;
     way[layer] = (int32_t)cell;
-    int64_t move = m, from = cell;
+    int64_t from = cell, move = m;
     for (int64_t l = layer; l > 0; l--) {
-        for (int a = 0; a < DIM; a++) from -= w->move[3 * move + a] * w->step[a];
-        way[l - 1] = (int32_t)from;
-        move = beside(w, move, w->there + ((l - 1) * w->cells + from) * M);
-        if (move < 0) return 0;
-    }
-    for (int64_t l = layer; l < t->layers; l++) {
-        cell_of(w, cell, at);
-        for (int64_t k = 0; k < M; k++) {
-            int64_t to = moved(w, at, cell, w->move + 3 * k), next = (l + 1) * w->cells + to;
-            w->row[k] = FAR;
-            if (to < 0 || !w->seen[next] || w->there[next * M + k] >= FAR) continue;
-            w->row[k] = t->move_cost[k] + w->node[next] + w->onward[next * M + k];
+        int64_t before = -1;
+        for (int a = 0; a < DIM; a++) from -= w->move[move * DIM + a] * w->step[a];
+        way[l - 1] = (int32_t)from, least = FAR;
+        for (int64_t i = 0; i < BESIDE; i++) {
+            int64_t k = beside(w, move, i, &change);
+            float cost = k < 0 ? FAR : state(w, w->there, l - 1, k, from) + change;
+            if (cost < least) least = cost, before = k;
         }
-        m = beside(w, m, w->row);
-        if (m < 0) return 0;
-        cell = moved(w, at, cell, w->move + 3 * m);
-        way[l + 1] = (int32_t)cell;
+        if (before < 0) return 0;
+        move = before;
     }
-    return 1;
+    for (int64_t l = layer; l <= t->layers; l++) {
+        int64_t to = -1, next = -1;
+        least = end_of(w, l, cell) + t->last_cost[m], cell_of(w, cell, at);
+        for (int64_t i = 0; l < t->layers && i < BESIDE; i++) {
+            int64_t k = beside(w, m, i, &change), then = k < 0 ? -1 : moved(w, at, cell, w->move + k * DIM);
+            if (then < 0 || state(w, w->there, l + 1, k, then) >= FAR) continue;
+            float cost = state(w, w->onward, l + 1, k, then) + t->move_cost[k] + change + t->cell_cost[l * w->cells + cell];
+            if (cost < least) least = cost, next = k, to = then;
+        }
+        *end = (int32_t)l;
+        if (next < 0) break;
+        way[l + 1] = (int32_t)to, m = next, cell = to;
+    }
+    return least < FAR;
 }
 
-/* Whether the segment between two ways is clear at all times: one becomes the other without passing an obstacle. */
-static int is_same(const Sweep *w, const int32_t *a, const int32_t *b) {
+/* Whether the segment between two ways is clear at all times, until one ends: one becomes the other without passing an
+   obstacle. */
+static int is_same(const Sweep *w, const int32_t *a, const int32_t *b, int64_t layers) {
     const Timed *t = w->t;
-    for (int64_t l = 0; l < t->layers; l++) {
+    for (int64_t l = 0; l < layers; l++) {
         if (a[l] == b[l] && a[l + 1] == b[l + 1]) continue;
         int64_t ends[4][DIM];
         cell_of(w, a[l], ends[0]), cell_of(w, a[l + 1], ends[1]);
@@ -320,27 +492,31 @@ static int64_t local_minima(const Sweep *w, const float *through, Least *found) 
     return count;
 }
 
-static void classes(Sweep *w, Timed *t, const float *through, Least *found) {
+static void classes(const Sweep *w, Timed *t, const float *through, Least *found) {
     int64_t count = local_minima(w, through, found), line = t->layers + 1;
     qsort(found, (size_t)count, sizeof(Least), cheaper);
     for (int64_t i = 0; i < count && i < t->tries && t->found < t->most; i++) {
-        int32_t *way = t->way + t->found * line;
-        int is_new = trace(w, found[i].layer, found[i].cell, way);
-        for (int64_t k = 0; k < t->found && is_new; k++) is_new = !is_same(w, t->way + k * line, way);
+        int32_t *way = t->way + t->found * line, *end = t->end + t->found;
+        int is_new = trace(w, found[i].layer, found[i].cell, way, end);
+        for (int64_t k = 0; k < t->found && is_new; k++)
+            is_new = !is_same(w, t->way + k * line, way, t->end[k] < *end ? t->end[k] : *end);
         if (is_new) t->cost[t->found++] = found[i].cost;
     }
 }
 
-static int search(Timed *t, Sweep *w, float *through, float *scratch, Least *found) {
-    t->found = t->states = 0;
+static void search(Timed *t, Sweep *w, float *through, float *scratch, Least *found) {
+    t->found = 0;
+    measure(w, scratch);
+    look_between(w);
     look_ahead(w, scratch);
     float best = sweep_there(w);
-    for (int64_t i = 0; i < (t->layers + 1) * w->cells; i++) t->states += w->seen[i];
-    if (best >= FAR) return 1;
+    if (best >= FAR) {
+        for (int64_t i = 0; i < (t->layers + 1) * w->cells; i++) through[i] = FAR;
+        return;
+    }
     w->limit = best + (float)t->dearer * fabsf(best);
     sweep_onward(w, through);
     classes(w, t, through, found);
-    return 1;
 }
 
 /* One problem; 0 where there is no memory. */
@@ -350,27 +526,26 @@ static int solve(Timed *t) {
         w.step[a] = w.cells, w.cells *= t->counts[a];
         w.turn[a] = w.moves, w.moves *= t->moves[a];
     }
-    size_t places = (size_t)((t->layers + 1) * w.cells), states = places * (size_t)w.moves;
-    int32_t *move = malloc(sizeof(int32_t) * 3 * (size_t)w.moves);
-    float *numbers = malloc(sizeof(float) * (3 * places + 3 * (size_t)w.moves + (size_t)w.cells));
-    w.there = malloc(sizeof(float) * states), w.onward = malloc(sizeof(float) * states);
-    w.seen = malloc(places);
-    Least *found = malloc(sizeof(Least) * places);
-    int done = move && numbers && w.there && w.onward && w.seen && found;
+    w.width = t->counts[DIM - 1], w.rows = w.cells / w.width, w.last = t->moves[DIM - 1];
+    size_t layers = (size_t)t->layers + 1, C = (size_t)w.cells, M = (size_t)w.moves, lines = layers * (size_t)w.rows;
+    size_t wide = M * (size_t)w.width;
+    int32_t *whole = malloc(sizeof(int32_t) * (M * DIM + 2 * lines));
+    float *numbers = malloc(sizeof(float) * (3 * layers * C + 2 * C + 2 * wide + 2 * (size_t)w.width));
+    w.there = malloc(sizeof(float) * layers * C * M), w.onward = malloc(sizeof(float) * layers * C * M);
+    w.between = malloc(sizeof(Between) * M * (size_t)t->parts);
+    Least *found = malloc(sizeof(Least) * layers * C);
+    int done = whole && numbers && w.there && w.onward && w.between && found;
     if (done) {
-        float *length = numbers + 3 * places + w.cells;
-        w.ahead = numbers, w.node = numbers + 2 * places + w.cells, w.move = move, w.length = length, w.row = length + w.moves, w.wide = w.row + w.moves;
-        for (int64_t m = 0; m < w.moves; m++) {
-            double far = 0.0;
-            for (int a = 0; a < 3; a++) {
-                int64_t d = a < DIM ? t->least[a] + m / w.turn[a] % t->moves[a] : 0;
-                move[3 * m + a] = (int32_t)d, far += (double)(d * d);
-            }
-            length[m] = (float)(t->spacing * sqrt(far));
-        }
-        done = search(t, &w, t->through ? t->through : numbers + places + w.cells, numbers + places, found);
+        float *through = numbers + 2 * layers * C, *scratch = numbers + 3 * layers * C;
+        w.ahead = numbers, w.least = numbers + layers * C, w.row = scratch + 2 * C, w.wide = w.row + wide;
+        w.gap = w.wide + wide;
+        w.move = whole, w.from = whole + M * DIM, w.to = w.from + lines;
+        for (int64_t m = 0; m < w.moves; m++)
+            for (int a = 0; a < DIM; a++)
+                w.move[m * DIM + a] = (int32_t)(t->least[a] + m / w.turn[a] % t->moves[a]);
+        search(t, &w, t->through ? t->through : through, scratch, found);
     }
-    free(move), free(numbers), free(w.there), free(w.onward), free(w.seen), free(found);
+    free(whole), free(numbers), free(w.there), free(w.onward), free(w.between), free(found);
     return done;
 }
 
