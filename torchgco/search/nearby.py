@@ -65,10 +65,12 @@ class Nearby:
     @classmethod
     def along(cls, call: Call, X: Tensor) -> Nearby | None:
         """A call without the obstacles farther from X (B, N+1, n) than a mean one is thick; None where few are."""
-        return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids), FAR_ONES)
+        return cls._where(call, lambda part, solids: _beside(X, part, solids), FAR_ONES)
 
     @classmethod
-    def _where(cls, call: Call, near: Callable[[Obstacles, Solids], Tensor | None], share: float) -> Nearby | None:
+    def _where(
+        cls, call: Call, near: Callable[[Obstacles, Solids | None], Tensor | None], share: float
+    ) -> Nearby | None:
         """Without those that aren't near, of problems in which they are more than a share of all."""
         problem = call.problem
         kept = [_kept(part, near) if isinstance(part, Obstacles) else None for part in problem.constraints]
@@ -148,12 +150,12 @@ def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:
     return replace(whole, trace=trace, search=search)
 
 
-def _kept(part: Obstacles, near: Callable[[Obstacles, Solids], Tensor | None]) -> Tensor | None:
+def _kept(part: Obstacles, near: Callable[[Obstacles, Solids | None], Tensor | None]) -> Tensor | None:
     """Which obstacles (B, M) are near; None for a kind that can't say. A body counts as the ball that holds it."""
     solids = part.inflated()
-    if type(part.inscribed).chosen is Obstacles.chosen or solids is None or solids.absent.shape[1] == 0:
+    if type(part.inscribed).chosen is Obstacles.chosen or part.absent.shape[1] == 0:
         return None
-    if part.body is not None:
+    if part.body is not None and solids is not None:
         solids = solids.grown(part.body.overhang)
     return near(part, solids)
 
@@ -166,9 +168,9 @@ def _rows(part: Constraint, at: Tensor) -> Tensor:
     return torch.cat([torch.where(at < 0, at, at + i * M) for i in range(len(part.body.balls))], dim=1)
 
 
-def _on_the_way(problem: Problem, solids: Solids) -> Tensor | None:
-    """Which obstacles (B, M) a sensible way may touch; None without a goal."""
-    if problem.goal is None:
+def _on_the_way(problem: Problem, solids: Solids | None) -> Tensor | None:
+    """Which obstacles (B, M) a sensible way may touch; None without a goal, and where they move."""
+    if problem.goal is None or solids is None:
         return None
     start, goal = problem.x0[:, problem.position], problem.goal.position
     gates = gates_of(problem)
@@ -181,8 +183,16 @@ def _on_the_way(problem: Problem, solids: Solids) -> Tensor | None:
     return ~solids.absent & near
 
 
-def _beside(p: Tensor, solids: Solids) -> Tensor:
-    """Which obstacles (B, M) are nearer to points p (B, K, d) than the mean obstacle's least half length, by axis."""
+def _beside(X: Tensor, part: Obstacles, solids: Solids | None) -> Tensor | None:
+    """Which obstacles (B, M) are nearer to states X (B, N+1, n) than the mean obstacle's least half length, by axis; of
+    those that move, at the times of the knots, by distance. None where C traces rows: absent ones take as long."""
+    if solids is None:
+        if not part.moving or part.body is not None or part.kernel == "function":
+            return None
+        present = (~part.absent).to(X.dtype)
+        margin = (part.margins * present).sum(-1) / present.sum(-1).clamp(min=1.0)
+        return ~part.absent & ~(part.distances(X).amin(1) > margin.unsqueeze(-1))  # NaN counts as near
+    p = X[:, :, part.position]
     reach = solids.extent + solids.radii.unsqueeze(-1)
     present = (~solids.absent).to(p.dtype)
     margin = (reach.amin(-1) * present).sum(-1) / present.sum(-1).clamp(min=1.0)

@@ -34,6 +34,7 @@ PROBLEMS_AT_ONCE = 16  # searched together: bounds the memory
 FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the lattice is made finer once
 GAP = 0.02  # share by which what has arrived may cost more than without obstacles, and is left as it is
 DEARER = 0.5  # share by which ways that are solved may cost more than the cheapest, on the lattice
+FIRST = 3  # ways of a problem that are solved in any case: costs on the lattice order them roughly
 ALIKE = 1e-4  # share by which the costs of two candidates may differ that count as the same
 ROUNDS = 5  # of solves, at most, each among larger obstacles: what is clear at knots may touch between them
 
@@ -127,32 +128,77 @@ def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
 def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor:
     """Solve along the ways of the problems in `rows`; whether each has a trajectory that arrives now, (b,).
 
-    Where the cheapest of a problem touch an obstacle between two knots, they are solved again among larger ones.
+    First along a few of each; they show by how much a solve undercuts its lattice's costs, and others follow that may
+    undercut the best by as much.
     """
-    each = torch.tensor([b for b, ways in enumerate(found) for _ in ways.points])
+    each = torch.tensor([b for b, ways in enumerate(found) for _ in ways.points], dtype=torch.int64, device=rows.device)
     done = torch.zeros_like(rows, dtype=torch.bool)
     if each.numel() == 0:
         return done
-    each = each.to(rows.device)
+    number = torch.cat([torch.arange(len(ways.points)) for ways in found]).to(rows.device)
     X, U = guesses_along(search.call.problem.take(rows), each, found)
+    along = torch.cat([X.new_tensor(ways.costs) for ways in found])
     call = replace(search.call.take(rows[each]), U0=U, warm=None, callback=None)
-    grown, left = torch.zeros_like(X[:, 0, 0]), torch.arange(len(each), device=each.device)
     least = torch.full_like(search.best.end.best.cost[rows], torch.inf)
-    for _ in range(ROUNDS):
-        part = call.take(left)
-        end = _solved(part, X[left], grown[left])
-        good, clearance = _rated(search, part.problem, end)
-        clear = good & (clearance >= 0.0)
-        merit = torch.where(clear, end.best.cost, torch.inf)
-        done |= _keep(search, rows, each[left], merit, end)
-        least = least.scatter_reduce(0, each[left], merit, "amin")
-        again = good & ~clear & (end.best.cost < least[each[left]]) & ~_repeated(each[left], end.best.cost)
-        more = torch.maximum(grown[left] - EXTRA * clearance, 2.0 * grown[left])
-        left = left[again]
-        grown[left] = more[again]
-        if left.numel() == 0 or search.call.late:
+    below = torch.full_like(least, torch.inf)
+    for wave in range(2):
+        # Those of a kind together: the last ones of a batch are solved without company.
+        chosen = (number < FIRST if wave == 0 else number >= FIRST).nonzero().flatten()
+        if wave == 1:
+            b = each[chosen]
+            chosen = chosen[~(along[chosen] + below[b] >= least[b])]
+        if chosen.numel() == 0 or search.call.late:
             break
+        chosen = chosen[number[chosen].argsort(stable=True)]
+        ends = _Ends(search, rows, each[chosen], along[chosen], least, below)
+        done |= ends.solve(call.take(chosen), X[chosen])
     return done
+
+
+@dataclass
+class _Ends:
+    """What solves of some candidates come to.
+
+    Args:
+        rows: the problems (b,).
+        each: the place (C,) among `rows` that each candidate belongs to.
+        along: what its way costs on the lattice, (C,).
+        least: the least cost of each problem so far, (b,), in place.
+        below: the least that a solve has come to beyond its way's cost, (b,), in place.
+    """
+
+    search: Search
+    rows: Tensor
+    each: Tensor
+    along: Tensor
+    least: Tensor
+    below: Tensor
+
+    def solve(self, call: Call, X: Tensor) -> Tensor:
+        """Solve from states X (C, N+1, n), and keep the best; whether a problem has one that arrives, (b,) bool.
+
+        Where the cheapest of a problem touch an obstacle between two knots, they are solved again among larger ones.
+        """
+        search, each = self.search, self.each
+        done = torch.zeros_like(self.rows, dtype=torch.bool)
+        grown, left = torch.zeros_like(self.along), torch.arange(len(each), device=each.device)
+        for _ in range(ROUNDS):
+            part = call.take(left)
+            end = _solved(part, X[left], grown[left])
+            good, clearance = _rated(search, part.problem, end)
+            clear = good & (clearance >= 0.0)
+            merit = torch.where(clear, end.best.cost, torch.inf)
+            done |= _keep(search, self.rows, each[left], merit, end)
+            self.least.scatter_reduce_(0, each[left], merit, "amin")
+            self.below.scatter_reduce_(0, each[left], merit - self.along[left], "amin")
+            again = good & ~clear & (end.best.cost < self.least[each[left]])
+            again &= ~_repeated(each[left], end.best.cost)
+            more = torch.maximum(grown[left] - EXTRA * clearance, 2.0 * grown[left])
+            left = left[again]
+            grown[left] = more[again]
+            if left.numel() == 0 or search.call.late:
+                break
+        return done
 
 
 def _solved(call: Call, X: Tensor, grown: Tensor) -> SolveEnd:
