@@ -65,11 +65,11 @@ def drawn(counts: tuple[int, ...], layers: int, seed: int, ends: int = 1) -> Tim
 def reference(scene: TimedScene) -> np.ndarray:
     a = scene.lattice
     counts, least, most = (tuple(int(n) for n in part) for part in (a.counts, a.least, a.most))
-    costs = (part.numpy().astype(float).reshape(-1, *counts) for part in (scene.cell_cost, scene.end_cost))
-    costs = [np.where(part < FAR, part, np.inf) for part in costs]
+    parts = (part.numpy().astype(float).reshape(-1, *counts) for part in (scene.cell_cost, scene.end_cost))
+    cost, end = (np.where(part < FAR, part, np.inf) for part in parts)
     ways = Ways(
         counts, least, most, PARTS, MARGIN, scene.field.away.numpy().astype(float).reshape(-1, *counts),
-        *costs, {}, {}, tuple(scene.change[: a.d].tolist()),
+        cost, end, {}, {}, tuple(scene.change[: a.d].tolist()),
     )  # fmt: skip
     finite = lambda v: float(v) if v < FAR else np.inf
     ways.move_cost = dict(zip(ways.moves, map(finite, scene.move_cost.tolist()), strict=True))

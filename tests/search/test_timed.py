@@ -31,7 +31,7 @@ from torchgco.dynamics.unicycle import Unicycle
 from torchgco.kernels import path_clearance
 from torchgco.problem.between import bulge
 from torchgco.roadmap.timed import library_for
-from torchgco.search.timed_scenes import can_search
+from torchgco.search.timed_scenes import MOVES, STATES, can_search, scene_in_time
 from torchgco.search.velocity import Velocity
 
 D, INF = torch.float64, float("inf")
@@ -171,3 +171,26 @@ def test_a_problem_whose_obstacles_are_all_absent_loses_nothing() -> None:
     with pytest.warns(HorizonWarning):
         solution = solve(problem, verbose=False)
     assert bool(judge(problem, solution.U).feasible.all())
+
+
+@pytest.mark.filterwarnings("ignore::torchgco.base.errors.ScaleWarning")
+@pytest.mark.parametrize("scale", [1e-4, 1e-2, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("fast", [1.0, 18.0])
+def test_lattices_have_few_moves_and_states_at_any_scale(scale: float, fast: float) -> None:
+    """A ball of 0.3 m that flies 500 m in 5 s at up to 90 m/s, and slower ones, in other units of length."""
+    B, rng = 3, np.random.default_rng(7)
+    way, speed = scale * fast * 28.0, scale * fast * 5.0
+    model = point(0.1)
+    discs = Spheres(
+        scale * rng.uniform(0, 20, (B, 12, 2)), 0.5 * scale, 0.3 * scale, scale * rng.normal(0, 3, (B, 12, 2))
+    )
+    rows = [discs, ControlBounds(-8.0 * scale * fast, 8.0 * scale * fast), NormBounds(("x", [2, 3]), upper=speed)]
+    goal = QuadraticCost([0.1] * 4, [0.01] * 2, [10.0] * 4, x_ref=[way, 0.0, 0.0, 0.0])
+    problem = Problem(model, goal, rows, torch.zeros(B, 4, dtype=D), 50, Goal([way, 0.0], 0.3 * scale))
+    t = torch.linspace(0, 1, 51, dtype=D).unsqueeze(-1)
+    free = torch.cat((t * torch.tensor([way, 0.0]), torch.ones_like(t) * torch.tensor([speed, 0.0])), dim=-1)
+    for b in range(B):
+        lattice = scene_in_time(problem.take([b]), free).lattice
+        assert len(lattice.velocities) <= MOVES and lattice.states <= STATES
+        assert lattice.velocities[:, 0].max() >= 0.7 * speed and lattice.spacing >= 0.3 * scale * 0.999
+        assert np.all(lattice.points.min(0) <= 0.0) and lattice.points[:, 0].max() >= way - lattice.spacing

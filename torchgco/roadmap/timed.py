@@ -225,8 +225,8 @@ def field_of(parts: Sequence[Any], lattice: TimedLattice) -> Field:
     rests = (center == center[:1]).all(-1).all(0)
     order = (~rests).to(torch.int8).argsort(stable=True)
     center = (center - torch.from_numpy(lattice.origin))[:, order]
-    shaped = (part.float().contiguous() for part in (center, half[order], axes[order], radius[order]))
-    return Field(_away(others, lattice, times.float()), *shaped, int(rests.sum()))
+    center, half, axes, radius = (p.float().contiguous() for p in (center, half[order], axes[order], radius[order]))
+    return Field(_away(others, lattice, times.float()), center, half, axes, radius, int(rests.sum()))
 
 
 def _present(solids: Solids, count: int) -> list[Tensor]:

@@ -203,8 +203,8 @@ def _cell_costs(problem: Problem, lattice: TimedLattice, stages: float, span: Sp
     ends = [_end_cost(problem, x, layer * lattice.tau) for layer in range(earliest, lattice.layers + 1)]
     end = torch.stack(ends).double().cpu()
     _bar(problem, lattice, points, found, end)
-    numbers = (part.nan_to_num(FAR, FAR, FAR).clamp(max=FAR).float() for part in (found, end))
-    return *numbers, bend
+    found, end = (part.nan_to_num(FAR, FAR, FAR).clamp(max=FAR).float() for part in (found, end))
+    return found, end, bend
 
 
 def _stage_cost(problem: Problem, x: Tensor, u: Tensor, k: int, t: float) -> Tensor:
