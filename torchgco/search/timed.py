@@ -31,7 +31,7 @@ from torchgco.search.timed_scenes import can_search, scene_in_time
 from torchgco.solvers.contracts import Call
 
 PROBLEMS_AT_ONCE = 16  # searched together: bounds the memory
-FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the lattice is made finer once
+FINER = 1.0, 0.5  # shares of the usual spacing: where no way is found, the lattice is made finer, and larger, once
 GAP = 0.02  # share by which what has arrived may cost more than without obstacles, and is left as it is
 DEARER = 0.5  # share by which ways that are solved may cost more than the cheapest, on the lattice
 FIRST = 3  # ways of a problem that are solved in any case: costs on the lattice order them roughly
@@ -190,7 +190,8 @@ class _Ends:
             merit = torch.where(clear, end.best.cost, torch.inf)
             done |= _keep(search, self.rows, each[left], merit, end)
             self.least.scatter_reduce_(0, each[left], merit, "amin")
-            self.below.scatter_reduce_(0, each[left], merit - self.along[left], "amin")
+            undercut = torch.where(good, end.best.cost - self.along[left], torch.inf)
+            self.below.scatter_reduce_(0, each[left], undercut, "amin")
             again = good & ~clear & (end.best.cost < self.least[each[left]])
             again &= ~_repeated(each[left], end.best.cost)
             more = torch.maximum(grown[left] - EXTRA * clearance, 2.0 * grown[left])

@@ -25,8 +25,11 @@ MOVES = 256  # of a lattice, at most, before the constraints are asked: two swee
 COARSER = 1.1  # times as wide cells, until there are so few
 PUSH_SHARE = 0.5  # share of the strongest acceleration by which the lattice changes its velocity at most
 ROOM = 0.1  # share of a cell's side that ways keep clear, as distances are interpolated between cells
-AROUND = 3.0  # sizes of the largest obstacle that the lattice extends beyond start, goal and the way without obstacles;
-# at most half of the distance, within which ways up to sqrt(2) times as long stay
+HALF = (
+    0.5  # share of the distance that the lattice extends beyond start, goal and the way without obstacles: there stay
+)
+# ways up to sqrt(2) times as long; at first
+AROUND = 3.0  # sizes of the largest obstacle, at most
 FASTER = 1.25  # times as fast as without obstacles, at most
 SIDEWAYS = 0.5  # share of that speed by which in space the velocity along an axis may leave its range there
 THIN = 0.25  # share of the smallest obstacle's size that a cell of a vehicle without a radius measures
@@ -124,7 +127,9 @@ def _sizes(problem: Problem, free: Tensor, finer: float, span: Span) -> Sizes:
     if gates is not None:
         ends.append(gates.centers[0].double().cpu().numpy())
     points = np.concatenate(ends)
-    beyond = min(AROUND * (_largest(problem) + radius), 0.5 * float(np.linalg.norm(np.ptp(points, axis=0))))
+    beyond = HALF * float(np.linalg.norm(np.ptp(points, axis=0)))
+    if finer == 1.0 or d == 3:  # in space so many cells would be coarse
+        beyond = min(beyond, AROUND * (_largest(problem) + radius))
     low, high = (part[0, at].double().cpu().numpy() for part in bounds_at_inner_knots(problem))
     speed = FASTER * np.linalg.norm(v, axis=1).max(initial=0.0)
     slowest, fastest = np.full(d, -speed), np.full(d, speed)

@@ -1,0 +1,61 @@
+"""Where the time is free and obstacles move: ways arrive at times of their own, each through a gap of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchgco import (
+    ControlBounds, FreeTime, FunctionDynamics, Goal, Problem, QuadraticCost, Spheres, StateBounds, judge, solve,
+)  # fmt: skip
+from torchgco.roadmap.timed import library_for
+
+D, INF = torch.float64, float("inf")
+LANES = 3
+
+
+@pytest.fixture(autouse=True)
+def searched() -> None:
+    if library_for(2) is None:
+        pytest.skip("no compiler")
+
+
+def lanes(B: int, seed: int, weight: float, **time: float) -> Problem:
+    """Points that have to be at rest beyond lanes of discs with a gap each now and then; a second costs `weight`."""
+    rng, rows = np.random.default_rng(seed), []
+    for _ in range(B):
+        discs = []
+        for x in 1.5 + 1.7 * np.arange(LANES):
+            speed, side = rng.uniform(0.4, 0.9), rng.choice([-1.0, 1.0])
+            y = -side * (1.3 * np.arange(16) - rng.uniform(3.0, 4.0))
+            y[rng.permutation(16)[:5]] = np.nan
+            discs += [(x if np.isfinite(row) else np.nan, row, 0.0, side * speed) for row in y]
+        rows.append(discs)
+    x, y, still, speed = np.moveaxis(np.array(rows), -1, 0)
+    radius = np.where(np.isnan(x), np.nan, 0.4)
+    moving = Spheres(np.stack((x, y), -1), radius, 0.2, np.stack((still, speed), -1))
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4", slice(0, 2))
+    end = [1.5 + 1.7 * LANES, 0.0, 0.0, 0.0]
+    cost = QuadraticCost([0.0] * 4, [0.02] * 2, [0.0] * 4, x_ref=end)
+    bounds = [ControlBounds(-2.0, 2.0), StateBounds([-0.5, -2.5, -2.0, -2.0], [8.0, 2.5, 2.0, 2.0])]
+    goal = Goal(state=end, required=True)
+    free = FreeTime(**{"least": 0.4, "most": 2.5, "weight": weight, **time})
+    return Problem(model, cost, [moving, *bounds], torch.zeros(B, 4, dtype=D), 50, goal, time=free)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_who_may_choose_the_time_takes_the_gap_that_is_cheapest(seed: int) -> None:
+    problem = lanes(4, seed, 1.0)
+    solution = solve(problem, verbose=False)
+    verdict = judge(problem, solution.U, times=solution.t)
+    assert bool(verdict.reached.all()) and bool((verdict.clearance >= 0).all())
+    one = torch.tensor([2])
+    alone = solve(problem.take(one), ids=one, verbose=False)
+    assert torch.equal(alone.U[0], solution.U[2]) and torch.equal(alone.duration[0], solution.duration[2])
+
+
+def test_times_stay_within_their_bounds_and_what_no_way_reaches_is_said() -> None:
+    problem = lanes(2, 3, 1.0, least=1.3, most=1.4)
+    solution = solve(problem, verbose=False)
+    assert bool(((solution.duration >= 6.5 - 1e-6) & (solution.duration <= 7.0 + 1e-6)).all())
