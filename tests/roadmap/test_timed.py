@@ -20,7 +20,7 @@ from torchgco import (
     Spheres,
 )
 from torchgco.native.engine import run
-from torchgco.roadmap.timed import FAR, PARTS, Field, TimedLattice, TimedScene, field_of, library_for, timed_ways
+from torchgco.roadmap.timed import FAR, PARTS, Surroundings, TimedLattice, TimedScene, field_of, library_for, timed_ways
 
 SPACING, TAU, MARGIN = 0.5, 0.5, 0.05
 
@@ -28,7 +28,9 @@ SPACING, TAU, MARGIN = 0.5, 0.5, 0.05
 def scene_of(lattice: TimedLattice, parts: tuple[np.ndarray, ...], start: int, first: int, margin: float) -> TimedScene:
     gap, cost, end, move, last, change = (torch.from_numpy(part).float().contiguous() for part in parts)
     d = lattice.d
-    field = Field(gap, gap.new_zeros(len(gap), 0, d), gap.new_zeros(0, d), gap.new_zeros(0, d, d), gap.new_zeros(0), 0)
+    field = Surroundings(
+        gap, gap.new_zeros(len(gap), 0, d), gap.new_zeros(0, d), gap.new_zeros(0, d, d), gap.new_zeros(0), 0
+    )
     return TimedScene(lattice, field, cost, end, move, last, change, start, first, margin)
 
 

@@ -190,7 +190,7 @@ def test_lattices_have_few_moves_and_states_at_any_scale(scale: float, fast: flo
     t = torch.linspace(0, 1, 51, dtype=D).unsqueeze(-1)
     free = torch.cat((t * torch.tensor([way, 0.0]), torch.ones_like(t) * torch.tensor([speed, 0.0])), dim=-1)
     for b in range(B):
-        lattice = scene_in_time(problem.take([b]), free).lattice
+        lattice = scene_in_time(problem.take(torch.tensor([b])), free).lattice
         assert len(lattice.velocities) <= MOVES and lattice.states <= STATES
         assert lattice.velocities[:, 0].max() >= 0.7 * speed and lattice.spacing >= 0.3 * scale * 0.999
         assert np.all(lattice.points.min(0) <= 0.0) and lattice.points[:, 0].max() >= way - lattice.spacing

@@ -103,7 +103,7 @@ class TimedLattice:
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class Surroundings:
     """What keeps ways off: solids at the times of a lattice, and distances from all else.
 
     Args:
@@ -137,7 +137,7 @@ class TimedScene:
     """
 
     lattice: TimedLattice
-    field: Field
+    field: Surroundings
     cell_cost: Tensor
     end_cost: Tensor
     move_cost: Tensor
@@ -205,7 +205,7 @@ def timed_ways(scenes: Sequence[TimedScene], most: int, dearer: float) -> list[T
     return found
 
 
-def field_of(parts: Sequence[Any], lattice: TimedLattice) -> Field:
+def field_of(parts: Sequence[Any], lattice: TimedLattice) -> Surroundings:
     """What the obstacles of one problem are at the times of a lattice.
 
     Args:
@@ -226,7 +226,7 @@ def field_of(parts: Sequence[Any], lattice: TimedLattice) -> Field:
     order = (~rests).to(torch.int8).argsort(stable=True)
     center = (center - torch.from_numpy(lattice.origin))[:, order]
     center, half, axes, radius = (p.float().contiguous() for p in (center, half[order], axes[order], radius[order]))
-    return Field(_away(others, lattice, times.float()), center, half, axes, radius, int(rests.sum()))
+    return Surroundings(_away(others, lattice, times.float()), center, half, axes, radius, int(rests.sum()))
 
 
 def _present(solids: Solids, count: int) -> list[Tensor]:

@@ -17,10 +17,13 @@ from torchgco.problem.in_time import factor_state, factors_in
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.timed import TimedScene, TimedWays, library_for, timed_ways
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
-from torchgco.search.timed import DEARER, FINER, PROBLEMS_AT_ONCE, Timed
+from torchgco.search.timed import DEARER, PROBLEMS_AT_ONCE, Timed
 from torchgco.search.timed_guesses import guesses_in_time
 from torchgco.search.timed_scenes import Span, can_search, scene_in_time
 from torchgco.solvers.contracts import Call
+
+FINER = 0.5, 0.25  # shares of the usual spacing: the first gap that can be reached decides on the time
+PUSH = 0.7  # share of the strongest acceleration, which along both axes is as much along each: the least time takes it
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,8 @@ class Arrivals:
             return None
         return None if library_for(at.stop - at.start) is None else cls(row.ways)
 
-    def guesses(self, problem: Problem, call: Call) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Which problem each is of (C,), its factors (C, 1), and states and controls as of the problem in free time.
+    def calls(self, problem: Problem, call: Call) -> tuple[Tensor, Tensor, Call]:
+        """Which problem each guess is of (C,), its number among those of the problem (C,), and a call from all guesses.
 
         Args:
             problem: the user's, whose time has one factor.
@@ -61,14 +64,20 @@ class Arrivals:
                     found[b] = ways
         each = torch.tensor([b for b, ways in enumerate(found) for _ in ways.points], dtype=torch.int64)
         each = each.to(problem.x0.device)
-        return each, *guesses_in_time(problem, call.problem, each, found)
+        number = torch.cat([torch.arange(len(ways.points)) for ways in found]).to(each.device)
+        factors, X, U = guesses_in_time(problem, call.problem, each, found)
+        many = call.take(each)
+        x0 = many.problem.x0.clone()
+        x0[:, problem.n] = factors[:, 0]
+        begun = many.problem._with({"x0": x0}, many.problem.known)
+        return each, number, replace(many, problem=begun, X0=X, U0=U, callback=None)
 
 
 def _scene(problem: Problem, b: int, X: Tensor, factor: float, finer: float) -> TimedScene:
     one, dt = problem.take(torch.tensor([b], device=X.device)), float(problem.dynamics.dt)
     assert one.time is not None
     whole = problem.N * dt
-    span = Span(factor * dt, float(one.time.least) * whole, float(one.time.most) * whole, float(one.time.weight))
+    span = Span(factor * dt, float(one.time.least) * whole, float(one.time.most) * whole, float(one.time.weight), PUSH)
     return scene_in_time(one, X[:, : problem.n], finer, span)
 
 

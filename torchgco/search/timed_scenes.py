@@ -39,7 +39,7 @@ class Sizes(NamedTuple):
     """What the lattice of a problem follows from."""
 
     spacing: float  # m
-    push: float  # m/s^2
+    push: float  # by which the lattice changes its velocity at most, m/s^2
     duration: float  # s
     low: Array  # (d,), m
     high: Array
@@ -68,6 +68,7 @@ class Span(NamedTuple):
     earliest: float  # at which it may end, s
     latest: float
     second: float = 0.0  # what a second costs
+    push: float = PUSH_SHARE
 
     @classmethod
     def of(cls, problem: Problem) -> Span:
@@ -136,7 +137,7 @@ def _sizes(problem: Problem, free: Tensor, finer: float, span: Span) -> Sizes:
     if d == 3 and len(v) > 0:
         slowest, fastest = v.min(0) - SIDEWAYS * speed, v.max(0) + SIDEWAYS * speed
     low, high = np.maximum(low, points.min(0) - beyond), np.minimum(high, points.max(0) + beyond)
-    return Sizes(spacing, push, span.latest, low, high, slowest, fastest)
+    return Sizes(spacing, span.push * push, span.latest, low, high, slowest, fastest)
 
 
 def _largest(problem: Problem) -> float:
@@ -164,7 +165,7 @@ def _lattice(sizes: Sizes, start: Array, velocity: Velocity) -> TimedLattice:
 
 def _of_spacing(sizes: Sizes, start: Array, spacing: float) -> TimedLattice | None:
     """The lattice with cells of a width, m; None where it has too many moves, or cells and layers."""
-    layers = max(2.0, np.rint(sizes.duration / np.sqrt(spacing / (PUSH_SHARE * sizes.push))))
+    layers = max(2.0, np.rint(sizes.duration / np.sqrt(spacing / sizes.push)))
     tau = sizes.duration / layers
     before, behind = (
         np.floor(np.maximum(part, 0.0) / spacing + 1e-9) for part in (start - sizes.low, sizes.high - start)

@@ -177,20 +177,14 @@ class Timed:
         The problems (b,) are left of which no way leads to a feasible trajectory.
         """
         call = replace(self._at(rows, guess, self.call.X0 is not None), warm=None)
-        each, factors, X, U = self.chooser.arrivals.guesses(self.problem, call)
-        x0 = call.problem.x0[each]
-        x0[:, self.problem.n] = factors[:, 0]
-        many = call.take(each)
-        many = replace(many, problem=many.problem._with({"x0": x0}, many.problem.known), X0=X, U0=U, callback=None)
+        each, number, many = self.chooser.arrivals.calls(self.problem, call)
         self._keep(rows, self.chooser.free.run(call))
-        ends, number = self.chooser.free.run(many), torch.zeros_like(each)
-        for b in each.unique():
-            number[each == b] = torch.arange(int((each == b).sum()), device=each.device)
-        for k in range(int(number.max()) + 1 if len(each) > 0 else 0):
-            self._keep(each[number == k], ends.take((number == k).nonzero().flatten()))
-        found = torch.zeros_like(self.clear)
-        found[each] = True
-        self.found = found & (self.best.violation <= self.chooser.limit)
+        if each.numel() > 0:
+            ends = self.chooser.free.run(many)
+            for k in number.unique():
+                self._keep(each[number == k], ends.take((number == k).nonzero().flatten()))
+        self.found[each] = True
+        self.found &= self.best.violation <= self.chooser.limit
         return rows[~self.found]
 
     def _first(self) -> Tensor:
