@@ -23,6 +23,7 @@ from torchgco.roadmap.timed import TimedWays, library_for, timed_ways
 from torchgco.search.chords import EXTRA
 from torchgco.search.converge import solved_nearby
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
+from torchgco.search.reach import limit_of, push_of
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import SOLVER
 from torchgco.search.table import Row
@@ -117,12 +118,32 @@ def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
     bare = without_obstacles(call.problem)
     none = torch.full_like(call.problem.x0[:, 0], -torch.inf)
     if bare is None:
-        return call.problem.at_rest[0], none
+        return _hurried(call.problem), none
     end = WITHOUT_OBSTACLES.solved(replace(call, problem=bare, U0=call.problem.at_rest[1]))
     search.best.end.iterations[rows] += end.iterations
     good = (end.best.violation <= search.solver.violation_tolerance) & torch.isfinite(end.best.cost)
     X = torch.where(good.view(-1, 1, 1), end.best.X, call.problem.at_rest[0])
     return X, torch.where(good, end.best.cost, none)
+
+
+def _hurried(problem: Problem) -> Tensor:
+    """States (B, N+1, n) straight to the goal, from rest to rest as fast as limits let it; at rest without a goal.
+
+    They say how fast ways may be where no trajectory without obstacles is known, as beside a map.
+    """
+    X, at, dt = problem.at_rest[0].clone(), problem.position, float(problem.dynamics.dt)
+    if problem.goal is None:
+        return X
+    far, push, whole = problem.goal.distance(problem.x0[:, at]), push_of(problem), dt * problem.stages
+    time = torch.where(torch.isfinite(push) & (push > 0.0), 2.0 * (far / push).sqrt(), whole)
+    limit = limit_of(problem)
+    if limit is not None:
+        time = torch.maximum(time, 2.0 * dt * far / limit.step)
+    time = torch.minimum(time.clamp(min=2.0 * dt), whole.to(far))
+    share = (dt * torch.arange(problem.N + 1).to(far) / time.unsqueeze(-1)).clamp(max=1.0).unsqueeze(-1)
+    done = torch.where(share < 0.5, 2.0 * share.square(), 1.0 - 2.0 * (1.0 - share).square())
+    X[..., at] += done * (problem.goal.position - problem.x0[:, at]).unsqueeze(1)
+    return X
 
 
 def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor:
