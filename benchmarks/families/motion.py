@@ -16,7 +16,8 @@ import torch
 import torchgco
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import markdown, share
-from torchgco import MultiStart, Problem, Solver, compose, presets
+from torchgco import MultiStart, Problem, compose, presets
+from torchgco.solvers.contracts import Solver
 
 SCENES = {
     "traffic": "unicycle", "walkers": "unicycle", "sliding": "unicycle", "revolving": "unicycle",
