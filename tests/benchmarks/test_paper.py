@@ -57,8 +57,9 @@ def test_missions_and_animations_are_written(tmp_path: Path, monkeypatch: pytest
         assert imread(tmp_path / "out" / name).std() > 0.01
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-    assert "| control steps | 4 | 4 | 4 |" in text and "| outcome | TIMEOUT | TIMEOUT | TIMEOUT |" in text
-    assert "| violation accepted in a new plan | any | any | 0.01 |" in text and "| shifted plans | 0 | 0 | 0 |" in text
+    assert "| outcome | TIMEOUT | TIMEOUT | TIMEOUT |" in text
+    rows = (tmp_path / "out" / "missions.csv").read_text().splitlines()
+    assert {"control steps,4,4,4", "violation accepted in a new plan,any,any,0.01", "shifted plans,0,0,0"} < set(rows)
 
 
 def test_the_papers_planners_have_nothing_of_the_librarys_own() -> None:
