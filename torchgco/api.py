@@ -24,7 +24,7 @@ from torchgco.fleets.solve import solve_fleet
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
-from torchgco.kernels import current, open_loop
+from torchgco.kernels import copied_to, current, on_cpu, open_loop
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
@@ -130,6 +130,8 @@ def solve(
     name = _refuse(misplaced, problem, solver)
     X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
+    if solver.kernels is None and (there := on_cpu(problem)) is not None:
+        problem, (U0, ids, warm, X0) = there, copied_to((U0, ids, warm, X0), there.x0)
     (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
@@ -139,9 +141,16 @@ def solve(
         watcher.end(found)
     finally:
         watcher.close()
-    found = replace(found, account=found.account and found.account.asked(asked, name))
     _warn(problem, found, warm is None)
+    problem, found = _returned(asked, problem, found, name)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
+
+
+def _returned(asked: Problem, problem: Problem, found: Solution, name: str | None) -> tuple[Problem, Solution]:
+    """The problem and the solution on the device of the problem that was asked for, which the solution knows."""
+    if problem.x0.device != asked.x0.device:
+        problem, found = current(asked), copied_to(found, asked.x0)
+    return problem, replace(found, account=found.account and found.account.asked(asked, name))
 
 
 def _solve_fleet(

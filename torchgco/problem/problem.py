@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
-from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, take
+from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, mapped, take
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -271,6 +271,12 @@ class Problem:
         if self.given is not None:
             subset._set(given=self.given.followed(self, lambda whole: whole.take(index)))
         return subset
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> Self:
+        """The same problems on another device, numbers in a precision; without gradients, and what users' functions
+        hold stays where it is."""
+        change = lambda leaf: leaf.detach().to(device, dtype if leaf.is_floating_point() else leaf.dtype)
+        return self._with({name: mapped(getattr(self, name), change) for name in field_names(type(self))})
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""
