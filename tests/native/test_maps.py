@@ -70,7 +70,9 @@ def test_values_expansions_and_violations_are_pytorchs(d: int, interpolation: st
         lam = [torch.rand(t.shape, generator=generator, dtype=t.dtype).clamp(min=least) - least for t in zero.lam]
         lagrangian = Lagrangian(problem, Multipliers(tuple(lam), zero.mu), None, True)
         torch.testing.assert_close(kernels.value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
-        torch.testing.assert_close(kernels.slack(lagrangian, X, U), lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(
+            kernels.judged(lagrangian, X, U).slack, lagrangian.slack(X, U), rtol=1e-10, atol=1e-10
+        )
         slopes, H = kernels.expand(problem, X, U, lagrangian)
         want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
         kept = [i for i in range(s + 1) if i != n]

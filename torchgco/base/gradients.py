@@ -66,7 +66,8 @@ def leaves(tree: Any) -> list[Any]:
             flat.append(node)
         elif id(node) not in seen:  # parts may hold each other
             seen.add(id(node))
-            waiting += [child for _, child in _parts(node)]
+            held = node if isinstance(node, (Mapping, tuple, list)) else getattr(node, "__dict__", {})
+            waiting += held.values() if isinstance(held, Mapping) else held
     return flat
 
 
@@ -86,14 +87,3 @@ def without_gradients(tree: Any) -> Any:
     if not asking(tree):  # it may hold itself
         return tree
     return mapped(tree, lambda leaf: leaf.detach() if asks(leaf) else leaf)
-
-
-def _parts(tree: Any) -> list[tuple[Any, Any]]:
-    """What a sequence, a mapping or a dataclass holds, by place or name; nothing of all else."""
-    if isinstance(tree, Mapping):
-        return list(tree.items())
-    if isinstance(tree, (tuple, list)):
-        return list(enumerate(tree))
-    if _holds(type(tree)) and hasattr(tree, "__dict__"):
-        return list(vars(tree).items())
-    return []

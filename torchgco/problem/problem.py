@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
-from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, take
+from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, taken
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -111,21 +112,21 @@ class Problem:
         first = 0 if chooses_position(self.free_start, model.position) else 1
         goal, dt = self.goal and self.goal.place, getattr(model, "dt", None)
         names = tuple(getattr(model, "state_names", ()))
-        parts = len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon, names
+        parts = len(x0), self.N, model.n, model.m, dt, model.position, x0, first, goal, self.horizon, names
         return Dimensions(*parts, free_time=self.time is not None)
 
     def __repr__(self) -> str:
         return summary(self)
 
-    @property
+    @cached_property
     def B(self) -> int:
         return self.x0.shape[0]
 
-    @property
+    @cached_property
     def n(self) -> int:
         return self.dynamics.n
 
-    @property
+    @cached_property
     def m(self) -> int:
         return self.dynamics.m
 
@@ -245,6 +246,9 @@ class Problem:
 
         No solver option then depends on the cost's scale or zero.
         """
+        return self.derive("in cost units", self._in_cost_units)
+
+    def _in_cost_units(self) -> Self:
         unit, constant, _ = self.cost_scale
         cost = self.cost.scaled(1.0 / unit)
         if bool((constant != 0).any()):
@@ -265,7 +269,7 @@ class Problem:
         if is_whole(index, self.B):
             return self
         names = "dynamics", "cost", "constraints", "x0", "goal", "horizon", "free_start", "time"
-        subset = self._with({name: take(getattr(self, name), index) for name in names}, known=self.known)
+        subset = self._with(taken(self, names, index), known=self.known)
         if self.B == 1 or self.one is not None:
             subset._set(one=self.one or self)
         if self.given is not None:
@@ -385,11 +389,10 @@ class Problem:
         self, parts: dict[str, object], known: Known | None = None, derived: dict[str, Any] | None = None
     ) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
-        copy = object.__new__(type(self))
-        for name in field_names(type(self)):
-            object.__setattr__(copy, name, parts[name] if name in parts else getattr(self, name))
-        object.__setattr__(copy, "known", Known() if known is None else known)
-        object.__setattr__(copy, "derived", {} if derived is None else derived)
+        copy, own = object.__new__(type(self)), vars(self)
+        known, derived = Known() if known is None else known, {} if derived is None else derived
+        vars(copy).update({name: own[name] for name in field_names(type(self))}, known=known, derived=derived)
+        vars(copy).update(parts)
         return copy
 
     def check_controls(self, U: Tensor, field: str = "U0") -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Self
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -54,8 +54,6 @@ class AugmentedLagrangian(Solver, named="solver"):
         violation_tolerance: violation (metres for lengths) up to which a trajectory counts as feasible.
         slots: problems that run at the same time; the others wait for a free slot. None: all. No result depends on it.
         record: keep the history of every problem in `solution.trace`.
-        by_kernels: violations of a solution are those that the kernels measure, as in closed loops; else PyTorch
-            evaluates all rows once more.
 
     Raises:
         InputError: a field out of its range.
@@ -69,7 +67,6 @@ class AugmentedLagrangian(Solver, named="solver"):
     violation_tolerance: Positive = ADMITTED
     slots: Count | None = None
     record: bool = False
-    by_kernels: bool = False
 
     def recording(self) -> AugmentedLagrangian:
         """The same solver, which keeps the history of every problem."""
@@ -79,14 +76,9 @@ class AugmentedLagrangian(Solver, named="solver"):
         """The same solver with at most `slots` problems at a time."""
         return replace(self, slots=slots)
 
-    def in_closed_loop(self, rounds: int) -> tuple[Self, Self]:
-        """The same solver twice. A planner flies on what its kernels measure: rows aren't evaluated by PyTorch, too."""
-        other = replace(self, by_kernels=True)
-        return other, other
-
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
-        session = Session(call, self.inner.as_printed, record=self.record, by_kernels=self.by_kernels)
+        session = Session(call, self.inner.as_printed, record=self.record)
         guidance = None if self.guidance is None else self.guidance.suited(session.call.problem)
         end = self.outer_loop(session.call, guidance, recorder=session.recorder)
         return session.finished(end, self.violation_tolerance, self.slots)

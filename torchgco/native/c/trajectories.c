@@ -1,4 +1,4 @@
-/* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions, gains,
+/* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions,
    rollouts, `lift`, and inner solves. They return 0 without memory. */
 #include "lifted.h"
 
@@ -11,22 +11,6 @@ static void put_values(Lanes *s, int64_t e, int used) {
     }
 }
 int tgco_value(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_values); }
-
-/* One backward pass along given trajectories: gains (E, N, NU, NZ) and the two sums of the expected change. */
-static void put_gains(Lanes *s, int64_t e, int used) {
-    const Problem *p = s->of;
-    int64_t size = p->N * NU * NZ;
-    V linear, squares, lowest;
-    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
-    V quadratic = -linear - s->mu_r * squares;
-    for (int l = 0; l < used; l++) {
-        p->cost[e + l] = linear[l];
-        p->merit[e + l] = quadratic[l];
-        p->status[e + l] = lowest[l] > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
-        for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = s->G[i][l];
-    }
-}
-int tgco_gains(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_gains); }
 
 /* Rollout from the first knot of X, in place: of U, or with feedback of U + K (x - X), in place of U, too. */
 TGCO_INLINE int roll_out(const Problem *p, int64_t first, int64_t last, int feedback) {
