@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import is_dataclass
 from functools import lru_cache
@@ -29,10 +29,14 @@ def recording() -> Iterator[None]:
         _recording.reset(token)
 
 
-@contextmanager
-def not_recording() -> Iterator[None]:
+def not_recording() -> AbstractContextManager[None]:
     """Nothing is recorded, neither for backward passes nor of tensors in forward mode."""
-    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False) if is_forward() else nullcontext():
+    return _without_tangents() if is_forward() else torch.no_grad()
+
+
+@contextmanager
+def _without_tangents() -> Iterator[None]:
+    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
         yield
 
 

@@ -96,11 +96,10 @@ def kernels_of(problem: Problem) -> Kernels:
     can't be traced or nothing compiles, which an EagerWarning explains.
     """
     known = problem.known
-    if native() and problem.x0.dtype == torch.float64 and problem.x0.device.type == "cpu":
-        if known.in_c is None:
-            known.in_c = _natively(problem) or False
-        if known.in_c:
-            return known.in_c
+    if _uses_native and known.in_c is None and problem.x0.dtype == torch.float64 and problem.x0.device.type == "cpu":
+        known.in_c = _natively(problem) or False
+    if _uses_native and known.in_c:
+        return known.in_c
     if known.in_pytorch is None:
         _check_eager(problem)
         known.in_pytorch = Kernels()

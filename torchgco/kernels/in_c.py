@@ -69,6 +69,14 @@ class NativeKernels(Kernels):
         self.engine.run("tgco_value", B, packed)
         return cost, merit
 
+    def begun(self, lagrangian: Lagrangian, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        problem, B = lagrangian.problem, len(U)
+        X, cost, merit = U.new_empty(B, problem.N + 1, problem.n), U.new_empty(B), U.new_empty(B)
+        X[:, 0] = problem.x0
+        packed = self.engine.terms(lagrangian, X=X, U=U.contiguous(), cost=cost, merit=merit)
+        self.engine.run("tgco_begin", B, packed)
+        return X, cost, merit
+
     def scale(self, problem: Problem) -> None:
         if self.engine.cost is not None:
             slopes, H = self.expand(problem, *problem.at_rest)
@@ -147,7 +155,7 @@ class NativeKernels(Kernels):
         self.engine.run("tgco_costates", problem.B, packed)
         return found
 
-    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
+    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
         B = lagrangian.problem.B
         for name in ITERATED:
             setattr(s, name, getattr(s, name).contiguous())
@@ -157,7 +165,7 @@ class NativeKernels(Kernels):
             lagrangian, None, **state, **out, options=native_options(how), limit=limit,
             replicas=self.engine.replicas_of(B),
         )  # fmt: skip
-        self.engine.run("tgco_ilqr", B, packed)
+        self.engine.run("tgco_descend" if begins else "tgco_ilqr", B, packed)
         end = pass_end(out)
         if out["lost"].any():
             rows = out["lost"].nonzero().flatten()
@@ -197,12 +205,14 @@ class NativeKernels(Kernels):
         return self._samplers[how.dtype].improve(problem, U, how)
 
 
+@lru_cache(maxsize=64)
 def native_options(how: Descent) -> Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
     rungs = search.ladder(printed)
     return Options.complete(
-        ladder=_numbers(*rungs), rungs=len(rungs), back=-1 if search.back is None else search.back, accept_last=printed,
+        ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs),
+        back=-1 if search.back is None else search.back, accept_last=printed,
         ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
         max_iterations=how.max_iterations, tolerance=0.0 if printed else how.tolerance,
         absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,
@@ -210,11 +220,6 @@ def native_options(how: Descent) -> Options:
         regularisation_max=descent.REGULARISATION_MAX, damping=0.0 if printed else descent.DAMPING,
         damping_growth=descent.DAMPING_GROWTH, damping_decay=descent.DAMPING_DECAY,
     )  # fmt: skip
-
-
-@lru_cache(maxsize=64)
-def _numbers(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def _flags(B: int) -> Tensor:

@@ -67,6 +67,11 @@ class Kernels:
         """J_var (B,) and L_M (B,)."""
         return lagrangian.value(X, U)
 
+    def begun(self, lagrangian: Lagrangian, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """X from the problem's start and controls U, J_var (B,) and L_M (B,)."""
+        X = self.open_loop(lagrangian.problem, U)
+        return X, *self.value(lagrangian, X, U)
+
     def scale(self, problem: Problem) -> None:
         """Have the problem keep its `cost_scale`, where that can be computed without autodiff."""
 
@@ -98,8 +103,11 @@ class Kernels:
         step = run(torch.zeros_like(worst))
         return Judged(step, lagrangian.slack(X, U), worst, torch.zeros_like(worst, dtype=torch.bool), run)
 
-    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
-        """Iterations of every problem's inner solve, in place: one at least, `limit` at most."""
+    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
+        """Iterations of every problem's inner solve, in place: one at least, `limit` at most.
+
+        Where they are `compiled` also the beginning: of `s` only the first states and U are then read.
+        """
         return iterate(how, s, lagrangian)
 
     def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:

@@ -93,8 +93,10 @@ def cost_unit(problem: Problem) -> Tensor:
 
 def cost_scale(problem: Problem) -> CostScale:
     """`problem.cost_scale`, computed without autodiff where compiled code can; the problem keeps it."""
-    if "cost_scale" not in problem.derived:
-        kernels_of(problem).scale(problem)
+    whole = problem if problem.part_of is None else problem.part_of[0]
+    if "cost_scale" not in problem.derived and "cost_scale" not in whole.derived:
+        first = whole if whole.B <= problem.B else problem
+        kernels_of(first).scale(first)
     return problem.cost_scale
 
 
@@ -119,11 +121,15 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     Exact where a path may touch; elsewhere that of its chords, which are then farther away than it leaves them.
     """
+    if not any(isinstance(row.bare, Distance) for row in problem.constraints):
+        return X.new_full(X.shape[:1], torch.inf)
     clearance = chord_clearance(problem, X)
     if not bends(problem):
         return clearance
     off = bulge(problem, X, U)
     near = (clearance < off).nonzero().flatten()
+    if near.numel() == 0:
+        return clearance
     for path in paths(problem.take(near), X[near], U[near], off[near]):
         if path.pieces > 1:
             rows = near[path.rows]

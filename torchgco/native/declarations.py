@@ -71,9 +71,12 @@ class Structure(ctypes.Structure):
             raise TypeError(f"{cls.__name__} lacks {', '.join(sorted(missing))}")
         return cls(**values)
 
-    def copy(self) -> Self:
+    def copy(self, values: Mapping[str, Any] | None = None) -> Self:
+        """The same, with other values of fields by name."""
         other = type(self).from_buffer_copy(self)
         _set(other, "kept", [self])
+        if values:
+            other.fill(values)
         return other
 
     def __setattr__(self, name: str, value: Any) -> None:

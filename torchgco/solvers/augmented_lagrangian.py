@@ -139,13 +139,18 @@ class OuterLoop:
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
         """Rollouts of the initial controls of the problems `rows`, and the statuses of invalid starts."""
         problem, U = self._part(rows), self.call.U0[rows]
-        X = open_loop(problem, U)
         if self.call.warm is None:
             multipliers = Multipliers.zero(problem, self.solver.initial_penalty)
         else:
             multipliers = take(self.call.warm, rows)
-        penalty = take(self.penalty, rows) if self.guidance is None else self.guidance.start(problem, X)
-        cost, merit = value(Lagrangian(problem, multipliers, penalty, not self.as_printed), X, U)
+        if self._guided:
+            X = open_loop(problem, U)
+            penalty = None if self.guidance is None else self.guidance.start(problem, X)
+            cost, merit = value(Lagrangian(problem, multipliers, penalty, not self.as_printed), X, U)
+        else:
+            penalty = take(self.penalty, rows) if self.guidance is None else None
+            lagrangian = Lagrangian(problem, multipliers, penalty, not self.as_printed)
+            X, cost, merit = kernels_of(problem).begun(lagrangian, U)
         none, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         state = State(
             rows=rows.clone(),

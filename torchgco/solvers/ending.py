@@ -135,10 +135,15 @@ def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Te
     return status
 
 
-def fails_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """Whether trajectories touch an obstacle that can be measured between two knots, or miss a gate, (B,) bool."""
-    chords = all(one.has_chords for one in problem.obstacles)
-    bad = path_clearance(problem, X, U) < 0 if chords else torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+def fails_between(problem: Problem, X: Tensor, U: Tensor, clearance: Tensor | None = None) -> Tensor:
+    """Whether trajectories touch an obstacle that can be measured between two knots, or miss a gate, (B,) bool.
+
+    Args:
+        clearance: `path_clearance` (B,), where it is known.
+    """
+    bad = torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    if all(one.has_chords for one in problem.obstacles):
+        bad = (path_clearance(problem, X, U) if clearance is None else clearance) < 0
     for way in passages(problem, X, U).values():
         bad = bad | ~way.passed.all(-1)
     return bad

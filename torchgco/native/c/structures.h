@@ -58,6 +58,7 @@ typedef struct {
     double *mu;
     int64_t *inner, *iterations, *rung;
     int32_t *status, *converged, *refused, *lost, *sensitive; /* sensitive: of tgco_gains; NULL: not asked for */
+    const int64_t *numbers; /* (E): at which place each problem's parameters, cost and constraints are; NULL: at its own */
     Array parameters; /* of the model: (E, N, count) */
     /* Numbers w that all problems share, of the model, and of stages and the last knot of a traced cost. */
     const double *shared, *stage_shared, *last_shared;

@@ -19,13 +19,13 @@ TGCO_INLINE int roll_out(const Problem *p, int64_t first, int64_t last, int feed
     for (int64_t e = first; e < last; e += LANES) {
         for (int l = 0; l < LANES; l++) {
             int64_t element = e + l < last ? e + l : e;
-            fill_stage(parameters, &p->parameters, 0, l, element);
+            fill_stage(parameters, &p->parameters, 0, l, numbers_of(p, element));
             for (int i = 0; i < NX; i++) x[i][l] = p->X[element * (N + 1) * NX + i];
         }
         for (int64_t k = 0; k < N; k++) {
             for (int l = 0; l < LANES; l++) {
                 int64_t element = e + l < last ? e + l : e;
-                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, element);
+                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, numbers_of(p, element));
                 double *X = p->X + (element * (N + 1) + k) * NX, *U = p->U + (element * N + k) * NU;
                 const double *K = feedback ? p->gains + (element * N + k) * NU * NZ : NULL;
                 for (int j = 0; j < NU; j++) {
@@ -52,6 +52,11 @@ int tgco_open_loop(const Problem *p, int64_t first, int64_t last) { return roll_
 /* Rollout of U + K (x - X) from the first knot of X, in place of X and U; gains (E, N, NU, NZ), of which K is used. */
 int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 1); }
 
+/* The same, and J_var and L_M along it. */
+int tgco_begin(const Problem *p, int64_t first, int64_t last) {
+    return roll_out(p, first, last, 0) && tgco_value(p, first, last);
+}
+
 /* Gradients (E, N+1, S) and upper triangles of the Hessians (E, N+1, S, S) of all terms. */
 static void put_expansion(Lanes *s, int64_t e, int used) {
     const Problem *p = s->of;
@@ -76,6 +81,23 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
     int64_t *number = in_order(first, last);
     if (!number || !start(s, p)) { free(number); return 0; }
     inner_solves(s, number, last - first);
+    free(number);
+    finish(s);
+    return 1;
+}
+
+/* The same from the rollout of U, where that is finite. */
+int tgco_descend(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    int64_t size = (p->N + 1) * NX, count = 0, *number = in_order(first, last);
+    if (!number || !tgco_begin(p, first, last) || !start(s, p)) { free(number); return 0; }
+    for (int64_t e = first; e < last; e++) {
+        double sum = 0 * p->merit[e];
+        for (int64_t i = 0; i < size; i++) sum += 0 * p->X[e * size + i];
+        if (sum == 0) number[count++] = e;
+        else p->status[e] = NON_FINITE;
+    }
+    if (count) inner_solves(s, number, count);
     free(number);
     finish(s);
     return 1;

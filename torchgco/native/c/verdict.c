@@ -166,6 +166,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
     if (!points) return 0;
     for (int64_t e = first; e < last; e++) {
         V least = SET(INFINITY), knot;
+        int64_t own = numbers_of(p, e);
         for (int64_t i = 0; i < 2 * DIM * blocks; i++)
             for (int l = 0; l < LANES; l++) {
                 int64_t k = i / (2 * DIM) * LANES + l, end = i / DIM % 2;
@@ -174,10 +175,10 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
             if (con->kind != SPHERES || con->moved) continue;
-            const double *o = con->bound.data + e * con->bound.element;
-            const double *squares = con->squares.data + e * con->squares.element;
-            const double *v = con->velocities.data ? con->velocities.data + e * con->velocities.element : NULL;
-            double stop = con->stops.data ? con->stops.data[e * con->stops.element] : INFINITY;
+            const double *o = con->bound.data + own * con->bound.element;
+            const double *squares = con->squares.data + own * con->squares.element;
+            const double *v = con->velocities.data ? con->velocities.data + own * con->velocities.element : NULL;
+            double stop = con->stops.data ? con->stops.data[own * con->stops.element] : INFINITY;
             for (int64_t j = 0; j < con->rows; j++, o += DIM, v += v ? DIM : 0) {
                 if (!(squares[j] >= 0)) continue;
                 V radius = SET(p->gain * sqrt(squares[j])), a[DIM], along[DIM];
