@@ -24,7 +24,7 @@ from torchgco.fleets.solve import solve_fleet
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
-from torchgco.kernels import copied_to, current, on_cpu, open_loop
+from torchgco.kernels import copied_to, costates, current, on_cpu, open_loop
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
@@ -275,8 +275,10 @@ def _checked(warm: Any) -> Solution | None:
 
 def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor | None) -> tuple[Problem, Tensor]:
     """Controls (B, N, m) to begin with, where none are given, and the problem with the guess of its free starts."""
+    if problem.B > 0:
+        problem = current(problem)  # traced once, for the guess, for the solve and for the warnings after it
     if U0 is not None:
-        return current(problem), U0  # traced once, for the solve and for the warnings after it
+        return problem, U0
     if warm is not None:
         if problem.time is not None:
             problem = guessing_times(problem, warm.t)
@@ -286,7 +288,6 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
         return problem, warm.U
     if problem.B == 0:
         return problem, problem.x0.new_zeros(0, problem.N, problem.m)
-    problem = current(problem)  # traced once, for the guess too
     whole = for_solvers(problem)
     solver.announce(whole)
     return problem, _guess(problem, whole)
@@ -353,7 +354,7 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None
         return
     part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]
     times = None if solution.times is None else solution.times[rows]
-    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], doubted=True)
+    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates)
     long = found.large.nonzero().flatten().tolist()
     if long:
         warnings.warn(

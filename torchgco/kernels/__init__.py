@@ -18,6 +18,7 @@ from torchgco.kernels.elsewhere import on_cpu as on_cpu
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_scale as cost_scale
 from torchgco.kernels.verbs import cost_unit as cost_unit
+from torchgco.kernels.verbs import costates as costates
 from torchgco.kernels.verbs import followed as followed
 from torchgco.kernels.verbs import interior_of as interior_of
 from torchgco.kernels.verbs import is_convex as is_convex
@@ -25,4 +26,5 @@ from torchgco.kernels.verbs import measured as measured
 from torchgco.kernels.verbs import open_loop as open_loop
 from torchgco.kernels.verbs import path_clearance as path_clearance
 from torchgco.kernels.verbs import reproducible as reproducible
+from torchgco.kernels.verbs import rolled_out as rolled_out
 from torchgco.kernels.verbs import value as value
