@@ -134,9 +134,8 @@ def solve(
     (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
     called, verbose = name or type(solver).__name__, check_value(verbose, bool | None, "verbose")
     watcher = Watcher(called, problem.B, isinstance(solver, Restarts), verbose)
-    callback = watcher if watcher.shows else None
     try:
-        found = solver.solve(problem, U0, seed, ids, multipliers, callback, max_seconds, X0)
+        found = solver.solve(problem, U0, seed, ids, multipliers, watcher.callback, max_seconds, X0)
         watcher.end(found)
     finally:
         watcher.close()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchgco.base.errors import DeviceWarning
 from torchgco.base.shapes import CPU, computing_on
-from torchgco.base.tree import mapped
+from torchgco.base.tree import field_names, mapped
 from torchgco.kernels.choice import native, serves
 from torchgco.problem.problem import Problem
 
@@ -28,7 +28,7 @@ def on_cpu(problem: Problem) -> Problem | None:
     device = problem.x0.device
     if device.type == CPU.type or problem.B == 0 or not native():
         return None
-    there = problem.to(CPU, torch.float64)
+    there = _held_on_cpu(problem)
     with computing_on(CPU):
         if not serves(there):
             return None
@@ -38,6 +38,13 @@ def on_cpu(problem: Problem) -> Problem | None:
         told = f"problems on {device} are solved by C on the CPU, with copies: PyTorch's kernels take far longer there"
         warnings.warn(told, DeviceWarning, stacklevel=4)
     return there
+
+
+def _held_on_cpu(problem: Problem) -> Problem:
+    """The problem without gradients; what users' functions hold stays where it is."""
+    change = lambda leaf: leaf.detach().to(CPU, torch.float64 if leaf.is_floating_point() else leaf.dtype)
+    parts = {name: mapped(getattr(problem, name), change) for name in field_names(type(problem))}
+    return problem._with(parts)
 
 
 def copied_to(tree: Any, like: Tensor) -> Any:

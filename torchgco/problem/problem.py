@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
-from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, mapped, take, taken
+from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, take, taken
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -289,11 +289,6 @@ class Problem:
             subset._set(given=self.given.followed(self, lambda whole: whole.take(index)))
         return subset
 
-    def to(self, device: torch.device, dtype: torch.dtype) -> Self:
-        """The same problems on another device, numbers in a precision; without gradients, and what users' functions
-        hold stays where it is."""
-        change = lambda leaf: leaf.detach().to(device, dtype if leaf.is_floating_point() else leaf.dtype)
-        return self._with({name: mapped(getattr(self, name), change) for name in field_names(type(self))})
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
