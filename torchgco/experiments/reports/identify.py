@@ -101,7 +101,8 @@ def table(before: Airframe, identified: Identified) -> str:
     return "\n".join([*lines, f"{'delay':<20} {'':>24} -> {identified.delay:g} s"])
 
 
-def _parser() -> RunParser:
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`torchgco-identify`. Returns the exit code, see `ended`."""
     parser = RunParser(
         prog="torchgco-identify",
         description="Identify mass, inertia, rotors, limits, delay and drag of a plant; write them as a vehicle.",
@@ -112,12 +113,7 @@ def _parser() -> RunParser:
     parser.add_argument("--run", metavar="RUN", type=Path, help="of a finished study: its missions, not test flights")
     parser.add_argument("--output", metavar="FILE", type=Path, default=VEHICLE_FILE, help=f"default: {VEHICLE_FILE}")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the test flights; default: 0")
-    return parser
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`torchgco-identify`. Returns the exit code, see `ended`."""
-    return _parser().run(arguments, _run)
+    return parser.run(arguments, _run)
 
 
 def _run(options: argparse.Namespace) -> int:
