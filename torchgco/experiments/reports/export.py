@@ -138,8 +138,7 @@ def _between(moments: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarr
     return np.stack([np.interp(moments, t, column) for column in values.T], axis=1)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`torchgco-export`. Returns the exit code, see `ended`."""
+def _parser() -> RunParser:
     parser = RunParser(prog="torchgco-export", description="The trajectories of a study as CSV, or as bags of ROS 2.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN")
@@ -150,7 +149,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--solver", metavar="NAME", nargs="+", default=[], help="default: all of the study")
     kinds = list(get_args(Storage))
     parser.add_argument("--bag", metavar="KIND", choices=kinds, help=f"bags of ROS 2 instead: {' or '.join(kinds)}")
-    return parser.run(arguments, _run)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`torchgco-export`. Returns the exit code, see `ended`."""
+    return _parser().run(arguments, _run)
 
 
 def _run(options: argparse.Namespace) -> int:
