@@ -106,14 +106,29 @@ def kernels_of(problem: Problem) -> Kernels:
     return known.in_pytorch
 
 
+def serves(problem: Problem) -> bool:
+    """Whether C serves problems of this form, on the CPU in float64; no warning says where it doesn't."""
+    known = problem.known
+    if known.in_c is None:
+        try:
+            known.in_c = _in_c(problem)
+        except (InputError, NativeError):
+            known.in_c = False
+    return bool(known.in_c)
+
+
 def _natively(problem: Problem) -> NativeKernels | None:
-    warned = problem.known.warned
     try:
-        return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
+        return _in_c(problem)
     except (InputError, NativeError) as error:
         _check_eager(problem)
-        _warn(warned, error)
+        _warn(problem.known.warned, error)
         return None
+
+
+def _in_c(problem: Problem) -> NativeKernels:
+    warned = problem.known.warned
+    return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
 
 
 def _check_eager(problem: Problem) -> None:

@@ -45,6 +45,7 @@ class Best:
         self.end = copied(first)
         self.worked = torch.ones_like(call.ids, dtype=torch.bool)  # (B,): on which problems the present pass has
         self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that one in contact has replaced
+        self.others: dict[int, list[SolveEnd]] = {}  # solved along other ways, in contact between two knots
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
         self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced, as what follows
         self._clearance: Tensor | None = None
