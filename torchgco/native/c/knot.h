@@ -14,7 +14,7 @@ static inline V sphere_terms(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V c, V lam, V total,
     V *g, V *H) {
     if (!g) return total + worth(s, 0, c, lam);
-    if (!any(~(c <= SET(0.0)) | (lam != SET(0.0)))) return total;
+    if (!any(NOT(c <= SET(0.0)) | (lam != SET(0.0)))) return total;
     V away[DIM], rho, slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam, &rho);
     for (int a = 0; a < DIM; a++) {
         SUBTRACT(g[POSITION + a], SET(2.0) * slope, away[a]);
@@ -64,7 +64,7 @@ static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V
             if (con->velocities.data) SUBTRACT(away, SET(k * con->dt), rows->velocities[j * DIM + a]);
             ADD(square, away, away);
         }
-        int adds = any((rows->widest[j] >= SET(0.0)) & ~(square >= limit * limit)); /* NaN may touch */
+        int adds = any((rows->widest[j] >= SET(0.0)) & NOT(square >= limit * limit)); /* NaN may touch */
         for (int64_t b = 0; pushed && !adds && b < P; b++) adds = any(lam[b * each + j] != SET(0.0));
         if (adds) near[count++] = j;
     }

@@ -98,7 +98,7 @@ static void fly(Samples *q, int64_t first) {
     if (o->dwell_cost > 0) cost += SET(o->dwell_cost * p->N) * cost_value(&q->s, p->N - 1, x, u);
     cost += SET(o->temperature) * likelihood;
     for (int l = 0; l < LANES && first + l < o->samples; l++) {
-        double score = (double)cost[l] + o->collision_penalty * (double)touched[l];
+        double score = (double)LANE(cost, l) + o->collision_penalty * (double)LANE(touched, l);
         /* A sample that isn't finite must not spoil the others. */
         q->score[first + l] = score - score == 0 ? score : DBL_MAX;
     }
@@ -133,7 +133,7 @@ static void average(Samples *q, uint64_t key, int64_t rows) {
     for (int64_t first = 0; first < o->samples; first += LANES) {
         V *sum = q->sum + first / LANES % BUNDLES;
         V weight = SET(0.0), eps[NU], u[NU];
-        for (int l = 0; l < LANES && first + l < o->samples; l++) weight[l] = (REAL)q->score[first + l];
+        for (int l = 0; l < LANES && first + l < o->samples; l++) LANE(weight, l) = (REAL)q->score[first + l];
         if (!any(weight > SET(0.0))) continue;
         normal(key, first, rows, q->z);
         for (int64_t k = 0; k < N; k++) {
@@ -143,7 +143,7 @@ static void average(Samples *q, uint64_t key, int64_t rows) {
     }
     for (int64_t i = 0; i < N * NU; i++) {
         double total = 0;
-        for (int l = 0; l < SUMS; l++) total += (double)q->sum[i * BUNDLES + l / LANES][l % LANES];
+        for (int l = 0; l < SUMS; l++) total += (double)LANE(q->sum[i * BUNDLES + l / LANES], l % LANES);
         q->mean[i] = SET(total);
     }
 }

@@ -67,7 +67,7 @@ static inline void net_weights(const double *from, int h, REAL *to) {
 
 /* Lanes whose numbers have the same bits as those of lane l. */
 static inline I net_alike(V a, int l) { return (I)a == ((I)a)[l]; }
-static inline int net_first(I left) { int l = 0; while (!left[l]) l++; return l; }
+static inline int net_first(I left) { int l = 0; while (!LANE(left, l)) l++; return l; }
 
 /* R vectors of y. */
 #define NET_AFFINE(R) \

@@ -66,6 +66,7 @@ typedef struct {
     Array center, radius, weight;
     Options options;
     double gain; /* share of L_M by which tgco_lift must lower it */
+    void *arena; /* of an exported solver, where its memory comes from (export/c/arena.h); else NULL */
 } Problem;
 
 /* The outer loop of the augmented Lagrangian (see solvers.augmented_lagrangian). */

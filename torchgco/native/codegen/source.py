@@ -75,7 +75,10 @@ SAMPLER = Library(("model.c",), (), ("mppi.c",))
 INTERIOR = Library(PASS_SOURCES, ("riccati.c",), ("interior.c", "interior_kkt.c"))
 # The same where Python computes the functions.
 CALLED = Library(("called.c",), INTERIOR.curvature, INTERIOR.shared)
-SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
+# Sizes that the model's unit defines for the others.
+SIZES = {name: f"tgco_{name.lower()}" for name in ("NX", "NU", "NP", "NJ", "MAX_ROWS")}
+SIZES_DEFINED = f"const int {', '.join(f'{name} = {size}' for size, name in SIZES.items())};\n"
+SIZES_DECLARED = f'extern __attribute__((visibility("hidden"))) const int {", ".join(SIZES.values())};\n'
 
 
 _units: dict[tuple[Any, ...], tuple[Unit, ...]] = {}  # reading and joining files takes longer than a small solve
@@ -115,7 +118,8 @@ class Form:
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]), "QUADRATIC_FULL": int(self.dense),
         }  # fmt: skip
         cost = "quadratic.c" if self.cost is None else "traced.c"
-        units = [Unit(_text(vectors | sizes, self._model_code(), cost, *library.model), own=True)]
+        text = _text(vectors | sizes, self._model_code(), cost, *library.model) + SIZES_DEFINED
+        units = [Unit(text, own=True)]
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
             units.append(Unit(_text(vectors | sizes, generated, *library.curvature), own=True))
@@ -146,8 +150,9 @@ class CalledForm:
         }  # fmt: skip
         vectors, dense = {"REAL": "double", "LANES": lanes}, [included("dense.h")]
         cost = "called_cost.c" if self.dense is None else "quadratic.c"
-        units = [_text(vectors | sizes, dense, *files) for files in ((cost, *CALLED.model), CALLED.curvature)]
-        return (*(Unit(text, own=True) for text in units), _shared_unit(vectors, self.position, CALLED))
+        model, curvature = (_text(vectors | sizes, dense, *own) for own in ((cost, *CALLED.model), CALLED.curvature))
+        units = Unit(model + SIZES_DEFINED, own=True), Unit(curvature, own=True)
+        return (*units, _shared_unit(vectors, self.position, CALLED))
 
 
 def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
@@ -159,8 +164,7 @@ def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
 def _shared_unit(vectors: dict[str, Any], at: slice | None, library: Library) -> Unit:
     """The unit that reads sizes from the model."""
     space = {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
-    read = {name: f"tgco_{name.lower()}" for name in SIZES} | space
-    return Unit(_text(vectors | read, [], *library.shared))
+    return Unit(SIZES_DECLARED + _text(vectors | SIZES | space, [], *library.shared))
 
 
 def _products(model: DynamicsSource) -> str:
