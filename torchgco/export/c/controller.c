@@ -62,6 +62,27 @@ static void clamp(const Solve *b, int64_t k, double *u) {
         }
 }
 
+/* Whether one of the numbers is one that the problem can't have. */
+static int has_bad_number(const NAME_workspace *w, const Solve *b) {
+    const double *numbers = (const double *)(const void *)&w->numbers;
+    for (int i = 0; i < (int)(sizeof checks / sizeof *checks); i++)
+        for (int j = checks[i].first; j < checks[i].first + checks[i].count; j++) {
+            int kind = checks[i].kind, is_finite_number = numbers[j] - numbers[j] == 0;
+            if (numbers[j] != numbers[j] || (kind < 3 && !is_finite_number)) return 1;
+            if ((kind == 1 && numbers[j] < 0) || (kind == 2 && numbers[j] <= 0)) return 1;
+        }
+    for (int64_t i = 0; i < b->problem.constraints; i++) {
+        const Constraint *con = b->problem.constraint + i;
+        if (con->kind != BOUNDS) continue;
+        for (int64_t k = 0; k < (con->bound.knot ? con->knots : 1); k++) {
+            const double *limit = con->bound.data + k * con->bound.knot;
+            for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++)
+                if (are_a_pair(con, j, l) && limit[j] < limit[l]) return 1;
+        }
+    }
+    return 0;
+}
+
 /* The bounds of variable v by constraint `con` at knot k; infinite where there are none. */
 static void bounds_at(const Constraint *con, int64_t k, int v, double *lower, double *upper) {
     const double *limit = con->bound.data + (con->bound.knot ? con->place[k] * con->bound.size : 0);

@@ -4,7 +4,7 @@ the sparse Jacobian and its functions, and those of the solver, which are compil
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from torchgco.native.codegen.emit import literal, switch
 from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes
 from torchgco.native.declarations import defines
-from torchgco.native.includes import included, joined
+from torchgco.native.includes import C, included, joined
 from torchgco.native.structures import HEADER, constants
 
 LANES = lanes()
@@ -111,19 +111,39 @@ class Form:
         functions = tuple((i, rows.key) for i, rows in self.functions)
         return self.dynamics.key, p and (p.start, p.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
 
-    def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
-        model, position = self.dynamics, self.position
-        sizes = {
+    def alone(self, declared: str, given: Mapping[str, str]) -> str:
+        """C of a single lane that needs no other unit: the interior point, sweeps and rollouts.
+
+        Args:
+            declared: what comes after the structures.
+            given: texts that stand for files of these names, such as clock.h.
+        """
+        generated = [*self._model_code(), curvature_code(self.dynamics, self.functions)]
+        texts = {"vectors.h": (C / "scalar.h").read_text(), "constants.h": constants(), "code.h": "\n".join(generated)}
+        sizes = {"REAL": "double", "LANES": 1} | self._sizes | _space(self.position)
+        files = included("model.c", self._cost_file, "riccati.c", "interior.c", "sweep.h", "rollout.h")
+        return joined(defines(sizes) + included("structures.h") + declared + files, given=texts | dict(given))
+
+    @property
+    def _sizes(self) -> dict[str, Any]:
+        model = self.dynamics
+        return {
             "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]), "QUADRATIC_FULL": int(self.dense),
         }  # fmt: skip
-        cost = "quadratic.c" if self.cost is None else "traced.c"
-        text = _text(vectors | sizes, self._model_code(), cost, *library.model) + SIZES_DEFINED
+
+    @property
+    def _cost_file(self) -> str:
+        return "quadratic.c" if self.cost is None else "traced.c"
+
+    def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
+        model, sizes = self.dynamics, vectors | self._sizes
+        text = _text(sizes, self._model_code(), self._cost_file, *library.model) + SIZES_DEFINED
         units = [Unit(text, own=True)]
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
-            units.append(Unit(_text(vectors | sizes, generated, *library.curvature), own=True))
-        return (*units, _shared_unit(vectors, position, library))
+            units.append(Unit(_text(sizes, generated, *library.curvature), own=True))
+        return (*units, _shared_unit(vectors, self.position, library))
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
@@ -163,8 +183,12 @@ def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
 
 def _shared_unit(vectors: dict[str, Any], at: slice | None, library: Library) -> Unit:
     """The unit that reads sizes from the model."""
-    space = {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
-    return Unit(SIZES_DECLARED + _text(vectors | SIZES | space, [], *library.shared))
+    return Unit(SIZES_DECLARED + _text(vectors | SIZES | _space(at), [], *library.shared))
+
+
+def _space(at: slice | None) -> dict[str, int]:
+    """Where the position is among the states."""
+    return {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
 
 
 def _products(model: DynamicsSource) -> str:
