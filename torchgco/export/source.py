@@ -19,6 +19,7 @@ from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
 from torchgco.native.declarations import Structure, defines
 from torchgco.native.kept import Kept
+from torchgco.native.packing import kind_of
 from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
 
@@ -150,13 +151,20 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
         _assertion(count, K), lines, _checks(changing), (HERE / "controller.c").read_text(),
     ]  # fmt: skip
     flash = writer.flash + 8 * sum(m.size for m in changing.members) + sum(part.flash for part in made)
-    return Solver(kept.engine.form.alone(declared, texts), "\n".join(own), room, multipliers, flash)
+    return Solver(kept.engine.form.alone(_kinds(kept), declared, texts), "\n".join(own), room, multipliers, flash)
 
 
 def _constraints(kept: Kept) -> list[c.Constraint]:
     """The constraints that a packed problem points to."""
     lists = (one for one in kept.packed.kept if isinstance(one, list) and one and isinstance(one[0], c.Constraint))
     return next(lists, [])
+
+
+def _kinds(kept: Kept) -> set[c.Kind]:
+    """The kinds of the constraints, and of the balls of bodies."""
+    parts = kept.problem.constraints
+    balls = (part.balls[0] for part in parts if kind_of(part) is c.Kind.BODY)
+    return {kind_of(part) for part in (*parts, *balls)}
 
 
 def _count(kept: Kept) -> int:

@@ -52,7 +52,7 @@ static void clamp(const Solve *b, int64_t k, double *u) {
     for (int side = -1; side <= 1; side += 2)
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
-            if (con->kind != BOUNDS || con->place[k] == NOWHERE) continue;
+            if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
             const double *limit = con->bound.data + (con->bound.knot ? con->place[k] * con->bound.size : 0);
             for (int j = 0; j < con->rows; j++) {
                 if (con->variable[j] < NX || con->sign[j] != side) continue;
@@ -73,7 +73,7 @@ static int has_bad_number(const NAME_workspace *w, const Solve *b) {
         }
     for (int64_t i = 0; i < b->problem.constraints; i++) {
         const Constraint *con = b->problem.constraint + i;
-        if (con->kind != BOUNDS) continue;
+        if (!is_kind(con, BOUNDS)) continue;
         for (int64_t k = 0; k < (con->bound.knot ? con->knots : 1); k++) {
             const double *limit = con->bound.data + k * con->bound.knot;
             for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++)
@@ -99,7 +99,7 @@ typedef void Within(double *z, double lower, double upper);
 static void each_bounded(const Problem *p, int controls_alone, Within *within, double *X, double *U) {
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
-        for (int64_t k = 0; con->kind == BOUNDS && k <= p->N; k++) {
+        for (int64_t k = 0; is_kind(con, BOUNDS) && k <= p->N; k++) {
             if (con->place[k] == NOWHERE) continue;
             for (int v = controls_alone ? NX : 0; v < NX + NU; v++) {
                 double lower, upper;
@@ -241,28 +241,28 @@ static int cold(NAME_workspace *w, Solve *b, const double *x, double until) {
 static double too_deep(const Lanes *s, int64_t i, const V *x) {
     const Constraint *con = s->of->constraint + i;
     double worst = -INFINITY;
-    int64_t k = con->place[0] == NOWHERE && (con->moved || con->kind == BODY) ? 1 : 0;
+    int64_t k = con->place[0] == NOWHERE && (con->moved || is_kind(con, BODY)) ? 1 : 0;
     Ball ball;
     V centers[MAX_ROWS];
     if (con->place[k] == NOWHERE && k) return worst;
-    if (con->kind == BODY) ball_centers(s, i, k, x, centers);
-    for (int part = 0; part < (con->kind == BODY ? con->balls : 1); part++) {
+    if (is_kind(con, BODY)) ball_centers(s, i, k, x, centers);
+    for (int part = 0; part < (is_kind(con, BODY) ? con->balls : 1); part++) {
         const Constraint *own = con;
         const Rows *rows = s->rows + i;
         const V *at_x = x;
-        if (con->kind == BODY) {
+        if (is_kind(con, BODY)) {
             ball_at(con, rows, part, k, centers + part * DIM, &ball);
             own = &ball.con; rows = &ball.rows; at_x = ball.x;
         }
         for (int j = 0; j < own->rows; j++) {
             V away[DIM];
             double deep = -INFINITY;
-            if (own->kind == SPHERES) {
+            if (is_kind(own, SPHERES)) {
                 double square = square_at(own, rows, j, k), gap = square - sphere(own, rows, j, k, at_x, away);
                 if (square >= 0) deep = CONTACT * sqrt(square) - sqrt(gap);
-            } else if (own->kind == BOXES) {
+            } else if (is_kind(own, BOXES)) {
                 deep = solid(own, rows, j, k, at_x, 0) / (rows->bound + own->rows * 2 * DIM)[j] - contact_depth[i];
-            } else {
+            } else if (is_kind(own, FIELD)) {
                 V c = field_row(own, rows, k, at_x, 0, 0);
                 if (c > 0) deep = depth_of(rows, c) - contact_depth[i];
             }
@@ -284,8 +284,8 @@ static int starts_inside(Solve *b, const double *x) {
     if (!start(s, &b->follow)) return 0;
     enter_problem(s, 0, 0);
     for (int64_t i = 0; i < s->of->constraints; i++) {
-        int kind = s->of->constraint[i].kind;
-        if (kind != BOUNDS && kind != FUNCTION) inside |= too_deep(s, i, s->X) > 0;
+        const Constraint *con = s->of->constraint + i;
+        if (is_solid(con) || is_kind(con, BODY)) inside |= too_deep(s, i, s->X) > 0;
     }
     finish(s);
     return inside;
@@ -302,7 +302,7 @@ static void step_beside(const Solve *b, double share, double *u) {
         for (int k = 0; k < N; k++) if (fabs(u[k * NU + j]) > size) size = fabs(u[k * NU + j]);
         for (int64_t i = 0; i < b->problem.constraints; i++) {
             const Constraint *con = b->problem.constraint + i;
-            for (int64_t k = 0; con->kind == BOUNDS && k < N; k++) {
+            for (int64_t k = 0; is_kind(con, BOUNDS) && k < N; k++) {
                 if (con->place[k] == NOWHERE) continue;
                 bounds_at(con, k, NX + j, &lower, &upper);
                 if (upper - lower > range) range = upper - lower;

@@ -33,7 +33,7 @@ static void measure_bounds(const Barrier *t, V *size) {
     const Lanes *s = &t->lanes;
     for (int64_t i = 0; i < s->of->constraints; i++) {
         const Constraint *con = s->of->constraint + i;
-        if (con->kind != BOUNDS) continue;
+        if (!is_kind(con, BOUNDS)) continue;
         for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
             V limit = tgco_fabs(at(s->rows[i].bound, &con->bound, con->place[k])[j]);
             int v = con->variable[j];
@@ -111,7 +111,7 @@ static void hold_loose(Barrier *t, I of) {
     measure_costs(t);
     for (int64_t i = 0; i < s->of->constraints; i++) {
         const Constraint *con = s->of->constraint + i;
-        if (con->kind != BOUNDS) continue;
+        if (!is_kind(con, BOUNDS)) continue;
         for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
             int v = con->variable[j];
             int64_t q = row_of(t, i, k) + j;
@@ -426,7 +426,7 @@ static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, 
         const Constraint *con = p->constraint + i;
         for (int64_t j = 0; j < con->knots * con->rows; j++)
             con->lam[e * con->knots * con->rows + j] = LANE(t->z[t->first[i] + j], lane) / LANE(t->scale, lane);
-        if (t->some_out && con->kind == BOUNDS) split_multipliers(t, i, lane);
+        if (t->some_out && is_kind(con, BOUNDS)) split_multipliers(t, i, lane);
     }
     t->how->barrier[e] = LANE(t->mu, lane);
     t->how->error[e] = error;

@@ -22,7 +22,7 @@ static inline int are_a_pair(const Constraint *con, int j, int l) {
 static void measure_room(Barrier *t, I of, int64_t i, int64_t k) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    if (con->kind != BOUNDS) return;
+    if (!is_kind(con, BOUNDS)) return;
     for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++) {
         if (!are_a_pair(con, j, l)) continue;
         V half = SET(-0.5) * (t->c[q + j] + t->c[q + l]);
@@ -41,7 +41,7 @@ static void vary_controls(const Barrier *t, int64_t k, V *du) {
     for (int j = 0; j < NU; j++) du[j] = SET(uneven(k * NU + j));
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
-        if (con->kind != BOUNDS || con->place[k] == NOWHERE) continue;
+        if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
         for (int j = 0; j < con->rows; j++) if (con->variable[j] >= NX) {
             V *own = du + con->variable[j] - NX;
             *own = tgco_if(NOT(t->fixes[row_of(t, i, k) + j]), *own);
@@ -71,7 +71,7 @@ static void find_moved(const Barrier *t, int64_t i, int64_t k, const V *x, const
 static I is_tight(const Barrier *t, I of, int64_t i, int64_t k, int j) {
     const Constraint *con = t->lanes.of->constraint + i;
     V room = SET(t->how->bound_push);
-    if (con->kind == BOUNDS) {
+    if (is_kind(con, BOUNDS)) {
         int v = con->variable[j];
         V at = v < NX ? t->lanes.X[k * NX + v] : t->lanes.U[k * NU + v - NX];
         room *= SET(2.0) * most(tgco_fabs(at), SET(1.0));
@@ -159,7 +159,7 @@ static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const I *moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I tight = is_tight(t, of, i, k, j), is_state = of & NOT(of);
-        if (con->kind == BOUNDS && con->variable[j] < NX) is_state = NOT(is_state);
+        if (is_kind(con, BOUNDS) && con->variable[j] < NX) is_state = NOT(is_state);
         t->out[q + j] |= tight & NOT(moves[j]);
         t->fixes[q + j] &= NOT(of) | moves[j] | NOT(is_state); /* controls that are fixed weren't varied */
     }
@@ -252,7 +252,7 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
     int64_t q = row_of(t, i, k);
     int first = 0, end = u ? S : NX;
 #if DIM > 0
-    if (con->kind != BOUNDS && con->kind != FUNCTION && con->kind != BODY) { first = POSITION; end = POSITION + DIM; }
+    if (is_solid(con)) { first = POSITION; end = POSITION + DIM; }
 #endif
     V own[S], *change = t->across[0], *least_of = t->across[1];
     for (int j = 0; j < con->rows; j++) least_of[j] = SET(INFINITY);
@@ -346,7 +346,7 @@ static void join_multipliers(Barrier *t, I of) {
     const Problem *p = t->lanes.of;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
-        if (con->kind != BOUNDS) continue;
+        if (!is_kind(con, BOUNDS)) continue;
         for (int64_t first = t->first[i]; first < t->first[i] + con->knots * con->rows; first += con->rows)
             for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
                 if (!are_a_pair(con, j, m)) continue;

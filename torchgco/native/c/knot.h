@@ -98,8 +98,8 @@ TGCO_APART V body_terms(const Lanes *s, int64_t i, int64_t k, const V *x, V tota
             own[a] = SET(0.0);
             for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
         }
-        if (ball.con.kind == SPHERES) total = near_terms(s, &ball, k, near, some, total, own, square);
-        else if (ball.con.kind == BOXES) total = boxes_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
+        if (is_kind(&ball.con, SPHERES)) total = near_terms(s, &ball, k, near, some, total, own, square);
+        else if (is_kind(&ball.con, BOXES)) total = boxes_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
         else total = field_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
         if (!g || adds_nothing(own + POSITION, square + POSITION * S)) continue;
         if (count < 0)
@@ -131,7 +131,7 @@ TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, const V *x, const
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     const V *lam = rows->lam + con->place[k] * con->rows;
-    if (con->kind == BOUNDS) {
+    if (is_kind(con, BOUNDS)) {
         for (int j = 0; j < con->rows; j++) {
             int v = con->variable[j];
             V c = bound(con, rows, j, k, x, u), rho;
@@ -142,10 +142,10 @@ TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, const V *x, const
         return total;
     }
 #if DIM > 0
-    if (con->kind == SPHERES) return spheres_terms(s, con, rows, k, x, total, g, H);
-    if (con->kind == BOXES) return boxes_terms(s, con, rows, k, x, total, g, H);
-    if (con->kind == FIELD) return field_terms(s, con, rows, k, x, total, g, H);
-    if (con->kind == BODY) return body_terms(s, i, k, x, total, g, H);
+    if (is_kind(con, SPHERES)) return spheres_terms(s, con, rows, k, x, total, g, H);
+    if (is_kind(con, BOXES)) return boxes_terms(s, con, rows, k, x, total, g, H);
+    if (is_kind(con, FIELD)) return field_terms(s, con, rows, k, x, total, g, H);
+    if (is_kind(con, BODY)) return body_terms(s, i, k, x, total, g, H);
 #endif
     return traced_terms(s, i, k, x, u, lam, total, g, H);
 }

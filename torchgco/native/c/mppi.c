@@ -34,12 +34,12 @@ static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
 /* How many obstacles of a kind each sample touches at knot k. */
 static inline V touched_solids(const Constraint *con, const Rows *rows, int64_t k, const V *x) {
     V count = SET(0.0);
-    if (con->kind == SPHERES) {
+    if (is_kind(con, SPHERES)) {
         for (int j = 0; j < con->rows; j++) {
             V away[DIM], c = sphere(con, rows, j, k, x, away);
             count += tgco_truth(c >= SET(0.0));
         }
-    } else if (con->kind == BOXES) {
+    } else if (is_kind(con, BOXES)) {
         for (int j = 0; j < con->rows; j++)
             if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
     } else if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, 0, 0) >= SET(0.0));
@@ -55,7 +55,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
         const Constraint *con = p->constraint + i;
         if (!q->of->geometric[i] || con->place[k] == NOWHERE) continue;
 #if DIM > 0
-        if (con->kind == BODY) {
+        if (is_kind(con, BODY)) {
             V centers[MAX_ROWS];
             Ball ball;
             ball_centers(&q->s, i, k, x, centers);
@@ -65,7 +65,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
             }
             continue;
         }
-        if (con->kind != FUNCTION) {
+        if (!is_kind(con, FUNCTION)) {
             count += touched_solids(con, q->s.rows + i, k, x);
             continue;
         }

@@ -205,7 +205,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
             }
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
-            if (con->kind != SPHERES || con->moved) continue;
+            if (!is_kind(con, SPHERES) || con->moved) continue;
             const double *o = con->bound.data + e * con->bound.element;
             const double *squares = con->squares.data + e * con->squares.element;
             const double *v = con->velocities.data ? con->velocities.data + e * con->velocities.element : NULL;

@@ -16,7 +16,7 @@ from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes
 from torchgco.native.declarations import defines
 from torchgco.native.includes import C, included, joined
-from torchgco.native.structures import HEADER, constants
+from torchgco.native.structures import HEADER, Kind, constants
 
 LANES = lanes()
 FEW_LANES = 2, 4  # lanes of libraries for few problems: lanes without a problem take time, too
@@ -111,16 +111,19 @@ class Form:
         functions = tuple((i, rows.key) for i, rows in self.functions)
         return self.dynamics.key, p and (p.start, p.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
 
-    def alone(self, declared: str, given: Mapping[str, str]) -> str:
+    def alone(self, kinds: Iterable[Kind], declared: str, given: Mapping[str, str]) -> str:
         """C of a single lane that needs no other unit: the interior point, sweeps and rollouts.
 
         Args:
+            kinds: of the rows that there are; no code for others is left.
             declared: what comes after the structures.
             given: texts that stand for files of these names, such as clock.h.
         """
         generated = [*self._model_code(), curvature_code(self.dynamics, self.functions)]
         texts = {"vectors.h": (C / "scalar.h").read_text(), "constants.h": constants(), "code.h": "\n".join(generated)}
-        sizes = {"REAL": "double", "LANES": 1} | self._sizes | _space(self.position)
+        kept = {"REAL": "double", "LANES": 1, "KINDS": sum(1 << kind for kind in set(kinds))}
+        sizes = kept | self._sizes | _space(self.position)
+        sizes["MAX_ROWS"] = max(sizes["MAX_ROWS"], sizes["DIM"])  # of places of balls, be there none
         files = included("model.c", self._cost_file, "riccati.c", "interior.c", "sweep.h", "rollout.h")
         return joined(defines(sizes) + included("structures.h") + declared + files, given=texts | dict(given))
 
