@@ -58,8 +58,8 @@ def export_c(
 
     Raises:
         InputError: a name that is no word of C, or a problem that C can't serve: several vehicles, a free time or
-            start, horizons, `RateBounds` or `Link`, single precision, code that can't be compiled, violations that only
-            Python measures; a number that can't change. No file is written then.
+            start, horizons, `RateBounds` or `Link`, single precision, code that can't be compiled; a number that can't
+            change. No file is written then.
     """
     check_value(receding, bool, "receding")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in C_WORDS:
@@ -105,11 +105,6 @@ def _served(compiled: Compiled) -> Kept:
         kernels = interior_of(current(for_solvers(problem)))  # raises, or warns, what is missing
         told = "code that reads a problem's numbers in Python" if isinstance(kernels, InteriorEngine) else "functions"
         raise InputError("problem", "functions that C compiles, of its numbers as tensors", told)
-    if not kept.engine.measures:
-        for i, part in enumerate(problem.constraints):
-            if type(part.bare).violation.__qualname__ != "Constraint.violation":
-                raise InputError(f"constraints[{i}]", "rows whose violation C measures", type(part.bare).__name__)
-        raise InputError("constraints", "rows whose violations C measures", "others")
     return kept
 
 

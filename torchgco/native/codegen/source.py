@@ -13,7 +13,7 @@ from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource
 from torchgco.native.codegen.emit import literal, switch
 from torchgco.native.codegen.knot import KnotSource
-from torchgco.native.compiler import Unit, lanes
+from torchgco.native.compiler import Unit, lanes, neurons
 from torchgco.native.declarations import defines
 from torchgco.native.includes import C, included, joined
 from torchgco.native.structures import HEADER, Kind, constants
@@ -121,7 +121,8 @@ class Form:
         """
         generated = [*self._model_code(), curvature_code(self.dynamics, self.functions)]
         texts = {"vectors.h": (C / "scalar.h").read_text(), "constants.h": constants(), "code.h": "\n".join(generated)}
-        kept = {"REAL": "double", "LANES": 1, "KINDS": sum(1 << kind for kind in set(kinds))}
+        texts["wide.h"] = (C / "wide_scalar.h").read_text()
+        kept = {"NET_WIDTH": neurons(), "REAL": "double", "LANES": 1, "KINDS": sum(1 << kind for kind in set(kinds))}
         sizes = kept | self._sizes | _space(self.position)
         sizes["MAX_ROWS"] = max(sizes["MAX_ROWS"], sizes["DIM"])  # of places of balls, be there none
         files = included("model.c", self._cost_file, "riccati.c", "interior.c", "sweep.h", "rollout.h")
