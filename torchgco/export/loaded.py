@@ -157,13 +157,17 @@ class LoadedController:
             self._write(name, value)
         stages = stages_between(later / self.dt) if self._begun else 0.0
         u = np.zeros(self.m)
-        self._functions["step"](
-            ctypes.byref(self._workspace), state.ctypes.data_as(_DOUBLES), ctypes.c_double(stages),
-            ctypes.c_double(math.inf if limit is None else limit), u.ctypes.data_as(_DOUBLES),
-        )  # fmt: skip
+        self.raw_step(state, stages, math.inf if limit is None else limit, u)
         self.t = (self.t + self.period if self._begun else 0.0) if t is None else t
         self._begun = True
         return torch.from_numpy(u)
+
+    def raw_step(self, x: Floats, stages: float, max_seconds: float, u: Floats) -> int:
+        """`NAME_step` itself, with states x (n,) and room for controls u (m,); returns what C returns."""
+        pointers = (array.ctypes.data_as(_DOUBLES) for array in (x, u))
+        state, controls = pointers
+        seconds = ctypes.c_double(stages), ctypes.c_double(max_seconds)
+        return int(self._functions["step"](ctypes.byref(self._workspace), state, *seconds, controls))
 
     def _write(self, name: str, value: Any) -> None:
         if name not in self._numbers:
