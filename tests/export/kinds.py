@@ -69,7 +69,9 @@ def point(*parts: Any, d: int = 2, **more: Any) -> Problem:
     model = FunctionDynamics(
         lambda x, u: torch.cat((x[..., d:], u), -1), 2 * d, d, DT, integrator="rk4", position=slice(0, d)
     )
-    cost = QuadraticCost([1.0] * d + [0.1] * d, [0.1] * d, [50.0] * d + [1.0] * d, x_ref=[1.5, 0.3, 0.2][:d] + [0.0] * d)
+    cost = QuadraticCost(
+        [1.0] * d + [0.1] * d, [0.1] * d, [50.0] * d + [1.0] * d, x_ref=[1.5, 0.3, 0.2][:d] + [0.0] * d
+    )
     return Problem(model, cost, [ControlBounds(-8.0, 8.0), *parts], [-1.0, 0.0, 0.0][:d] + [0.0] * d, N, **more)
 
 
@@ -101,12 +103,24 @@ def valued() -> Problem:
         lambda x, target: 20.0 * (x[..., :2] - target).square().sum(-1) + x[..., 2:].square().sum(-1),
         values={"target": torch.tensor([[1.0, 0.3]]).double()},
     )
-    room = FunctionConstraint(lambda x, width: x[..., 1:2].square() - width.square(), values={"width": torch.tensor([[0.5]]).double()})
+    room = FunctionConstraint(
+        lambda x, width: x[..., 1:2].square() - width.square(), values={"width": torch.tensor([[0.5]]).double()}
+    )
     return Problem(model, cost, [ControlBounds(-8.0, 8.0), room], [-1.0, 0.1, 0.0, 0.0], N)
 
 
 # Of a car among rows of other kinds, from starts that can be solved.
-OTHERS = "smooth", "per problem", "by knot", "dense", "kinks", "overridden expand", "scales itself", "shifted", "bounds by knot"
+OTHERS = (
+    "smooth",
+    "per problem",
+    "by knot",
+    "dense",
+    "kinks",
+    "overridden expand",
+    "scales itself",
+    "shifted",
+    "bounds by knot",
+)
 KINDS: dict[str, Callable[[], Problem]] = {
     "bounds": lambda: car(StateBounds([-np.inf, -1.0, -1.0, 0.0], [np.inf, 1.5, 1.0, 3.4])),
     "no constraints": lambda: Problem(CAR, QuadraticCost([1, 1, 0.1, 0.1], [0.1, 1], [10, 10, 1, 1]), [], START, N),
@@ -127,7 +141,7 @@ KINDS: dict[str, Callable[[], Problem]] = {
     "a network": learned,
     "values": valued,
     "planar": lambda: Problem(
-        Planar(dt=0.05), QuadraticCost([5, 5, 0, 1, 1, 0], [0.1, 0.1], [50, 50, 0, 1, 1, 0], x_ref=[1, 0.4, 0, 0, 0, 0]),
+        Planar(dt=0.05), QuadraticCost([5, 5, 0, 1, 1, 0], [0.1, 0.1], [50, 50, 0, 1, 1, 0], [1, 0.4, 0, 0, 0, 0]),
         [Spheres([[0.2, 0.1]], [0.1], 0.06), ControlBounds(-10.0, 10.0)], [-1.0, 0, 0, 0, 0, 0], 20,
     ),
     **{name: lambda make=make: make().take([0]) for name, make in PROBLEMS.items() if name in OTHERS},

@@ -10,10 +10,9 @@ import torch
 
 import torchgco
 from tests.export.exported import exported, needs_compiler
-from tests.export.kinds import KINDS, N, START, car, point, reference
+from tests.export.kinds import KINDS, START, N, car, point, reference
 from tests.slow import mostly
 from torchgco import (
-    Boxes,
     ControlBounds,
     FreeTime,
     FunctionConstraint,
@@ -67,7 +66,9 @@ def member(numbers: dict[str, np.ndarray], name: str) -> str:
 
 
 def test_only_chosen_numbers_change(tmp_path: Path) -> None:
-    folder = exported(car(Spheres([[2.5, 0.6]], [0.3], 0.2)), tmp_path, "x_ref", "constraints[0].upper", "vehicle_radius")
+    folder = exported(
+        car(Spheres([[2.5, 0.6]], [0.3], 0.2)), tmp_path, "x_ref", "constraints[0].upper", "vehicle_radius"
+    )
     c = load_c(folder)
     assert {name: value.shape for name, value in c.numbers.items()} == {
         "x_ref": (N + 1, 4), "upper": (2,), "vehicle_radius": (1,)
@@ -92,7 +93,7 @@ REFUSED = {
     "a word of C": (point, {"name": "double"}, "word of C"),
     "an unknown number": (point, {"changes": ["nothing"]}, "nothing"),
     "x0": (point, {"changes": ["x0"]}, "x0"),
-    "a computed number": (lambda: point(Boxes([[0.0, 0.6]], [[0.3, 0.2]], 0.1)), {"changes": ["half_sizes"]}, "half_sizes"),
+    "a computed number": (KINDS["boxes"], {"changes": ["half_sizes"]}, "half_sizes"),
     "a number": (lambda: 3, {}, "a Problem"),
 }  # fmt: skip
 

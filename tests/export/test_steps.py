@@ -32,7 +32,9 @@ def plant(x: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
 
 
 def discs() -> Problem:
-    return car(Spheres([[6.0, 1.6], [12.0, -1.0]], [0.5, 0.5], 0.3), StateBounds(-np.inf, [np.inf, np.inf, np.inf, 4.5]))
+    return car(
+        Spheres([[6.0, 1.6], [12.0, -1.0]], [0.5, 0.5], 0.3), StateBounds(-np.inf, [np.inf, np.inf, np.inf, 4.5])
+    )
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +64,8 @@ def test_200_periods_have_the_bits_of_python(folder: Path, period: float, push: 
 @pytest.mark.filterwarnings("ignore::torchgco.StartWarning", "ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("seed", [0, 1])
 def test_pushed_into_discs_it_solves_what_python_solves_from_plans(folder: Path, seed: int) -> None:
-    """Pushes of 0.15 m and m/s: bits are equal until a solve fails. Python then has ways to come to rest, which C hasn't;
-    what both find after that is the same trajectory, to the solver's tolerance."""
+    """Pushes of 0.15 m and m/s: bits are equal until a solve fails. Python then has ways to come to rest, which C
+    hasn't."""
     c, mpc = pair(folder)
     x, draws, equal, failed = np.array([0.0, 0.0, 0.0, 3.0]), np.random.default_rng(seed), True, 0
     for k in range(200):
@@ -88,7 +90,9 @@ def test_a_late_step_holds_the_plan_with_feedback(folder: Path) -> None:
     for age in (1, 2):
         u = c.step(x, max_seconds=1e-9)
         want = U[age] + K[age] @ (torch.from_numpy(x) - X[age])
-        torch.testing.assert_close(u, want.clamp(torch.tensor([-3.0, -0.5]), torch.tensor([3.0, 0.5])), rtol=0, atol=1e-12)
+        torch.testing.assert_close(
+            u, want.clamp(torch.tensor([-3.0, -0.5]), torch.tensor([3.0, 0.5])), rtol=0, atol=1e-12
+        )
         assert c.held and c.status == Status.TIME_LIMIT and c.workspace.age == age
     assert not (c.step(x), c.held)[1] and c.status == Status.CONVERGED
 

@@ -16,15 +16,15 @@ from torchgco.constraints.norms import within_norms
 from torchgco.export.files import Exported, write_files
 from torchgco.export.numbers import changing
 from torchgco.export.source import solver_source
+from torchgco.kernels import current, interior_of
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
-from torchgco.kernels import current, interior_of
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
 
-C_WORDS = frozenset(
+C_WORDS = (
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
-    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while".split()
+    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while"
 )
 
 
@@ -62,7 +62,7 @@ def export_c(
             change. No file is written then.
     """
     check_value(receding, bool, "receding")
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in C_WORDS:
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in re.findall(r"\w+", C_WORDS):
         raise InputError("name", "a word of C, such as controller", shown(name))
     if isinstance(problem, Compiled):
         changes = problem.changes if changes is None else changes

@@ -96,7 +96,8 @@ def _header(exported: Exported) -> str:
         for status in Status
     ]
     members = [
-        f"    double {m.name}[{m.size}]; /* {' x '.join(map(str, m.shape))}: {m.full} */" for m in exported.changing.members
+        f"    double {m.name}[{m.size}]; /* {' x '.join(map(str, m.shape))}: {m.full} */"
+        for m in exported.changing.members
     ]
     lam = [f"    double lam_{i}[{count}];" for i, count in exported.solver.multipliers.items()]
     return _filled(
@@ -122,7 +123,9 @@ def _code(exported: Exported) -> str:
 
 def _periods(exported: Exported) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
     """States, controls and iterations of periods in Python, as long as all converge."""
-    compiled = compile(exported.compiled.now, "interior_point", ["x0"], exported.receding, exported.compiled.interior.tolerance)
+    compiled = compile(
+        exported.compiled.now, "interior_point", ["x0"], exported.receding, exported.compiled.interior.tolerance
+    )
     bounds, N = compiled.problem.control_bounds, compiled.problem.N
     x, draws = compiled.problem.x0[0].numpy().copy(), np.random.default_rng(0)
     first = x

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -157,7 +158,9 @@ def _probed(kept: Kept, number: Number, first: int) -> dict[int, Copies] | None:
         if any(value not in places for value in values):
             return None
         if changed:
-            found[address] = Copies(changed, [first + places[value] for value in values], bounds=number.none is not None)
+            found[address] = Copies(
+                changed, [first + places[value] for value in values], bounds=number.none is not None
+            )
     return found or None
 
 
@@ -196,7 +199,8 @@ def _add_radii(kept: Kept, members: list[Member], copied: dict[int, Copies]) -> 
 
 def fixed_radii(kept: Kept, address: int) -> tuple[Tensor, Tensor]:
     """Radii (M,) of spheres and that of the vehicle (1,), of the squares at an address."""
-    for part, own in zip(kept.problem.constraints, kept._numbers, strict=True):
+    parts: Sequence[Any] = kept.problem.constraints
+    for part, own in zip(parts, kept._numbers, strict=True):
         if "squares" in own and own["squares"].kept[0].data_ptr() == address:
             radius = part.vehicle_radius[:1]
             return part.inflated_radii[0] - radius, radius

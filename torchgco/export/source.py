@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bounds import LOOSE
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
+from torchgco.constraints.bounds import LOOSE
 from torchgco.export.numbers import Changing, Copies, fixed_radii
 from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
@@ -137,7 +137,9 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
     K = len(problem.constraints)
     rows = [writer.body(row) for row in _constraints(kept)]
     fields = writer.body(kept.packed, constraint="b->constraints", arena="&b->arena")
-    lines = _bound(rows, fields, writer.body(how, of="&b->problem"), changing, made, _rest(kept, changing, writer, rest))
+    lines = _bound(
+        rows, fields, writer.body(how, of="&b->problem"), changing, made, _rest(kept, changing, writer, rest)
+    )
     count = _count(kept)
     need = count + 2 + (K + 1) * (POINTERS_OF_ROWS + 2)
     sizes = problem.N + 1, problem.N, problem.n, problem.m
@@ -162,7 +164,7 @@ def _constraints(kept: Kept) -> list[c.Constraint]:
 
 def _kinds(kept: Kept) -> set[c.Kind]:
     """The kinds of the constraints, and of the balls of bodies."""
-    parts = kept.problem.constraints
+    parts: Sequence[Any] = kept.problem.constraints
     balls = (part.balls[0] for part in parts if kind_of(part) is c.Kind.BODY)
     return {kind_of(part) for part in (*parts, *balls)}
 
@@ -208,14 +210,16 @@ def _made(kept: Kept, j: int, address: int, copies: Copies) -> Made:
     (base,) = (tensor for place, tensor in kept_by(kept.how).items() if place == address)
     size = base.numel()
     tables = [table(f"static const double base_{j}[]", base)]
-    tables += [table(f"static const int32_t {name}_{j}[]", map(int, values)) for name, values in
-               (("to", copies.to), ("source", copies.source))]  # fmt: skip
+    places = {"source": copies.source} | ({} if copies.squares else {"to": copies.to})
+    tables += [table(f"static const int32_t {name}_{j}[]", map(int, values)) for name, values in places.items()]
     lines = [f"    memcpy(b->made_{j}, base_{j}, sizeof base_{j});"]
     if copies.squares:
         radii, radius = fixed_radii(kept, address)
         tables += [table(f"static const double fixed_{j}[]", torch.cat((radii, radius)))]
         lines.append(f"    for (int i = 0; i < {size}; i++)")
-        lines.append(f"        fill_square(b->made_{j} + i, numbers, source_{j} + 2 * i, fixed_{j}[i], fixed_{j}[{size}]);")
+        lines.append(
+            f"        fill_square(b->made_{j} + i, numbers, source_{j} + 2 * i, fixed_{j}[i], fixed_{j}[{size}]);"
+        )
     else:
         to = f"b->made_{j}[to_{j}[i]]"
         lines.append(f"    for (int i = 0; i < {len(copies.to)}; i++) {to} = numbers[source_{j}[i]];")
@@ -233,9 +237,7 @@ def _rest(kept: Kept, changing: Changing, writer: Writer, rest: Tensor) -> str:
     return writer.table(rest)
 
 
-def _bound(
-    rows: list[str], problem: str, how: str, changing: Changing, made: list[Made], rest: str
-) -> str:
+def _bound(rows: list[str], problem: str, how: str, changing: Changing, made: list[Made], rest: str) -> str:
     """The function `bind`, which fills the structures that the solver reads."""
     lines = [
         SQUARES if any(copies.squares for copies in changing.copied.values()) else "",
@@ -261,7 +263,7 @@ def _bound(
 
 
 SQUARES = """
-/* The square of a radius and the vehicle's, of those of the two that may change; what is exported stays to the last bit. */
+/* The square of a radius and the vehicle's, of which one may change; what was exported stays to the last bit. */
 static void fill_square(double *square, const double *numbers, const int32_t *source, double radius, double vehicle) {
     const double *exported = (const double *)(const void *)&exported_numbers;
     double r = source[0] < 0 ? radius : numbers[source[0]], v = source[1] < 0 ? vehicle : numbers[source[1]];

@@ -147,7 +147,10 @@ def _parser() -> RunParser:
         description="The trajectories of a study as CSV, or as bags of ROS 2; or the controller of a problem as C.",
     )
     parser.add_argument(
-        "run", metavar="RUN", nargs="+", help="the folder of a finished study; with --c also KEY=VALUE as torchgco takes them"
+        "run",
+        metavar="RUN",
+        nargs="+",
+        help="the folder of a finished study; with --c also KEY=VALUE as torchgco takes them",
     )
     parser.add_argument(
         "--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN; of KEY=VALUE a folder NAME"
@@ -159,9 +162,14 @@ def _parser() -> RunParser:
     parser.add_argument("--solver", metavar="NAME", nargs="+", default=[], help="default: all of the study")
     kinds = list(get_args(Storage))
     parser.add_argument("--bag", metavar="KIND", choices=kinds, help=f"bags of ROS 2 instead: {' or '.join(kinds)}")
-    parser.add_argument("--c", metavar="NAME", help="instead the C of this name that controls the first, or the only --layout")
     parser.add_argument(
-        "--changes", metavar="NAME", nargs="*", help="numbers that the C may be given between steps; default: all that can"
+        "--c", metavar="NAME", help="instead the C of this name that controls the first, or the only --layout"
+    )
+    parser.add_argument(
+        "--changes",
+        metavar="NAME",
+        nargs="*",
+        help="numbers that the C may be given between steps; default: all that can",
     )
     return parser
 
