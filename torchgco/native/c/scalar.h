@@ -35,8 +35,8 @@ static inline V tgco_copysign(V a, V b) { return TGCO_MATH(copysign)(a, b); }
 
 /* Bits of numbers, as of vectors.h. */
 #if TGCO_IS_DOUBLE
-typedef int64_t Whole;
-typedef uint64_t Bits;
+typedef long long Whole; /* of 64 bits, whatever counters have */
+typedef unsigned long long Bits;
 #else
 typedef int32_t Whole;
 typedef uint32_t Bits;
