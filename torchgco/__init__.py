@@ -22,6 +22,7 @@ from torchgco import presets, sensitivity
 from torchgco.api import compare, plot, show, solve
 from torchgco.base.errors import (
     ContactWarning,
+    DeviceWarning,
     GuidanceWarning,
     HorizonWarning,
     InputError,
@@ -100,7 +101,7 @@ __all__ = [  # noqa: RUF022
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
     "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning", "ScaleWarning",
-    "StartWarning", "StepWarning", "TraceWarning",
+    "StartWarning", "StepWarning", "TraceWarning", "DeviceWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

@@ -23,13 +23,11 @@ from torchgco.problem.problem import Problem
 SHARES = -1.0, -0.5, 0.5, 1.0  # of the way from a control at rest to its lower and its upper bound
 MOST_TOGETHER = 4  # controls, of which all ends of the bounds are combined: 16 candidates
 BRAKES_AFTER = 0.0, 0.125, 0.25  # of the horizon, after which candidates begin to brake
-TILTS_WITHIN = (
-    0.25  # of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these
-)
+# Of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these.
+TILTS_WITHIN = 0.25
 PROBE = 1e-4  # of a control's range: by how much a difference moves it
-SMALLEST_SQUARE = (
-    1e-9  # of the squares' sum: no direction counts in which the speed changes by less than their square root
-)
+# Of the squares' sum: no direction counts in which the speed changes by less than their square root.
+SMALLEST_SQUARE = 1e-9
 Limits = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # of stages, after the controls of those before
 
 
@@ -90,9 +88,8 @@ def _candidates(problem: Problem, rest: Tensor, before: Tensor | None) -> tuple[
         if m <= MOST_TOGETHER:
             shares += [rest.new_tensor(signs) for signs in product((-1.0, 1.0), repeat=m)]
         bases += [rest + share.clamp(min=0.0) * up - share.clamp(max=0.0) * down for share in shares]
-    later = (
-        BRAKES_AFTER if problem.along is problem.dynamics else BRAKES_AFTER[:1]
-    )  # a stage is of one model for all candidates
+    # Where models differ by stage, one stage is of one model for all candidates: they brake at once.
+    later = BRAKES_AFTER if problem.along is problem.dynamics else BRAKES_AFTER[:1]
     delays = torch.tensor([int(share * problem.N) for share in later]).repeat_interleave(len(bases))
     return torch.stack(bases, dim=1).repeat(1, len(later), 1, 1), delays
 

@@ -44,13 +44,18 @@ def settings_of(configuration: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a resolved configuration that decides results, with the settings of all solvers that fly."""
+    """The part of a resolved configuration that decides results, with the settings of all solvers that fly.
+
+    The rows of a solver's table work in their order, of which `digest` takes no notice: it stands as a list.
+    """
+    passes = {name: settings.get("passes") for name, settings in solvers.items()}
     return {
         "scenario": configuration["scenario"],
         "model": {"vehicle": configuration["model"]["vehicle"]},
         "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
         "study": {"solvers": list(solvers)},
         "solvers": dict(solvers),
+        "order": {name: list(rows) for name, rows in passes.items() if isinstance(rows, Mapping)},
         **closed_loop(configuration),
     }
 

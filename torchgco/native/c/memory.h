@@ -12,6 +12,9 @@ static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t elem
         for (int64_t i = 0; i < from->size; i++) LANE(to[k * from->size + i], lane) = source[k * from->knot + i];
 }
 
+/* Where the numbers of problem e are. */
+static inline int64_t numbers_of(const Problem *p, int64_t e) { return p->numbers ? p->numbers[e] : e; }
+
 /* The same of one knot. */
 static void fill_stage(V *to, const Array *from, int64_t k, int lane, int64_t element) {
     for (int64_t i = 0; i < from->size; i++) LANE(to[i], lane) = from->data[element * from->element + k * from->knot + i];
@@ -82,6 +85,7 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
     int64_t N = p->N;
     s->element[lane] = e;
     for (int i = 0; i < NX; i++) LANE(s->X[i], lane) = p->X[e * (N + 1) * NX + i];
+    e = numbers_of(p, e);
     fill(s->parameters, &p->parameters, N, lane, e);
     for (int i = 0; i < COST_ARRAYS; i++) fill(s->cost_data[i], p->cost_data + i, N, lane, e);
     for (int64_t i = 0; i < p->constraints; i++) {

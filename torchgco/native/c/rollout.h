@@ -9,13 +9,13 @@ TGCO_INLINE int roll_out(const Problem *p, int64_t first, int64_t last, int feed
     for (int64_t e = first; e < last; e += LANES) {
         for (int l = 0; l < LANES; l++) {
             int64_t element = e + l < last ? e + l : e;
-            fill_stage(parameters, &p->parameters, 0, l, element);
+            fill_stage(parameters, &p->parameters, 0, l, numbers_of(p, element));
             for (int i = 0; i < NX; i++) LANE(x[i], l) = p->X[element * (N + 1) * NX + i];
         }
         for (int64_t k = 0; k < N; k++) {
             for (int l = 0; l < LANES; l++) {
                 int64_t element = e + l < last ? e + l : e;
-                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, element);
+                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, numbers_of(p, element));
                 double *X = p->X + (element * (N + 1) + k) * NX, *U = p->U + (element * N + k) * NU;
                 const double *K = feedback ? p->gains + (element * N + k) * NU * NZ : NULL;
                 for (int j = 0; j < NU; j++) {

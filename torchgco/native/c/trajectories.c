@@ -1,4 +1,4 @@
-/* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions, gains,
+/* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions,
    rollouts, `lift`, and inner solves. They return 0 without memory. */
 #include "lifted.h"
 #include "rollout.h"
@@ -13,27 +13,16 @@ static void put_values(Lanes *s, int64_t e, int used) {
 }
 int tgco_value(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_values); }
 
-/* One backward pass along given trajectories: gains (E, N, NU, NZ) and the two sums of the expected change. */
-static void put_gains(Lanes *s, int64_t e, int used) {
-    const Problem *p = s->of;
-    int64_t size = p->N * NU * NZ;
-    V linear, squares, lowest;
-    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
-    V quadratic = -linear - s->mu_r * squares;
-    for (int l = 0; l < used; l++) {
-        p->cost[e + l] = LANE(linear, l);
-        p->merit[e + l] = LANE(quadratic, l);
-        p->status[e + l] = LANE(lowest, l) > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
-        for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = LANE(s->G[i], l);
-    }
-}
-int tgco_gains(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_gains); }
-
 /* Rollout of U from the first knot of X. */
 int tgco_open_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 0); }
 
 /* Rollout of U + K (x - X) from the first knot of X, in place of X and U; gains (E, N, NU, NZ), of which K is used. */
 int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 1); }
+
+/* The same, and J_var and L_M along it. */
+int tgco_begin(const Problem *p, int64_t first, int64_t last) {
+    return roll_out(p, first, last, 0) && tgco_value(p, first, last);
+}
 
 /* Gradients (E, N+1, S) and upper triangles of the Hessians (E, N+1, S, S) of all terms. */
 static void put_expansion(Lanes *s, int64_t e, int used) {
@@ -59,6 +48,23 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
     int64_t *number = in_order(first, last);
     if (!number || !start(s, p)) { free(number); return 0; }
     inner_solves(s, number, last - first);
+    free(number);
+    finish(s);
+    return 1;
+}
+
+/* The same from the rollout of U, where that is finite. */
+int tgco_descend(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    int64_t size = (p->N + 1) * NX, count = 0, *number = in_order(first, last);
+    if (!number || !tgco_begin(p, first, last) || !start(s, p)) { free(number); return 0; }
+    for (int64_t e = first; e < last; e++) {
+        double sum = 0 * p->merit[e];
+        for (int64_t i = 0; i < size; i++) sum += 0 * p->X[e * size + i];
+        if (sum == 0) number[count++] = e;
+        else p->status[e] = NON_FINITE;
+    }
+    if (count) inner_solves(s, number, count);
     free(number);
     finish(s);
     return 1;

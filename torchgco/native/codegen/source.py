@@ -69,7 +69,7 @@ class Library:
 
 
 PASS_SOURCES = "model.c", "passes.c"
-SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c"))
+SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c", "verdict.c"))
 SAMPLER = Library(("model.c",), (), ("mppi.c",))
 # The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
 INTERIOR = Library(PASS_SOURCES, ("riccati.c",), ("interior.c", "interior_kkt.c"))
