@@ -36,7 +36,7 @@ class Numbers(Mapping[str, Floats]):
         number = self._by_name.get(name)
         if number is None:
             alike = [full for full in self._all if _short(full) == name]
-            raise InputError("numbers", f"one of {', '.join(alike or map(self._named, self._all))}", name)
+            raise InputError("numbers", f"one of {', '.join(alike or map(self.short, self._all))}", name)
         return number
 
     def named(self, *mappings: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -80,11 +80,12 @@ class Numbers(Mapping[str, Floats]):
         return len(self._all)
 
     def __repr__(self) -> str:
-        rows = [(self._named(name), "x".join(map(str, n.shape)), name) for name, n in self._all.items()]
+        rows = [(self.short(name), "x".join(map(str, n.shape)), name) for name, n in self._all.items()]
         widths = [max(len(row[i]) for row in rows) for i in (0, 1)]
         return "\n".join(f"{a:{widths[0]}}  {b:{widths[1]}}  {c}" for a, b, c in [("name", "shape", "where"), *rows])
 
-    def _named(self, name: str) -> str:
+    def short(self, name: str) -> str:
+        """The shortest name of the number with this full name."""
         short = _short(name)
         return short if self._by_name.get(short) is self._all[name] else name
 
