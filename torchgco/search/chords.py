@@ -78,7 +78,7 @@ class ClearChords(Row):
 
         limit = search.solver.violation_tolerance
         rounds = self.rounds * (IN_MAPS if has_maps(search.call.problem) else 1)
-        best.restore(*cleared(search.call, best.end.best, rounds, limit, once))
+        best.restore(*cleared(search.call, best.end.best, rounds, limit, once, best.clearance))
         _along_other_ways(search)
 
     def _continued(
@@ -115,7 +115,9 @@ class ClearChords(Row):
 Once = Callable[[Tensor, Call, Iterate, Tensor], tuple[Tensor, Tensor]]
 
 
-def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) -> tuple[Tensor, Tensor]:
+def cleared(
+    call: Call, best: Iterate, rounds: int, limit: float, once: Once, clearance: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Solve the feasible problems of a call that touch an obstacle between two knots again, among larger obstacles.
 
     Args:
@@ -124,11 +126,12 @@ def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) ->
         once: solves problems `rows` (b,), by a call with obstacles that have grown for them, from their trajectories,
             where more clearance than `least` (b,) is wanted. Returns where it has put new ones, and the clearances
             (b,) that it has found.
+        clearance: `path_clearance` (B,) of `best`, where it is known.
 
     Returns:
         The problems that touched, and whether they still do.
     """
-    clearance = path_clearance(call.problem, best.X, best.U)
+    clearance = path_clearance(call.problem, best.X, best.U) if clearance is None else clearance.clone()
     by, now = torch.zeros_like(clearance), clearance.clone()
     rows = touching = ((best.violation <= limit) & (clearance < 0)).nonzero().flatten()
     for _ in range(rounds):
