@@ -25,6 +25,7 @@ from torchgco.base.errors import (
     GuidanceWarning,
     HorizonWarning,
     InputError,
+    RefusalWarning,
     ScaleWarning,
     StartWarning,
     StepWarning,
@@ -97,8 +98,8 @@ __all__ = [  # noqa: RUF022
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
-    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning", "ScaleWarning",
-    "StartWarning", "StepWarning", "TraceWarning",
+    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning",
+    "RefusalWarning", "ScaleWarning", "StartWarning", "StepWarning", "TraceWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

@@ -31,6 +31,7 @@ from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times, guessing_times
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.refusals import spared
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
 from torchgco.sensitivity import asks_for_gradients, attached, check_smoothing
@@ -130,7 +131,8 @@ def solve(
     name = _refuse(misplaced, problem, solver)
     X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
-    (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
+    problem, U0 = spared(problem, lambda problem: _start(problem, warm, solver, U0))
+    multipliers = None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
     more: dict[str, Any] = {"callback": watcher} if watcher.shows else {}
@@ -139,8 +141,9 @@ def solve(
         watcher.end(found)
     finally:
         watcher.close()
+    judged = problem if found.account is None else found.account.problem or problem  # whose code may refuse states
     found = replace(found, account=found.account and found.account.asked(asked, name))
-    _warn(problem, found, warm is None)
+    _warn(judged, found, warm is None)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
