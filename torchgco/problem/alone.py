@@ -73,8 +73,17 @@ def check_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
             by_row = called(field, wanted, values, alone, x, u, True)
             for at_once in (True, False):
                 together = called(field, wanted, values, whole, x, u, at_once)
-                if together.shape != by_row.shape or bool((wrong := unlike(together, by_row)).any()):
+                wrong = torch.ones_like(by_row, dtype=torch.bool)
+                if together.shape == by_row.shape:
+                    # Of a problem of which some rows are refused, all may count as lost where they are asked together.
+                    lost = ~(_is_finite(together) | _is_finite(by_row))
+                    wrong = unlike(together, by_row) & ~lost.view(-1, *[1] * (by_row.dim() - 1))
+                if bool(wrong.any()):
                     raise InputError(field, wanted, _told(together, by_row, wrong, rows))
+
+
+def _is_finite(values: Tensor) -> Tensor:
+    return torch.isfinite(values).reshape(len(values), -1).all(-1)
 
 
 def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values]]:
