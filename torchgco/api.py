@@ -132,18 +132,16 @@ def solve(
     X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
     solver = _solver(solver, problem, check_value(record, bool, "record"))
     problem, U0 = spared(problem, lambda problem: _start(problem, warm, solver, U0))
-    multipliers = None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-    more: dict[str, Any] = {"callback": watcher} if watcher.shows else {}
+    more: dict[str, Any] = {"warm": warm and warm.multipliers} | ({"callback": watcher} if watcher.shows else {})
     try:
-        found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds, X0=X0, **more)
+        found = solver.solve(problem, U0, seed=seed, ids=ids, max_seconds=max_seconds, X0=X0, **more)
         watcher.end(found)
     finally:
         watcher.close()
-    judged = problem if found.account is None else found.account.problem or problem  # whose code may refuse states
+    _warn(problem, found, warm is None)
     found = replace(found, account=found.account and found.account.asked(asked, name))
-    _warn(judged, found, warm is None)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
@@ -290,6 +288,8 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
 def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
     """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    if solution.account is not None:
+        problem = solution.account.problem or problem  # whose code may refuse states
     if cold:
         _warn_of_horizon(problem, solution, claims)
     _warn_of_scale(problem, solution, claims)

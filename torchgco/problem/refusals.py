@@ -172,10 +172,10 @@ class _Sparing:
 
 class _Model(_Sparing, Dynamics):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
-        return self._spared(lambda part, x, u: super(_Model, part).field(x, u), _lost, x, u, splits=self._is_one)
+        return self._spared(lambda part, x, u: super().field(x, u), _lost, x, u, splits=self._is_one)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
-        return self._spared(lambda part, x, u: super(_Model, part).step(x, u), _lost, x, u, splits=self._is_one)
+        return self._spared(lambda part, x, u: super().step(x, u), _lost, x, u, splits=self._is_one)
 
     @property
     def _is_one(self) -> bool:
@@ -185,32 +185,32 @@ class _Model(_Sparing, Dynamics):
 
 class _Price(_Sparing, Cost):
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        evaluate = lambda part, x, u: super(_Price, part).stage(x, u, k)
+        evaluate = lambda part, x, u: super().stage(x, u, k)
         return self._spared(evaluate, _lost_number, x, u, splits=not isinstance(k, Tensor))
 
     def terminal(self, x: Tensor) -> Tensor:
-        return self._spared(lambda part, x: super(_Price, part).terminal(x), _lost_number, x)
+        return self._spared(lambda part, x: super().terminal(x), _lost_number, x)
 
 
 class _Total(_Price):
     def total(self, X: Tensor, U: Tensor) -> Tensor:
-        evaluate = lambda part, X, U: super(_Total, part).total(X, U)
+        evaluate = lambda part, X, U: super().total(X, U)
         return self._spared(evaluate, lambda X: _lost_number(X[:, 0]), X, U, splits=False)
 
 
 class _Function(_Sparing, FunctionConstraint):
     def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
-        p, evaluate = self.rows_shape[1], lambda part, *z: super(_Function, part).rows_at(k, *z)
+        p, evaluate = self.rows_shape[1], lambda part, *z: super().rows_at(k, *z)
         lost = lambda z: _lost(z[..., :1]).expand(*z.shape[:-1], p)
         return self._spared(evaluate, lost, *arguments, splits=isinstance(k, int))
 
 
 class _Rows(_Sparing, Constraint):
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._spared(lambda part, X, U: super(_Rows, part).value(X, U), self._lost, X, U, splits=False)
+        return self._spared(lambda part, X, U: super().value(X, U), self._lost, X, U, splits=False)
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._spared(lambda part, X, U: super(_Rows, part).violation(X, U), self._lost, X, U, splits=False)
+        return self._spared(lambda part, X, U: super().violation(X, U), self._lost, X, U, splits=False)
 
     def _lost(self, X: Tensor) -> Tensor:
         return _lost(X[:, :1, :1]).expand(1, *self.rows_shape)

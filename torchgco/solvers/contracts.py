@@ -202,9 +202,8 @@ class Solver(Brief, Checked):
                 mixes knots or problems.
         """
         check_untransformed("solve")
-        problem, ends = current_problem(problem), None
-        if check_value(max_seconds, Seconds | None, "max_seconds") is not None:
-            ends = clock.seconds() + max_seconds
+        problem, limit = current_problem(problem), check_value(max_seconds, Seconds | None, "max_seconds")
+        ends = None if limit is None else clock.seconds() + limit
 
         def run(problem: Problem) -> Solution:
             left = None if ends is None else max(LEAST_SECONDS, ends - clock.seconds())
