@@ -20,7 +20,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchgco.base.errors import InputError, RefusalWarning, first_line
 from torchgco.base.shapes import MISTAKES
 from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.constraints.base import Constraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.problem.problem import Problem
@@ -101,8 +101,7 @@ def with_looking(problem: Problem, change: Callable[[Any, str, tuple[int, int]],
     rows = list(problem.constraints)
     for i, constraint in enumerate(first.constraints):
         if looks(rows[i], constraint.value, X, U):
-            is_function = isinstance(constraint, FunctionConstraint)
-            field = f"{constraint.name}.function" if is_function else f"constraints[{i}]"
+            field = f"{getattr(constraint, 'name', '')}.function" if _is_function(constraint) else f"constraints[{i}]"
             rows[i] = change(rows[i], field, problem.row_shapes[i])
             parts["constraints"] = tuple(rows)
     return problem._with(parts, problem.known) if parts else problem
@@ -117,12 +116,17 @@ def sparing_part(part: Any, field: str, shape: tuple[int, int], refusals: Refusa
     elif isinstance(part, Cost):
         mixin = _Price if type(part).total is Cost.total else _Total
     else:
-        mixin = _Function if isinstance(part, FunctionConstraint) else _Rows
+        mixin = _Function if _is_function(part) else _Rows
     own = {"refusals": refusals, "field_name": field, "rows_shape": shape}
     kind = type(type(part).__name__, (mixin, type(part)), {"__module__": type(part).__module__, **own})
     made = copy.copy(part)
     object.__setattr__(made, "__class__", kind)
     return made
+
+
+def _is_function(part: Any) -> bool:
+    """Whether rows are those of a function of a knot, which may be asked for any number of knots."""
+    return hasattr(part, "rows_at")
 
 
 def _looks(again: bool, part: Any, values: Callable[..., Tensor], *arguments: Tensor) -> bool:
@@ -198,9 +202,9 @@ class _Total(_Price):
         return self._spared(evaluate, lambda X: _lost_number(X[:, 0]), X, U, splits=False)
 
 
-class _Function(_Sparing, FunctionConstraint):
+class _Function(_Sparing, Constraint):
     def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
-        p, evaluate = self.rows_shape[1], lambda part, *z: super().rows_at(k, *z)
+        p, evaluate = self.rows_shape[1], lambda part, *z: super().rows_at(k, *z)  # type: ignore[misc]
         lost = lambda z: _lost(z[..., :1]).expand(*z.shape[:-1], p)
         return self._spared(evaluate, lost, *arguments, splits=isinstance(k, int))
 
