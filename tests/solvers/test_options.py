@@ -36,7 +36,7 @@ CHANGES = {
 # `slots` changes no result (test_batch_contract); test_ilqr tests the line search, test_restarts replaced iterates,
 # test_reported_figures violations by the kernels.
 ELSEWHERE = {
-    (AugmentedLagrangian, "slots"), (AugmentedLagrangian, "by_kernels"), (ILQR, "line_search"),
+    (AugmentedLagrangian, "slots"), (ILQR, "line_search"),
     (GCO, "start_from_sample"),
 }  # fmt: skip
 PLACES = {

@@ -59,6 +59,10 @@ class GuidanceWarning(UserWarning):
     """Guidance, or a part of it, can't be used for a problem, which is solved without it."""
 
 
+class DeviceWarning(UserWarning):
+    """A problem of another device is solved on the CPU, in a fraction of the time."""
+
+
 class StartWarning(UserWarning):
     """A start that may be free is held at its guess: the solver can't choose it."""
 

@@ -55,8 +55,10 @@ def _better_guesses(search: Search) -> tuple[Tensor, Iterate]:
     """
     call, end, limit = search.call, search.best.end, search.solver.violation_tolerance
     problem, best = call.problem, end.best
-    X, sound = open_loop(problem, call.U0), is_sound(problem, best, limit)
+    X, sound = open_loop(problem, call.U0), is_sound(problem, best, limit, search.best.clearance)
     rows = ((~sound | ~_falls_short(problem, X, best.X)) & (end.status != Status.INVALID_START)).nonzero().flatten()
+    if rows.numel() == 0:
+        return rows, best
     asked, X, U, old = problem.take(rows), X[rows], call.U0[rows], take(best, rows)
     cost, violation = asked.cost.total(X, U), measured(asked, X, U)
     cheaper = cost < old.cost - _worth(search, violation, old.violation) * old.cost.abs()

@@ -21,7 +21,7 @@ from torchgco.base.shapes import check_shape, check_tensor, check_untransformed,
 from torchgco.base.status import Status
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
-from torchgco.kernels import cost_unit, current, interior_of, kernels_of, used
+from torchgco.kernels import copied_to, cost_unit, current, interior_of, kernels_of, on_cpu, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.alone import check_rows
@@ -203,6 +203,11 @@ class Solver(Brief, Checked):
         """
         check_untransformed("solve")
         problem, limit = current_problem(problem), check_value(max_seconds, Seconds | None, "max_seconds")
+        if self.kernels is None and (there := on_cpu(problem)) is not None:
+            U0, ids, warm, X0 = copied_to((U0, ids, warm, X0), there.x0)
+            solution = self.solve(there, U0, seed, ids, warm, callback, max_seconds, X0)
+            account = solution.account and solution.account.asked(problem, None)
+            return replace(copied_to(solution, problem.x0), account=account)
         ends = None if limit is None else clock.seconds() + limit
 
         def run(problem: Problem) -> Solution:
@@ -311,7 +316,8 @@ class Solver(Brief, Checked):
 
     def prepare(self, problem: Problem) -> Solver:
         """The solver with everything built that this batch needs, so that nothing is compiled beside the solve."""
-        whole = for_solvers(current_problem(problem), self.joins_knots)
+        problem = current_problem(problem)
+        whole = for_solvers(on_cpu(problem) or problem, self.joins_knots)
         with computing_on(whole.x0.device):
             self.announce(whole)
             if whole.B > 0 and kernels_of(whole) and whole.known.expects_interior:
