@@ -134,9 +134,8 @@ def solve(
     if solver.kernels is None and (there := on_cpu(problem)) is not None:
         problem, (U0, ids, warm, X0) = there, copied_to((U0, ids, warm, X0), there.x0)
     problem, U0 = spared(problem, partial(_start, warm, solver, U0))
-    multipliers, called = None if warm is None else warm.multipliers, name or type(solver).__name__
-    how = isinstance(solver, Restarts), check_value(verbose, bool | None, "verbose")
-    watcher = Watcher(called, problem.B, *how)
+    multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
+    watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
     try:
         found = solver.solve(problem, U0, seed, ids, multipliers, watcher.callback, max_seconds, X0)
         watcher.end(found)
