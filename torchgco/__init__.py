@@ -60,6 +60,7 @@ from torchgco.dynamics import (
     RotorTracking,
     Unicycle,
 )
+from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
@@ -91,7 +92,8 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "MPC", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets",
+    "solve", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
+    "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
     "Fleet", "FleetSolution",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",

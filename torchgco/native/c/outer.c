@@ -1,6 +1,7 @@
 /* The outer loop of the augmented Lagrangian (Algorithm 1): inner solves of all problems, then multipliers, penalties
    and the tests of the end, until each has ended. solvers/augmented_lagrangian.py does the same in PyTorch. */
 #include <float.h>
+#include "lifted.h"
 #include "sweep.h"
 
 /* Whether a trajectory of problem e counts as feasible and arrived. */
@@ -57,42 +58,42 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
     for (int l = 0; l < LANES; l++) {
         int64_t e = number[l < count ? l : 0];
         enter(s, l, e);
-        least[l] = o->single_after >= 0 && o->base[e] + o->outer[e] + 1 >= o->single_after ? 1 : 2;
+        LANE(least, l) = o->single_after >= 0 && o->base[e] + o->outer[e] + 1 >= o->single_after ? 1 : 2;
     }
     V violation = swept(s, 0, !failed, least, &caught).violation;
     for (int l = 0; l < count && !failed; l++) {
         int64_t e = number[l];
         double growth = o->growth;
-        if (o->ends && violation[l] <= o->tolerance) growth = 1;
-        s->mu[l] *= growth;
-        if (s->mu[l] > o->penalty_max) s->mu[l] = o->penalty_max;
-        s->inverse_mu[l] = 1 / s->mu[l];
-        p->mu[e] = s->mu[l];
+        if (o->ends && LANE(violation, l) <= o->tolerance) growth = 1;
+        LANE(s->mu, l) *= growth;
+        if (LANE(s->mu, l) > o->penalty_max) LANE(s->mu, l) = o->penalty_max;
+        LANE(s->inverse_mu, l) = 1 / LANE(s->mu, l);
+        p->mu[e] = LANE(s->mu, l);
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *c = p->constraint + i;
             double *lam = c->lam + e * c->knots * c->rows;
             for (int64_t k = 0; k < c->knots; k++, lam += c->rows) {
                 const V *next = s->rows[i].lam + k * c->rows;
-                if (s->rows[i].pushed[k][l]) for (int j = 0; j < c->rows; j++) lam[j] = next[j][l];
+                if (LANE(s->rows[i].pushed[k], l)) for (int j = 0; j < c->rows; j++) lam[j] = LANE(next[j], l);
                 else memset(lam, 0, c->rows * sizeof *lam);
             }
         }
-        if (preferred(o, e, violation[l])) keep(o, e, violation[l]);
+        if (preferred(o, e, LANE(violation, l))) keep(o, e, LANE(violation, l));
         o->outer[e]++;
-        o->outcome[e] = tested(o, e, violation[l], caught[l] != 0);
+        o->outcome[e] = tested(o, e, LANE(violation, l), LANE(caught, l) != 0);
         o->last_cost[e] = p->cost[e];
     }
     int going = 0;
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];
         going |= o->outcome[e] == RUNNING;
-        if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= DBL_MAX)) keep(o, e, violation[l]);
+        if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= DBL_MAX)) keep(o, e, LANE(violation, l));
     }
     if (!going) return;
     V merit = merit_of(s, &total);
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];
-        p->cost[e] = total[l]; p->merit[e] = merit[l];
+        p->cost[e] = LANE(total, l); p->merit[e] = LANE(merit, l);
         p->regularisation[e] = 0; p->inner[e] = p->rung[e] = 0;
     }
 }

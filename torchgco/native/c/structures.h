@@ -69,6 +69,7 @@ typedef struct {
     Options options;
     double gain; /* share of L_M by which tgco_lift must lower it */
     double nudge; /* share of the controls by which tgco_gains changes them; times `gain` states may change by it */
+    void *arena; /* of an exported solver, where its memory comes from (export/c/arena.h); else NULL */
 } Problem;
 
 /* The outer loop of the augmented Lagrangian (see solvers.augmented_lagrangian). */

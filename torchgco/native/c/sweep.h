@@ -1,6 +1,7 @@
-/* Sweeps over all rows along an iterate: violation, contact, slack, and multipliers to come. */
+/* Sweeps over the rows of an iterate: violation, contacts, slack, and new multipliers. */
 #pragma once
-#include "lifted.h"
+#include "memory.h"
+#include "solids.h"
 
 /* What a sweep over an iterate finds. */
 typedef struct {
@@ -33,7 +34,7 @@ static inline void note_solids(
     Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, I *pushed, Sweep *sweep) {
     int64_t place = con->place[k];
     V *lam = rows->lam + place * con->rows, zero = SET(0.0);
-    if (con->kind == SPHERES) {
+    if (is_kind(con, SPHERES)) {
         V c[BLOCK];
         for (int64_t first = 0; first < con->rows; first += BLOCK) {
             int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
@@ -44,7 +45,7 @@ static inline void note_solids(
                 note(s, con, value, tgco_choose(value <= zero, zero, depth), lam + j, pushed, sweep);
             }
         }
-    } else if (con->kind == BOXES) {
+    } else if (is_kind(con, BOXES)) {
         const V *factors = rows->bound + con->rows * 2 * DIM;
         int known = any(rows->pushed[place]);
         for (int64_t first = 0, last; first < con->rows; first = last) {
@@ -56,7 +57,7 @@ static inline void note_solids(
                 note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, pushed, sweep);
             }
         }
-    } else if (any(rows->pushed[place]) || !is_far_from_map(con, rows, x)) {
+    } else if (is_kind(con, FIELD) && (any(rows->pushed[place]) || !is_far_from_map(con, rows, x))) {
         V c = field_row(con, rows, k, x, 0, 0);
         note(s, con, c, tgco_choose(c <= zero, zero, depth_of(rows, c)), lam, pushed, sweep);
     }
@@ -70,15 +71,15 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
     int64_t place = con->place[k];
     V *lam = rows->lam + place * con->rows, zero = SET(0.0);
     I none = zero != zero, pushed = none;
-    if (con->kind == BOUNDS) {
+    if (is_kind(con, BOUNDS)) {
         for (int j = 0; j < con->rows; j++) {
             V c = bound(con, rows, j, k, x, u);
             note(s, con, c, tgco_choose(c < zero, zero, c), lam + j, &pushed, sweep);
         }
 #if DIM > 0
-    } else if (con->kind != FUNCTION && con->kind != BODY) {
+    } else if (is_solid(con)) {
         note_solids(s, con, rows, k, x, &pushed, sweep);
-    } else if (con->kind == BODY) {
+    } else if (is_kind(con, BODY)) {
         V centers[MAX_ROWS];
         Ball ball;
         ball_centers(s, i, k, x, centers);
@@ -87,7 +88,7 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
             note_solids(s, &ball.con, &ball.rows, k, ball.x, &pushed, sweep);
         }
 #endif
-    } else {
+    } else if (is_kind(con, FUNCTION)) {
         V c[MAX_ROWS];
         model_rows((int)i, x, u, at(rows->bound, &con->bound, place), con->shared, c);
         for (int j = 0; j < con->rows; j++) {

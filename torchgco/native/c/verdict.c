@@ -1,13 +1,14 @@
 /* What returned trajectories are judged by: violations, clearance, gains and what a step could still save, costates, and the
    rollouts that solves stand for. Functions return 0 without memory. */
 #include <float.h>
+#include "lifted.h"
 #include "sweep.h"
 
 /* The largest violation of given trajectories, into `merit`. */
 static void put_violation(Lanes *s, int64_t e, int used) {
     I caught;
     V violation = swept(s, 0, 0, SET(0.0), &caught).violation;
-    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = LANE(violation, l);
 }
 int tgco_violation(const Problem *p, int64_t first, int64_t last) {
     return put_all(p, first, last, enter_iterate, put_violation);
@@ -17,7 +18,7 @@ int tgco_violation(const Problem *p, int64_t first, int64_t last) {
 static void put_penetration(Lanes *s, int64_t e, int used) {
     I caught;
     V violation = swept(s, 1, 0, SET(0.0), &caught).violation;
-    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
+    for (int l = 0; l < used; l++) s->of->merit[e + l] = LANE(violation, l);
 }
 int tgco_penetration(const Problem *p, int64_t first, int64_t last) {
     return put_all(p, first, last, enter_iterate, put_penetration);
@@ -37,7 +38,7 @@ static I is_sensitive(const Lanes *s) {
         for (int i = 0; i < NX; i++) apart = tgco_maximum(apart, tgco_fabs(x[NX + i] - s->X[(k + 1) * NX + i]));
         memcpy(x, x + NX, NX * sizeof(V));
     }
-    return ~(apart <= SET(p->gain) * tgco_choose(size < SET(p->nudge), SET(p->nudge), size));
+    return NOT(apart <= SET(p->gain) * tgco_choose(size < SET(p->nudge), SET(p->nudge), size));
 }
 
 /* One backward pass along given trajectories: gains (E, N, NU, NZ) and the two sums of the expected change. Where they are
@@ -54,12 +55,12 @@ static void put_gains(Lanes *s, int64_t e, int used) {
     backward(s, knot_expand, NULL, &linear, &squares, &lowest);
     V quadratic = -linear - s->mu_r * squares;
     for (int l = 0; l < used; l++) {
-        p->cost[e + l] = linear[l];
-        p->merit[e + l] = quadratic[l];
-        p->status[e + l] = lowest[l] > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
-        if (p->slack) { p->slack[e + l] = sweep.slack[l]; p->violation[e + l] = sweep.violation[l]; }
-        if (p->sensitive) p->sensitive[e + l] = sensitive[l] != 0;
-        for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = s->G[i][l];
+        p->cost[e + l] = LANE(linear, l);
+        p->merit[e + l] = LANE(quadratic, l);
+        p->status[e + l] = LANE(lowest, l) > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
+        if (p->slack) { p->slack[e + l] = LANE(sweep.slack, l); p->violation[e + l] = LANE(sweep.violation, l); }
+        if (p->sensitive) p->sensitive[e + l] = LANE(sensitive, l) != 0;
+        for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = LANE(s->G[i], l);
     }
 }
 int tgco_gains(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_gains); }
@@ -80,7 +81,7 @@ static void put_costates(Lanes *s, int64_t e, int used) {
         knot_expand(s, k, x, u, g, H);
         memcpy(y, g, sizeof y);
         for (int l = 0; l < used; l++)
-            for (int i = 0; i < NX; i++) p->slopes[((e + l) * (N + 1) + k) * NX + i] = y[i][l];
+            for (int i = 0; i < NX; i++) p->slopes[((e + l) * (N + 1) + k) * NX + i] = LANE(y[i], l);
     }
 }
 int tgco_costates(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_costates); }
@@ -121,7 +122,7 @@ static void enter_followed(Lanes *s, int lane, int64_t e) {
     enter_iterate(s, lane, e);
     for (int64_t i = 0; i < size; i++) {
         double K = p->gains[e * size + i];
-        s->G[i][lane] = K - K == 0 ? K : 0;
+        LANE(s->G[i], lane) = K - K == 0 ? K : 0;
     }
 }
 
@@ -129,18 +130,18 @@ static void put_followed(Lanes *s, int64_t e, int used) {
     int64_t N = s->of->N;
     I all = SET(0.0) == SET(0.0), alone = all;
     follow(s, all);
-    alone = ~is_rounding(s);
+    alone = NOT(is_rounding(s));
     if (any(alone)) {
-        follow(s, ~all);
+        follow(s, NOT(all));
         alone &= is_rounding(s);
-        follow(s, ~alone);
+        follow(s, NOT(alone));
     }
     memcpy(s->X, s->Xn, (N + 1) * NX * sizeof(V));
     memcpy(s->U, s->Un, N * NU * sizeof(V));
     put_violation(s, e, used);
     for (int l = 0; l < used; l++) {
-        for (int64_t i = 0; i < (N + 1) * NX; i++) s->of->X[(e + l) * (N + 1) * NX + i] = s->Xn[i][l];
-        for (int64_t i = 0; i < N * NU; i++) s->of->U[(e + l) * N * NU + i] = s->Un[i][l];
+        for (int64_t i = 0; i < (N + 1) * NX; i++) s->of->X[(e + l) * (N + 1) * NX + i] = LANE(s->Xn[i], l);
+        for (int64_t i = 0; i < N * NU; i++) s->of->U[(e + l) * N * NU + i] = LANE(s->Un[i], l);
     }
 }
 int tgco_follow(const Problem *p, int64_t first, int64_t last) {
@@ -170,11 +171,11 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
         for (int64_t i = 0; i < 2 * DIM * blocks; i++)
             for (int l = 0; l < LANES; l++) {
                 int64_t k = i / (2 * DIM) * LANES + l, end = i / DIM % 2;
-                points[i][l] = p->X[(e * (N + 1) + (k < N ? k : N - 1) + end) * NX + POSITION + i % DIM];
+                LANE(points[i], l) = p->X[(e * (N + 1) + (k < N ? k : N - 1) + end) * NX + POSITION + i % DIM];
             }
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
-            if (con->kind != SPHERES || con->moved) continue;
+            if (!is_kind(con, SPHERES) || con->moved) continue;
             const double *o = con->bound.data + own * con->bound.element;
             const double *squares = con->squares.data + own * con->squares.element;
             const double *v = con->velocities.data ? con->velocities.data + own * con->velocities.element : NULL;
@@ -184,7 +185,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
                 V radius = SET(p->gain * sqrt(squares[j])), a[DIM], along[DIM];
                 for (int64_t block = 0; block < blocks; block++) {
                     const V *from = points + 2 * DIM * block, *to = from + DIM;
-                    for (int l = 0; l < LANES; l++) knot[l] = block * LANES + l < N ? block * LANES + l : N - 1;
+                    for (int l = 0; l < LANES; l++) LANE(knot, l) = block * LANES + l < N ? block * LANES + l : N - 1;
                     for (int d = 0; d < DIM; d++) {
                         V b = to[d] - SET(o[d]);
                         a[d] = from[d] - SET(o[d]);
@@ -200,8 +201,8 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
                 }
             }
         }
-        p->merit[e] = least[0];
-        for (int l = 1; l < LANES; l++) if (least[l] < p->merit[e] || least[l] != least[l]) p->merit[e] = least[l];
+        p->merit[e] = LANE(least, 0);
+        for (int l = 1; l < LANES; l++) if (LANE(least, l) < p->merit[e] || LANE(least, l) != LANE(least, l)) p->merit[e] = LANE(least, l);
     }
     free(points);
     return 1;
