@@ -258,7 +258,7 @@ def _refuse(misplaced: Mapping[str, Any], problem: Problem, solver: Solver | str
         made = option_places(_solver(solver, problem, False))
         near = get_close_matches(name, inspect.signature(solve).parameters, n=1)
         expected = "an argument of solve" + "".join(f", such as {other}" for other in near)
-        if places := [place for place in made if place.rpartition(".")[2] == name]:
+        if places := [path for path in made if path.rpartition(".")[2] == name]:
             whose = f"presets.{solver}(problem)" if isinstance(solver, str) else "your solver"
             expected = f"an option of the solver in its place: {', '.join(places)} of {whose}, by dataclasses.replace"
         raise InputError(f"solve.{name}", expected, shown(value))
@@ -394,7 +394,7 @@ def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
 
     if not isinstance(fleet, Fleet) or not isinstance(solution, FleetSolution) or len(solution) != fleet.V:
         raise InputError("solution", "a fleet and its solution", type(solution).__name__)
-    arrays = [[part.detach().cpu().double().numpy() for part in (one.X, one.U)] for one in solution]
+    arrays = [[tensor.detach().cpu().double().numpy() for tensor in (member.X, member.U)] for member in solution]
     X, U = zip(*arrays, strict=True)
     return fleet_figure(fleet.members, X, U, fleet.distances.cpu().double().numpy(), b)
 

@@ -22,15 +22,12 @@ class Plant(Protocol):
     @property
     def dt(self) -> float:
         """Time step, s."""
-        ...
 
     def take(self, index: Rows) -> Self:
         """The vehicles in `index`."""
-        ...
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """The states one step of dt later, for rotor speeds u (B, 4), rpm, and a force of the wind (B, 3), N."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -70,7 +67,7 @@ class RotorPlant(PerElement):
         """See `Plant`."""
         frame = self.frame
         model = QuadrotorPlant(self.dt, airframe=frame)
-        mass_error, thrust_error, drag = (column(part, x) for part in (self.mass_error, self.thrust_error, self.drag))
+        mass_error, thrust_error, drag = (column(z, x) for z in (self.mass_error, self.thrust_error, self.drag))
         speed = (1.0 + thrust_error).sqrt() * frame.reachable(u)
 
         def rates(x: Tensor) -> Tensor:

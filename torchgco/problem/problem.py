@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
-from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, take, taken
+from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -28,14 +28,13 @@ from torchgco.problem.given import Given, place, replaced
 from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, reach, savings
+from torchgco.problem.subset import Subset
 from torchgco.problem.summary import summary
 from torchgco.problem.tried import check_code
 
-OF_WHOLE = "dynamics", "cost", "constraints"  # what a subset takes of its batch when it is asked for
-
 
 @dataclass(frozen=True)
-class Problem:
+class Problem(Subset):
     """minimise J_var(X, U) subject to x_{k+1} = step(x_k, u_k), x_0 given, and the constraints: B problems at once.
 
     Args:
@@ -69,13 +68,9 @@ class Problem:
     free_start: Any = None
     time: FreeTime | None = None
 
-    # No fields. `known`: what depends on the problems' form alone, shared by all subsets of a batch. `derived`: what
-    # was computed from these very parts, by name; a problem made of others has what its maker hands on, else none.
+    # No fields. `known`: what depends on the problems' form alone, shared by all subsets of a batch.
     known: ClassVar[Known]
-    derived: ClassVar[dict[str, Any]]
     given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
-    # The batch that these are some problems of, and which, int64 (B,); None: they are no subset.
-    part_of: ClassVar[tuple[Problem, Tensor] | None] = None
 
     def __post_init__(self) -> None:
         fields_given = as_given({f.name: getattr(self, f.name) for f in fields(self)})
@@ -175,21 +170,6 @@ class Problem:
         """The bounds on controls, those of several parts as one; None where there are none."""
         return joined_bounds(bounds_of(self.constraints, "u"), self.N)
 
-    def derive(self, name: str, make: Callable[[], Any]) -> Any:
-        """What `make` computes from this problem's parts, once; kept in `derived` under the name."""
-        if name not in self.derived:
-            self.derived[name] = make()
-        return self.derived[name]
-
-    def derive_rows(self, name: str, make: Callable[[Problem], Any]) -> Any:
-        """The same of what has a row per problem; of a subset the rows of what the batch has, or finds as soon."""
-        if name not in self.derived and self.part_of is not None:
-            whole, rows = self.part_of
-            if name in whole.derived or whole.B <= self.B:
-                found = whole.derive(name, lambda: make(whole))
-                self.derived[name] = found.take(rows) if isinstance(found, Problem) else take(found, rows)
-        return self.derive(name, lambda: make(self))
-
     @property
     def start_is_clear(self) -> Tensor:
         """Whether each problem starts outside its obstacles, (B,) bool; see `free_start.clear_starts`."""
@@ -280,24 +260,10 @@ class Problem:
             index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
         if is_whole(index, self.B):
             return self
-        rows = torch.arange(self.B, device=self.x0.device)[index] if isinstance(index, slice) else index.clone()
-        whole, rows = (self, rows) if self.part_of is None else (self.part_of[0], self.part_of[1][rows])
-        subset = object.__new__(type(self))
-        parts = taken(self, ("x0", "goal", "horizon", "free_start", "time"), index)
-        vars(subset).update(parts, N=self.N, n=self.n, m=self.m, known=self.known, derived={}, part_of=(whole, rows))
+        subset = self.subset(index)
         if self.given is not None:
             subset._set(given=self.given.followed(self, lambda whole: whole.take(index)))
         return subset
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """The parts of a subset, where they are asked for: kernels in C read those of the whole batch."""
-            if name not in OF_WHOLE or self.part_of is None:
-                raise AttributeError(f"{type(self).__name__} has no attribute {name}")
-            whole, rows = self.part_of
-            self._set(**taken(whole, (name,), rows))
-            return vars(self)[name]
 
     def renewed(self) -> Self:
         """The same problems, with nothing kept that was computed from their parts."""

@@ -54,11 +54,11 @@ def limits(problem: Problem) -> Limits:
     """The bounds of controls (B, m) at stages (B,), those of rates among them."""
     B, N, m = problem.B, problem.N, problem.m
     inf, bounds = problem.x0.new_full((1, 1, m), torch.inf), problem.control_bounds
-    low, high = (part.expand(B, N, m) for part in ((-inf, inf) if bounds is None else bounds.over(N)))
+    low, high = (bound.expand(B, N, m) for bound in ((-inf, inf) if bounds is None else bounds.over(N)))
     rows, rates = torch.arange(B), rates_of(problem.constraints)
     if rates is None:
         return lambda k, before: (low[rows, k], high[rows, k])
-    fall, rise = (part.expand(B, N, m) for part in rates.over(N))
+    fall, rise = (bound.expand(B, N, m) for bound in rates.over(N))
     first = torch.full_like(low[:, 0], torch.nan) if rates.previous is None else rates.previous.expand(B, m)
 
     def both(k: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,7 +84,7 @@ def _candidates(problem: Problem, rest: Tensor, before: Tensor | None) -> tuple[
         up, down = (
             torch.where(torch.isfinite(bound - rest), bound - rest, 0.0) for bound in bounds.over(problem.N)[::-1]
         )
-        shares = [share * one for one in torch.eye(m, dtype=rest.dtype) for share in SHARES]
+        shares = [share * unit for unit in torch.eye(m, dtype=rest.dtype) for share in SHARES]
         if m <= MOST_TOGETHER:
             shares += [rest.new_tensor(signs) for signs in product((-1.0, 1.0), repeat=m)]
         bases += [rest + share.clamp(min=0.0) * up - share.clamp(max=0.0) * down for share in shares]
@@ -109,17 +109,17 @@ def _braked(problem: Problem, rest: Tensor, bases: Tensor, delays: Tensor, ahead
     x, u = open_loop(current(for_solvers(many)), U)[rows, first, : problem.n], U[rows, (first - 1).clamp(min=0)]
     rests = torch.zeros(B * C, dtype=torch.bool)
     for k in range(N - int(delays.min())):
-        at = (first + k).clamp(max=N - 1)
-        low, high = bounds(at, u)
-        quiet, own, then = calm[rows, at], U[rows, at], calm[rows, (at + 1).clamp(max=N - 1)]
+        stage = (first + k).clamp(max=N - 1)
+        low, high = bounds(stage, u)
+        quiet, begun, then = calm[rows, stage], U[rows, stage], calm[rows, (stage + 1).clamp(max=N - 1)]
         span = torch.where(torch.isfinite(high - low), high - low, 1.0).clamp(min=torch.finfo(x.dtype).tiny)
         stages = (varied, varied) if steady else (varied.at(k), varied.at(min(k + 1, N - 1)))
-        change, left = _toward_rest(problem, stages, x, own, span, quiet, then, ahead)
+        change, left = _toward_rest(problem, stages, x, begun, span, quiet, then, ahead)
         if ahead == 0.0:  # m until the end of the horizon with controls at rest
-            rests |= left * float(problem.dynamics.dt) * (N - at) <= ADMITTED
-        u = clamped(torch.where(rests.unsqueeze(-1), quiet, own + span * change), low, high)
+            rests |= left * float(problem.dynamics.dt) * (N - stage) <= ADMITTED
+        u = clamped(torch.where(rests.unsqueeze(-1), quiet, begun + span * change), low, high)
         runs = first + k < N
-        U[rows[runs], at[runs]] = u[runs]
+        U[rows[runs], stage[runs]] = u[runs]
         if bool(rests.all()):
             break
         x = (many.dynamics if steady else many.dynamics.at(k)).step(x, u)
@@ -166,22 +166,22 @@ def _toward_rest(
     The speed is that at the next knot, or `ahead` s later with controls `then`.
     """
     R, m = u.shape
-    at = slice(0, problem.n) if problem.dynamics.position is None else problem.position
+    place_states = slice(0, problem.n) if problem.dynamics.position is None else problem.position
     tried = torch.cat((u.unsqueeze(0), u + PROBE * torch.diag_embed(span).transpose(0, 1), quiet.unsqueeze(0)))
     now, later = stages
     x, then = now.step(x.repeat(m + 2, 1), tried.flatten(0, 1)), then.repeat(m + 2, 1)
     if not later.is_integrated:
-        speeds = (later.step(x, then) - x)[..., at] / problem.dynamics.dt
+        speeds = (later.step(x, then) - x)[..., place_states] / problem.dynamics.dt
     else:
         if ahead > 0.0:
             x = INTEGRATORS[later.integrator](lambda z: later.field(z, then), x, ahead)
-        speeds = later.field(x, then)[..., at]
+        speeds = later.field(x, then)[..., place_states]
     v, *others, still = speeds.view(m + 2, R, -1).unbind(0)
     J = (torch.stack(others, dim=-1) - v.unsqueeze(-1)) / PROBE  # (R, d, m), by shares of the ranges
-    squares, one = J.mT @ J, torch.eye(m, dtype=x.dtype)
+    squares, identity = J.mT @ J, torch.eye(m, dtype=x.dtype)
     size = squares.diagonal(dim1=-2, dim2=-1).sum(-1)
     size = torch.where(size > 0, size, 1.0)  # of a speed that no control changes yet
-    squares = squares + SMALLEST_SQUARE * size[:, None, None] * one
-    squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, one)
+    squares = squares + SMALLEST_SQUARE * size[:, None, None] * identity
+    squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, identity)
     change = -torch.linalg.solve(squares, (J.mT @ v.unsqueeze(-1)).nan_to_num()).squeeze(-1)
     return change, still.square().sum(-1).sqrt()

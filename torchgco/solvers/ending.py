@@ -142,7 +142,7 @@ def fails_between(problem: Problem, X: Tensor, U: Tensor, clearance: Tensor | No
         clearance: `path_clearance` (B,), where it is known.
     """
     bad = torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
-    if all(one.has_chords for one in problem.obstacles):
+    if all(obstacles.has_chords for obstacles in problem.obstacles):
         bad = (path_clearance(problem, X, U) if clearance is None else clearance) < 0
     for way in passages(problem, X, U).values():
         bad = bad | ~way.passed.all(-1)

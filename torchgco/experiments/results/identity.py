@@ -223,14 +223,14 @@ def _map_digests(field: DistanceField) -> dict[str, str]:
     return {name: _digest_of_array(value) for name, value in map_arrays(field).items()}
 
 
-def difference(held: Any, new: Any, path: str = "") -> str:
+def difference(stored: Any, new: Any, path: str = "") -> str:
     """The first key in which two identities differ, as 'key is this there, that here'."""
-    old, now = _parts(held), _parts(new)
+    old, now = _parts(stored), _parts(new)
     if old and now:
         for key in dict.fromkeys([*now, *old]):
             if old.get(key) != now.get(key):
                 return difference(old.get(key), now.get(key), f"{path}.{key}" if path else key)
-    return f"{path} is {_short(held)} there, {_short(new)} here"
+    return f"{path} is {_short(stored)} there, {_short(new)} here"
 
 
 def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
