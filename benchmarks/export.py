@@ -144,7 +144,9 @@ def counted(level: str, folder: Path) -> np.ndarray:
     said("arm-none-eabi-gcc", *FLAGS, level, *words, "-lm", "-o", "run", folder=folder)
     emulator = "qemu-system-arm", "-M", "mps2-an500", "-nographic", "-icount", "shift=6"
     host = "-semihosting-config", "enable=on,target=native"
-    rows = np.array([line.split() for line in said(*emulator, *host, "-kernel", "run", folder=folder).splitlines()], float)
+    rows = np.array(
+        [line.split() for line in said(*emulator, *host, "-kernel", "run", folder=folder).splitlines()], float
+    )
     rows[:, 3] /= TICKS
     return rows
 

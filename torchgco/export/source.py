@@ -28,6 +28,10 @@ TYPES = {
     torch.float64: "double", torch.float32: "float", torch.int64: "int64_t", torch.int32: "int32_t",
     torch.bool: "uint8_t",
 }  # fmt: skip
+# Files of the kernels, and what takes their places.
+REPLACED = {
+    "vectors.h": "scalar.h", "wide.h": "wide_scalar.h", "allocation.h": "arena.h", "clock.h": "seconds.h",
+}  # fmt: skip
 POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane
 SCALARS = 16  # numbers of the structure Solve beside its arrays, and what structures are padded with
 
@@ -144,7 +148,7 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
     need = count + 2 + (K + 1) * (POINTERS_OF_ROWS + 2)
     sizes = problem.N + 1, problem.N, problem.n, problem.m
     room = need + _solve_size(K, sizes, [len(kept_by(how)[address].flatten()) for address in changing.copied])
-    texts = {"allocation.h": (HERE / "arena.h").read_text(), "clock.h": (HERE / "seconds.h").read_text()}
+    texts = {name: (HERE / own).read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
     own = [

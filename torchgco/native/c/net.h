@@ -7,7 +7,7 @@
 #include <stdint.h>
 #include <string.h>
 #include "functions.h"
-#include "wide.h" /* or wide_scalar.h */
+#include "wide.h" /* or export/c/wide_scalar.h */
 
 #define NET_SIZE(h) (((h) + 15) / 16 * 16) /* whole vectors of neurons or lanes, in single precision, too */
 

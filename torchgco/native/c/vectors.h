@@ -1,7 +1,9 @@
-/* Vectors V of LANES numbers of type REAL, and what truth of their lanes is, I. scalar.h has the same for a single lane. */
+/* Vectors V of LANES numbers of type REAL, and what truth of their lanes is, I. export/c/scalar.h has
+   the same for a single lane. */
 #pragma once
 #include <math.h>
 #include <stdint.h>
+#include "real.h"
 
 /* The function of the C library for REAL: sin or sinf. */
 #define TGCO_MATH(name) TGCO_JOIN(__builtin_##name, TGCO_JOIN(TGCO_SUFFIX_, REAL))

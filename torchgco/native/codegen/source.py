@@ -15,7 +15,7 @@ from torchgco.native.codegen.emit import literal, switch
 from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes, neurons
 from torchgco.native.declarations import defines
-from torchgco.native.includes import C, included, joined
+from torchgco.native.includes import included, joined
 from torchgco.native.structures import HEADER, Kind, constants
 
 LANES = lanes()
@@ -117,11 +117,10 @@ class Form:
         Args:
             kinds: of the rows that there are; no code for others is left.
             declared: what comes after the structures.
-            given: texts that stand for files of these names, such as clock.h.
+            given: texts that stand for vectors.h and others, by their names.
         """
         generated = [*self._model_code(), curvature_code(self.dynamics, self.functions)]
-        texts = {"vectors.h": (C / "scalar.h").read_text(), "constants.h": constants(), "code.h": "\n".join(generated)}
-        texts["wide.h"] = (C / "wide_scalar.h").read_text()
+        texts = {"constants.h": constants(), "code.h": "\n".join(generated)}
         kept = {"NET_WIDTH": neurons(), "REAL": "double", "LANES": 1, "KINDS": sum(1 << kind for kind in set(kinds))}
         sizes = kept | self._sizes | _space(self.position)
         sizes["MAX_ROWS"] = max(sizes["MAX_ROWS"], sizes["DIM"])  # of places of balls, be there none

@@ -3,6 +3,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#include "real.h"
 
 #define TGCO_MATH(name) TGCO_JOIN(name, TGCO_JOIN(TGCO_SUFFIX_, REAL))
 
