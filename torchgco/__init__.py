@@ -26,6 +26,7 @@ from torchgco.base.errors import (
     GuidanceWarning,
     HorizonWarning,
     InputError,
+    RefusalWarning,
     ScaleWarning,
     StartWarning,
     StepWarning,
@@ -100,8 +101,9 @@ __all__ = [  # noqa: RUF022
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
-    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning", "ScaleWarning",
-    "StartWarning", "StepWarning", "TraceWarning", "DeviceWarning",
+    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning",
+    "RefusalWarning", "ScaleWarning", "StartWarning", "StepWarning", "TraceWarning",
+    "DeviceWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

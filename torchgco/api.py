@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import partial
 from typing import TYPE_CHECKING, Any, Never, overload
 
 import torch
@@ -31,6 +32,7 @@ from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times, guessing_times
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.refusals import spared
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
 from torchgco.sensitivity import asks_for_gradients, attached, check_smoothing
@@ -131,9 +133,9 @@ def solve(
     solver, X0 = _solver(solver, problem, record), warm.X if X0 is None and warm and problem.time else X0
     if solver.kernels is None and (there := on_cpu(problem)) is not None:
         problem, (U0, ids, warm, X0) = there, copied_to((U0, ids, warm, X0), there.x0)
-    (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
-    called, verbose = name or type(solver).__name__, check_value(verbose, bool | None, "verbose")
-    watcher = Watcher(called, problem.B, isinstance(solver, Restarts), verbose)
+    problem, U0 = spared(problem, partial(_start, warm, solver, U0))
+    multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
+    watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
     try:
         found = solver.solve(problem, U0, seed, ids, multipliers, watcher.callback, max_seconds, X0)
         watcher.end(found)
@@ -272,7 +274,7 @@ def _checked(warm: Any) -> Solution | None:
     return warm and warm.detach()
 
 
-def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor | None) -> tuple[Problem, Tensor]:
+def _start(warm: Solution | None, solver: Solver, U0: Tensor | None, problem: Problem) -> tuple[Problem, Tensor]:
     """Controls (B, N, m) to begin with, where none are given, and the problem with the guess of its free starts."""
     if problem.B > 0:
         problem = current(problem)  # traced once, for the guess, for the solve and for the warnings after it
@@ -295,6 +297,8 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
 def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
     """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    if solution.account is not None:
+        problem = solution.account.problem or problem  # whose code may refuse states
     if cold:
         _warn_of_horizon(problem, solution, claims)
     _warn_of_scale(problem, solution, claims)

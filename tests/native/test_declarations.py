@@ -26,7 +26,7 @@ from torchgco.guidance import mppi
 from torchgco.ilqr import descent, lifted
 from torchgco.ilqr.lifted import lifted_search
 from torchgco.ilqr.step import iterate
-from torchgco.kernels import in_c, kernels_of
+from torchgco.kernels import kernels_of
 from torchgco.kernels.in_c import native_options
 from torchgco.lagrangian.state import State
 from torchgco.native import structures
@@ -216,13 +216,6 @@ OF_LINE_SEARCH = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def unkept(monkeypatch) -> None:
-    """Options are read anew at each call."""
-    monkeypatch.setattr(in_c, "native_options", native_options.__wrapped__)
-
-
-@pytest.mark.usefixtures("unkept")
 @pytest.mark.parametrize("name", OF_ILQR)
 def test_a_constant_of_ilqr_changes_both_kernels(name: str, monkeypatch) -> None:
     value, inner, prepare, problem, count = OF_ILQR[name]
@@ -232,7 +225,6 @@ def test_a_constant_of_ilqr_changes_both_kernels(name: str, monkeypatch) -> None
     assert not same(mine, usual) and same(mine, theirs)
 
 
-@pytest.mark.usefixtures("unkept")
 @pytest.mark.parametrize("name", OF_LINE_SEARCH)
 def test_a_constant_of_the_line_search_changes_both_kernels(name: str, monkeypatch) -> None:
     value, inner = OF_LINE_SEARCH[name]
@@ -247,7 +239,6 @@ def same(a: State, b: State) -> bool:
     return all(torch.allclose(getattr(a, name), getattr(b, name), rtol=1e-7, atol=1e-10) for name in names)
 
 
-@pytest.mark.usefixtures("unkept")
 @pytest.mark.parametrize("B", [1, 3])
 def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
     """With LOST_BY = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""

@@ -79,6 +79,10 @@ class StepWarning(UserWarning):
     """A model's time step is too long: half of it gives other states, or another cost."""
 
 
+class RefusalWarning(UserWarning):
+    """A user's code raises an error for a state that a trajectory goes through; it counts as not finite."""
+
+
 class TraceWarning(UserWarning):
     """A model's compiled code gives other states than the model itself."""
 

@@ -141,12 +141,14 @@ class Movers(Protocol):
 
     def observe(self, scan: Scan, seen: SeenMap, t: float) -> np.ndarray:
         """Take a scan at time t, s, before the map does. Returns which rays the map may have, (R,) bool."""
+        ...
 
     def note(self, seen: SeenMap, changed: np.ndarray) -> None:
         """Cells of the map have changed, given by flat indices."""
 
     def now(self, t: float) -> Moving:
         """The bodies at time t, s."""
+        ...
 
 
 def nothing() -> Moving:

@@ -14,7 +14,7 @@ from torchgco.base.status import Status
 from torchgco.eager.sampling import Sampling
 from torchgco.ilqr import descent, lifted
 from torchgco.ilqr.descent import Descent
-from torchgco.ilqr.line_search import Rollouts
+from torchgco.ilqr.line_search import Rollouts, rungs_of
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import keep_lifted
 from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
@@ -205,21 +205,25 @@ class NativeKernels(Kernels):
         return self._samplers[how.dtype].improve(problem, U, how)
 
 
-@lru_cache(maxsize=64)
 def native_options(how: Descent) -> Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
-    rungs = search.ladder(printed)
-    return Options.complete(
-        ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs),
-        back=-1 if search.back is None else search.back, accept_last=printed,
-        ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
+    return _options(
+        search.shrink, back=-1 if search.back is None else search.back,
+        accept_last=printed, ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
         max_iterations=how.max_iterations, tolerance=0.0 if printed else how.tolerance,
         absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,
         regularisation_first=descent.REGULARISATION_FIRST, regularisation_growth=descent.REGULARISATION_GROWTH,
         regularisation_max=descent.REGULARISATION_MAX, damping=0.0 if printed else descent.DAMPING,
         damping_growth=descent.DAMPING_GROWTH, damping_decay=descent.DAMPING_DECAY,
     )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _options(shrink: float, **numbers: Any) -> Options:
+    """The structure with these fields: there are few of them, and filling one takes long beside a small solve."""
+    rungs = rungs_of(shrink, numbers["smallest"], numbers["accept_last"])
+    return Options.complete(ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs), **numbers)
 
 
 def _flags(B: int) -> Tensor:

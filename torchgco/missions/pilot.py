@@ -25,10 +25,12 @@ class Pilot(Protocol):
     @property
     def knots(self) -> int:
         """Of a plan, N+1: as many positions are logged."""
+        ...
 
     @property
     def seen(self) -> list[SeenLog]:
         """What each vehicle sees, kept up to date by `sense`; empty for pilots without a sensor."""
+        ...
 
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
         """Look around at a control step, from true states x (b, 17) that are measured as `measured`."""
@@ -40,12 +42,14 @@ class Pilot(Protocol):
 
         `before` are the plans of the period before; None: there are none to continue.
         """
+        ...
 
     def take(self, index: Tensor) -> None:
         """Keep the vehicles in `index`, int64."""
 
     def parts(self) -> Mapping[str, Tensor]:
         """Seconds of the period by part, (b,), under names of `MissionLog`; empty where they aren't measured."""
+        ...
 
 
 class KnownMap:

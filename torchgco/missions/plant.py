@@ -22,12 +22,15 @@ class Plant(Protocol):
     @property
     def dt(self) -> float:
         """Time step, s."""
+        ...
 
     def take(self, index: Rows) -> Self:
         """The vehicles in `index`."""
+        ...
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """The states one step of dt later, for rotor speeds u (B, 4), rpm, and a force of the wind (B, 3), N."""
+        ...
 
 
 @dataclass(frozen=True)

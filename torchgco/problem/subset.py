@@ -58,5 +58,5 @@ class Subset:
             batch, rows = self.part_of
             if name in batch.derived or batch.B <= self.B:
                 found = batch.derive(name, lambda: make(batch))
-                self.derived[name] = found.take(rows) if isinstance(found, Subset) else take(found, rows)
+                self.derived[name] = found.subset(rows) if isinstance(found, Subset) else take(found, rows)
         return self.derive(name, lambda: make(self))

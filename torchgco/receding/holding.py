@@ -36,18 +36,26 @@ def held(problem: Problem, plan: Plan | None, now: float) -> Held:
         problem: from the states that are measured `now`, s, and with the numbers of now.
         plan: of these problems, or None.
     """
-    whole, before, best = current(for_solvers(problem)), None, None
+    whole, before = current(for_solvers(problem)), None
+    best: Held | None = None
     if plan is not None:
         later = plan.moved_to(now)
         before, K = later.U, later.K
         lifted = rates_of(problem.constraints) is not None  # feedback could break the bounds of rates
         ways = [before] if lifted else [followed(whole, later.X, before, K)[1], before]
         best = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
-    if best is None:
-        return _best(problem, whole, stopping(problem, None))
-    left = (~best.feasible).nonzero().flatten()
-    if left.numel() > 0:
-        stops = stopping(problem.take(left), None if before is None else before[left])
+    for mixed in (False, True):
+        if best is None:
+            stops = stopping(problem, None)
+            assert stops is not None
+            best = _best(problem, whole, stops)
+            continue
+        left = (~best.feasible).nonzero().flatten()
+        if left.numel() == 0:
+            break
+        stops = stopping(problem.take(left), None if before is None else before[left], mixed)
+        if stops is None:
+            break
         ways = torch.cat((best.U[left].unsqueeze(1), stops), dim=1)
         other = _best(problem.take(left), whole.take(left), ways, best.K[left], 1)
         other.is_before.logical_and_(best.is_before[left])

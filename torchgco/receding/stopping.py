@@ -22,6 +22,7 @@ from torchgco.problem.problem import Problem
 
 SHARES = -1.0, -0.5, 0.5, 1.0  # of the way from a control at rest to its lower and its upper bound
 MOST_TOGETHER = 4  # controls, of which all ends of the bounds are combined: 16 candidates
+MOST_MIXED = 2  # controls, of which all other shares are combined, too: 12 candidates
 BRAKES_AFTER = 0.0, 0.125, 0.25  # of the horizon, after which candidates begin to brake
 # Of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these.
 TILTS_WITHIN = 0.25
@@ -31,15 +32,18 @@ SMALLEST_SQUARE = 1e-9
 Limits = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # of stages, after the controls of those before
 
 
-def stopping(problem: Problem, before: Tensor | None) -> Tensor:
-    """Controls (B, C, N, m) of candidates that come to rest.
+def stopping(problem: Problem, before: Tensor | None, mixed: bool = False) -> Tensor | None:
+    """Controls (B, C, N, m) of candidates that come to rest; None: there are none.
 
     Args:
         problem: as users give it, of a fixed time.
         before: controls (B, N, m) of the plan before, moved on; None: none.
+        mixed: further ones, which have some controls at their bounds beside others half-way, as to speed up in a bend.
     """
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-    bases, delays = _candidates(problem, rest, before)
+    if mixed and (problem.control_bounds is None or not 1 < problem.m <= MOST_MIXED):
+        return None
+    bases, delays = _candidates(problem, rest, before, mixed)
     U, rests = _braked(problem, rest, bases, delays, 0.0)
     left = (~rests.any(1)).nonzero().flatten()
     if left.numel() == 0 or not problem.dynamics.is_integrated:
@@ -74,18 +78,22 @@ def clamped(u: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return torch.minimum(torch.maximum(u.nan_to_num(), low), high)
 
 
-def _candidates(problem: Problem, rest: Tensor, before: Tensor | None) -> tuple[Tensor, Tensor]:
+def _candidates(problem: Problem, rest: Tensor, before: Tensor | None, mixed: bool) -> tuple[Tensor, Tensor]:
     """Controls (B, C, N, m) that candidates have until they brake and beside it, and the stages (C,) at which they do.
 
     Shares of infinite bounds are those of rest.
     """
     bases, bounds, m = [rest] if before is None else [rest, before], problem.control_bounds, problem.m
+    bases = [] if mixed else bases
     if bounds is not None:
         up, down = (
             torch.where(torch.isfinite(bound - rest), bound - rest, 0.0) for bound in bounds.over(problem.N)[::-1]
         )
         shares = [share * unit for unit in torch.eye(m, dtype=rest.dtype) for share in SHARES]
-        if m <= MOST_TOGETHER:
+        if mixed:
+            parts = (part for part in product(SHARES, repeat=m) if min(map(abs, part)) < 1.0)
+            shares = [rest.new_tensor(part) for part in parts]
+        elif m <= MOST_TOGETHER:
             shares += [rest.new_tensor(signs) for signs in product((-1.0, 1.0), repeat=m)]
         bases += [rest + share.clamp(min=0.0) * up - share.clamp(max=0.0) * down for share in shares]
     # Where models differ by stage, one stage is of one model for all candidates: they brake at once.
