@@ -180,16 +180,16 @@ def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
     calls = []
     whole = Restarts.solve
 
-    def note_call(self, problem, U0, **options):
+    def note_call(self, problem, U0, *options):
         calls.append((self, U0, options))
-        return whole(replace(self, passes=self.passes[:1]), problem, U0, **options)
+        return whole(replace(self, passes=self.passes[:1]), problem, U0, *options)
 
     monkeypatch.setattr(Restarts, "solve", note_call)
     problem, U0 = planar_batch(B=2, N=25)
     solve(problem, seed=3)
     ((solver, guess, options),) = calls
     assert solver == compose(["scenario=planar_trap", "model=planar"]).solver
-    assert torch.equal(guess, U0) and options == {"seed": 3} | dict.fromkeys(("ids", "warm", "max_seconds", "X0"))
+    assert torch.equal(guess, U0) and options == (3, None, None, None, None, None)
 
 
 def test_offsets_are_for_two_controls() -> None:
