@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgco.base.status import Status
 from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.verdict import FleetVerdict
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -54,8 +55,17 @@ class Plans:
         self.X[v][rows], self.U[v][rows], self.K[v][rows] = found.X[of], found.U[of], found.K[of]
         self.status[rows, v] = found.status[of]
 
-    def solutions(self, fleet: Fleet) -> tuple[Solution, ...]:
-        """A solution per vehicle, without multipliers."""
+    def solutions(self, fleet: Fleet, verdict: FleetVerdict, late: bool = False) -> tuple[Solution, ...]:
+        """A solution per vehicle, without multipliers; each status says whether constraints and distances are kept.
+
+        Args:
+            late: whether time has ended the solve.
+        """
+        good = torch.stack([one.feasible for one in verdict.vehicles], dim=1) & verdict.apart
+        claims = torch.isin(self.status, torch.tensor([Status.CONVERGED, Status.FEASIBLE]))
+        self.status = torch.where(good & ~claims, int(Status.FEASIBLE), self.status)
+        lost = Status.TIME_LIMIT if late else Status.INFEASIBLE
+        self.status = torch.where(~good & claims, int(lost), self.status)
         return tuple(self._solution(v, one) for v, one in enumerate(fleet.members))
 
     def _solution(self, v: int, one: Problem) -> Solution:
@@ -66,3 +76,10 @@ class Plans:
             X, U, self.K[v], torch.zeros_like(U), Multipliers.zero(one, 1.0), one.cost.total(X, U), violation, status,
             self.iterations[:, v], none, none,
         )  # fmt: skip
+
+
+def cat(parts: Sequence[Plans]) -> Plans:
+    """Plans of several batches of fleets as those of one."""
+    X, U, K = ([torch.cat(of) for of in zip(*(getattr(one, name) for one in parts), strict=True)] for name in "XUK")
+    status, iterations = (torch.cat([getattr(one, name) for one in parts]) for name in ("status", "iterations"))
+    return Plans(X, U, K, status, iterations)

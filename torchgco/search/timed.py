@@ -101,17 +101,22 @@ class Timed(Row):
         rows, X = rows[left], X[left]
         search.best.worked[rows] = True
         for finer in FINER:
-            found = self._ways(search.call.problem.take(rows), X, finer)
+            found = ways_in_time(search.call.problem.take(rows), X, self.ways, finer)
             arrived = _solve_along(search, rows, found)
             rows, X = rows[~arrived], X[~arrived]
             if rows.numel() == 0 or search.call.late:
                 return
 
-    def _ways(self, problem: Problem, X: Tensor, finer: float) -> list[TimedWays]:
-        """The ways of every problem."""
-        each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
-        scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
-        return timed_ways(scenes, self.ways, DEARER)
+
+def ways_in_time(problem: Problem, X: Tensor, most: int, finer: float = 1.0) -> list[TimedWays]:
+    """Up to `most` ways of every problem through a lattice in space and time; see `scene_in_time`.
+
+    Args:
+        X: trajectories without obstacles (B, N+1, n).
+    """
+    each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
+    scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
+    return timed_ways(scenes, most, DEARER)
 
 
 def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,7 +143,7 @@ def _solve_along(search: Search, rows: Tensor, found: list[TimedWays]) -> Tensor
     if each.numel() == 0:
         return done
     each = each.to(rows.device)
-    X, U = _guesses(search.call.problem.take(rows), each, found)
+    X, U = guesses_along(search.call.problem.take(rows), each, found)
     call = replace(search.call.take(rows[each]), U0=U, warm=None, callback=None)
     grown, left = torch.zeros_like(X[:, 0, 0]), torch.arange(len(each), device=each.device)
     least = torch.full_like(search.best.end.best.cost[rows], torch.inf)
@@ -205,7 +210,7 @@ def _keep(search: Search, rows: Tensor, each: Tensor, merit: Tensor, end: SolveE
     return done
 
 
-def _guesses(problem: Problem, each: Tensor, found: list[TimedWays]) -> tuple[Tensor, Tensor]:
+def guesses_along(problem: Problem, each: Tensor, found: list[TimedWays]) -> tuple[Tensor, Tensor]:
     """States (C, N+1, n) and controls (C, N, m) along the ways of all problems in turn; `each` says whose way it is."""
     states, t = [], float(problem.dynamics.dt) * np.arange(problem.N + 1.0)
     for b, ways in enumerate(found):

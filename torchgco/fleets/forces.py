@@ -1,0 +1,94 @@
+"""Forces between vehicles that are in balance: where they move the vehicles of one fleet, to first order.
+
+Each vehicle's trajectory is the minimum of its own cost under the forces of others, and answers to a change of these by
+a linear response. Forces push apart, and only pairs that touch. The forces are then the multipliers of a quadratic
+programme: find l >= 0 with M l - q >= 0 and l'(M l - q) = 0, M the response of gaps to forces.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SOFT = 1e-6  # share of the responses by which pairs give way: rows that depend on each other have no unique forces
+STEPS = 40  # of the interior point on forces, at most
+ENOUGH = 1e-8  # product of force and gap at its end, as a share of the first one
+SHORT = 0.99  # share of the way to where a force or a gap would be 0
+
+
+def balancing_forces(
+    normals: Tensor, gaps: Tensor, needed: Tensor, forces: Tensor, responses: Tensor, near: float
+) -> Tensor:
+    """Where V vehicles go, as changes of their places (V, K, d), m.
+
+    Args:
+        normals: along which two push each other, from vehicle j to vehicle i, (V, V, K, d).
+        gaps: how far apart they are along these, (V, V, K), m.
+        needed: the gaps that pairs need, (V, V, K), m; 0 of those that need none.
+        forces: that act on the vehicles now, (V, K, d).
+        responses: of places at knots 1..N to forces there, (V, N d, N d).
+        near: by how many times the gap that they need others may be farther apart.
+    """
+    V, K, d = forces.shape
+    if not bool(torch.isfinite(responses).all()):
+        return torch.zeros_like(forces)
+    freed = -(responses @ forces[:, 1:].flatten(1).unsqueeze(-1)).view(V, K - 1, d)
+    gap, keep = gaps[:, :, 1:], needed[:, :, 1:]
+    close = (keep > 0) & (gap < (1.0 + near) * keep) & torch.ones(V, V, dtype=torch.bool).triu(1).unsqueeze(-1)
+    i, j, k = close.nonzero(as_tuple=True)
+    if len(i) == 0:
+        return torch.cat((torch.zeros_like(freed[:, :1]), freed), dim=1)
+    normal = normals[:, :, 1:][i, j, k]
+    M = forces.new_zeros(len(i), len(i))
+    R = responses.view(V, K - 1, d, K - 1, d)
+    for v in range(V):
+        mine = ((i == v) | (j == v)).nonzero().flatten()
+        along = torch.where(i[mine] == v, 1.0, -1.0).unsqueeze(-1) * normal[mine]
+        at = k[mine]
+        between = R[v][at][:, :, at]  # (r, d, r, d)
+        M[mine.unsqueeze(1), mine] += torch.einsum("ra,rasb,sb->rs", along, between, along)
+    q = keep[i, j, k] - gap[i, j, k] - (normal * (freed[i, k] - freed[j, k])).sum(-1)
+    size = balanced(M, q)
+    push = torch.zeros_like(freed)
+    push.index_put_((i, k), size.unsqueeze(-1) * normal, accumulate=True)
+    push.index_put_((j, k), -size.unsqueeze(-1) * normal, accumulate=True)
+    moved = freed + (responses @ push.flatten(1).unsqueeze(-1)).view(V, K - 1, d)
+    return torch.cat((torch.zeros_like(moved[:, :1]), moved), dim=1)
+
+
+def balanced(M: Tensor, q: Tensor) -> Tensor:
+    """The l >= 0 (R,) with M l - q >= 0 and l'(M l - q) = 0, M (R, R) symmetric and positive semidefinite."""
+    M = 0.5 * (M + M.T)
+    M = M + SOFT * M.diagonal().mean() * torch.eye(len(q), dtype=M.dtype)
+    scale = q.abs().max().clamp(min=1e-12) / M.diagonal().mean()
+    l, w = torch.full_like(q, float(scale)), torch.full_like(q, float(q.abs().max().clamp(min=1e-12)))
+    first = float(l @ w) / len(q)
+    for _ in range(STEPS):
+        r, mean = M @ l - q - w, float(l @ w) / len(q)
+        if mean < ENOUGH * first and float(r.abs().max()) < 1e-9:
+            break
+        factor, info = torch.linalg.cholesky_ex(M + torch.diag(w / l))
+        if int(info) != 0:
+            break
+        change = torch.zeros_like(l)
+        other = torch.zeros_like(w)
+        for center in (0.0, None):
+            if center is None:
+                t = min(_most(l, change), _most(w, other))
+                center = (float((l + t * change) @ (w + t * other)) / len(q) / mean) ** 3 * mean
+                target = center - change * other
+            else:
+                target = torch.zeros_like(l)
+            right = -r + (target - l * w) / l
+            change = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
+            other = (target - l * w - w * change) / l
+        t = SHORT * min(_most(l, change), _most(w, other))
+        t = min(t, 1.0)
+        l, w = l + t * change, w + t * other
+    return l
+
+
+def _most(z: Tensor, change: Tensor) -> float:
+    """The step up to which z stays at least 0, at most 1 / SHORT."""
+    ratio = torch.where(change < 0, -z / change, torch.inf)
+    return min(float(ratio.min()), 1.0 / SHORT)
