@@ -10,6 +10,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.lagrangian.kkt import RightSides
+from torchgco.problem.problem import Problem
+from torchgco.sensitivity.points import rows_that_hold, solve_at
+from torchgco.solution import Solution
+
+TINY = 1e-9  # m, below which two places are one
+AT_ONCE = 64  # problems whose responses are computed together
 SOFT = 1e-6  # share of the responses by which pairs give way: rows that depend on each other have no unique forces
 STEPS = 40  # of the interior point on forces, at most
 ENOUGH = 1e-8  # product of force and gap at its end, as a share of the first one
@@ -18,8 +25,8 @@ SHORT = 0.99  # share of the way to where a force or a gap would be 0
 
 def balancing_forces(
     normals: Tensor, gaps: Tensor, needed: Tensor, forces: Tensor, responses: Tensor, near: float
-) -> Tensor:
-    """Where V vehicles go, as changes of their places (V, K, d), m.
+) -> tuple[Tensor, Tensor]:
+    """Where V vehicles go, as changes of their places (V, K, d), m, and the forces (V, K, d) that move them there.
 
     Args:
         normals: along which two push each other, from vehicle j to vehicle i, (V, V, K, d).
@@ -31,13 +38,13 @@ def balancing_forces(
     """
     V, K, d = forces.shape
     if not bool(torch.isfinite(responses).all()):
-        return torch.zeros_like(forces)
+        return torch.zeros_like(forces), forces
     freed = -(responses @ forces[:, 1:].flatten(1).unsqueeze(-1)).view(V, K - 1, d)
     gap, keep = gaps[:, :, 1:], needed[:, :, 1:]
     close = (keep > 0) & (gap < (1.0 + near) * keep) & torch.ones(V, V, dtype=torch.bool).triu(1).unsqueeze(-1)
     i, j, k = close.nonzero(as_tuple=True)
     if len(i) == 0:
-        return torch.cat((torch.zeros_like(freed[:, :1]), freed), dim=1)
+        return torch.cat((torch.zeros_like(freed[:, :1]), freed), dim=1), torch.zeros_like(forces)
     normal = normals[:, :, 1:][i, j, k]
     M = forces.new_zeros(len(i), len(i))
     R = responses.view(V, K - 1, d, K - 1, d)
@@ -53,7 +60,7 @@ def balancing_forces(
     push.index_put_((i, k), size.unsqueeze(-1) * normal, accumulate=True)
     push.index_put_((j, k), -size.unsqueeze(-1) * normal, accumulate=True)
     moved = freed + (responses @ push.flatten(1).unsqueeze(-1)).view(V, K - 1, d)
-    return torch.cat((torch.zeros_like(moved[:, :1]), moved), dim=1)
+    return torch.cat((torch.zeros_like(moved[:, :1]), moved), dim=1), torch.cat((torch.zeros_like(push[:, :1]), push), dim=1)
 
 
 def balanced(M: Tensor, q: Tensor) -> Tensor:
@@ -92,3 +99,43 @@ def _most(z: Tensor, change: Tensor) -> float:
     """The step up to which z stays at least 0, at most 1 / SHORT."""
     ratio = torch.where(change < 0, -z / change, torch.inf)
     return min(float(ratio.min()), 1.0 / SHORT)
+
+
+
+def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals (c, V, V, K, d) of planes between any two of the places p (c, V, K, d), and how far apart these are along
+    them, (c, V, V, K), m.
+
+    At each knot the shortest way between the two, then or in the stages beside it: so who passes whom on which side
+    stays as it is, however fast they are.
+    """
+    away = p.unsqueeze(2) - p.unsqueeze(1)
+    a, along = away[..., :-1, :], away.diff(dim=-2)
+    share = -(a * along).sum(-1) / along.square().sum(-1).clamp(min=torch.finfo(p.dtype).tiny)
+    nearest = a + share.clamp(0.0, 1.0).unsqueeze(-1) * along
+    before, after = (torch.cat(ends, dim=-2) for ends in ((nearest[..., :1, :], nearest), (nearest, nearest[..., -1:, :])))
+    nearer = (before.norm(dim=-1) < after.norm(dim=-1)).unsqueeze(-1)
+    way = torch.where(nearer, before, after)
+    size = way.norm(dim=-1, keepdim=True)
+    v, aside = torch.arange(p.shape[1]), torch.zeros_like(away)
+    aside[..., 0] = (v.unsqueeze(1) - v).sign().view(1, len(v), len(v), 1).to(away)  # of two at one place
+    normals = torch.where(size > TINY, way / size.clamp(min=TINY), aside)
+    return normals, (normals * away).sum(-1)
+
+
+def responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
+    """Of places at knots 1..N to forces there, (B, N d, N d), m per unit; NaN where the minimum isn't strict."""
+    return torch.cat([_responses(problem.take(rows), solution.take(rows), position) for rows in torch.arange(problem.B).split(AT_ONCE)])
+
+
+def _responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
+    holds, _ = rows_that_hold(problem, solution)
+    B, N, n, d = problem.B, problem.N, problem.n, position.stop - position.start
+    a = solution.X.new_zeros(N, d, B, N + 1, n + problem.m)
+    for k in range(N):
+        for axis in range(d):
+            a[k, axis, :, k + 1, position.start + axis] = -1.0
+    gaps, none = a.new_zeros(()).expand(N * d, B, N, n), a.new_zeros(()).expand(N * d, B, holds.shape[1])
+    found = solve_at(problem, solution, holds, RightSides(a.flatten(0, 1), gaps, none))
+    moved = found.z[:, :, 1:, position].permute(1, 2, 3, 0).flatten(1, 2)
+    return torch.where(found.definite.view(-1, 1, 1), moved, torch.nan)

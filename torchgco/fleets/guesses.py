@@ -13,6 +13,7 @@ from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.plans import Plans
 from torchgco.solvers.interior import InteriorPoint
 
+TINY = 1e-9  # share of a way
 SIDES = 1.0, -1.0  # to the right, to the left
 # From near guesses: a large barrier would lose them.
 SOLVER = InteriorPoint(tolerance=1e-6, initial_barrier=1e-2, max_iterations=100)
@@ -79,7 +80,26 @@ def aside(fleet: Fleet, forms: Sequence[Among], rows: Tensor, alone: Plans, side
             at = place * b + torch.arange(b)
             plans.set(v, torch.arange(b), found, at)
             plans.iterations[:, v] += found.iterations[at]
-    return plans
+    return together(fleet, plans, conflicts)
+
+
+def together(fleet: Fleet, plans: Plans, conflicts: Tensor) -> Plans:
+    """Plans slowed down such that vehicles in conflict (b, V) are equally far on their ways, as far as the last one."""
+    p = fleet.places(plans.X)
+    way = p[:, :, -1:] - p[:, :, :1]
+    share = ((p - p[:, :, :1]) * way).sum(-1) / way.square().sum(-1).clamp(min=1e-12)
+    share = share.cummax(-1).values.clamp(0.0, 1.0)
+    last = torch.where(conflicts.unsqueeze(-1), share, torch.inf).amin(1)
+    kept = plans.take(torch.arange(len(p)))
+    for v in range(fleet.V):
+        own = share[:, v] + TINY * torch.arange(fleet.N + 1)  # rises
+        k = torch.searchsorted(own, last).clamp(1, fleet.N)
+        before, after = own.gather(1, k - 1), own.gather(1, k)
+        part = ((last - before) / (after - before)).clamp(0.0, 1.0).unsqueeze(-1)
+        at = lambda k, x=plans.X[v]: x.gather(1, k.unsqueeze(-1).expand(-1, -1, x.shape[-1]))
+        moved = at(k - 1) * (1.0 - part) + at(k) * part
+        kept.X[v] = torch.where(conflicts[:, v].view(-1, 1, 1), moved, plans.X[v])
+    return kept
 
 
 def late(X: Tensor, U: Tensor, stages: int) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ Notes on decomposition methods, 2007).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,14 +23,13 @@ from torch import Tensor
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.fleets.among import Among
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.forces import balancing_forces
+from torchgco.fleets.forces import balancing_forces, between_two, responses
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords
 from torchgco.kernels import path_clearance
-from torchgco.lagrangian.kkt import RightSides
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.measured import segment_distance
 from torchgco.problem.problem import Problem
-from torchgco.sensitivity.points import rows_that_hold, solve_at
 from torchgco.solution import Solution
 from torchgco.solvers.interior import InteriorPoint
 
@@ -42,8 +41,6 @@ MORE = 1e-4  # m, by which pairs stay farther apart between the knots than where
 BEYOND = 1.5  # times what touches an obstacle between the knots, by which it is larger in the next round
 BACK, ON, SHORTEST = 0.3, 2.0, 0.02  # the step of the planes: times after a round that fails, and that serves; least
 LOOSE = 0.03  # share of what two keep by which they may come closer on the way to it: planes with no room have no inside
-TINY = 1e-9  # m, below which two places are one
-AT_ONCE = 64  # problems whose responses are held
 # From near guesses: a large barrier would lose them.
 SOLVER = InteriorPoint(tolerance=1e-6, initial_barrier=1e-3, max_iterations=60)
 
@@ -97,21 +94,11 @@ class Sides:
 
     def responses(self, rows: Tensor, position: slice) -> Tensor:
         """Of places at knots 1..N to forces there, (r, N d, N d), m per unit; NaN where the minimum isn't strict."""
-        problem, solution = self.problem.take(rows), self.solution.take(rows)
-        holds, _ = rows_that_hold(problem, solution)
-        sizes = [lam[0].numel() for lam in solution.multipliers.lam]
-        first = sum(sizes[: self.place])
-        holds[:, first : first + sizes[self.place]] = False
-        B, N, n, d = problem.B, problem.N, problem.n, position.stop - position.start
-        a = solution.X.new_zeros(N, d, B, N + 1, n + problem.m)
-        for k in range(N):
-            for axis in range(d):
-                a[k, axis, :, k + 1, position.start + axis] = -1.0
-        gaps, none = a.new_zeros(()).expand(N * d, B, N, n), a.new_zeros(()).expand(N * d, B, holds.shape[1])
-        right = RightSides(a.flatten(0, 1), gaps, none)
-        found = solve_at(problem, solution, holds, right)
-        moved = found.z[:, :, 1:, position].permute(1, 2, 3, 0).flatten(1, 2)
-        return torch.where(found.definite.view(-1, 1, 1), moved, torch.nan)
+        solution = self.solution.take(rows)
+        lam = list(solution.multipliers.lam)
+        del lam[self.place]
+        own = replace(solution, multipliers=Multipliers(tuple(lam), solution.multipliers.mu))
+        return responses(self.bare.take(rows), own, position)
 
 
 class SharedRoom:
@@ -140,18 +127,18 @@ class SharedRoom:
 
     def run(self) -> Plans:
         """The best plans of each; those of the last round where none was sound."""
-        for number in range(ROUNDS):
+        for _ in range(ROUNDS):
             rows = self.live.nonzero().flatten()
             if len(rows) == 0 or self.late():
                 break
-            self._round(rows, first=number == 0)
+            self._round(rows)
         lost = (~torch.isfinite(self.least)).nonzero().flatten()
         self.best.put(lost, self.now.take(lost))
         return self.best
 
-    def _round(self, rows: Tensor, first: bool = False) -> None:
-        """Plan between new planes, and keep what is better; in the first round as points."""
-        room, p = self._room(rows, first)
+    def _round(self, rows: Tensor) -> None:
+        """Plan between new planes, and keep what is better."""
+        room, p = self._room(rows)
         sides = [self._solved(i, rows, room, p) for i in range(len(self.forms))]
         new, cost, fine = self._gathered(rows, sides)
         short = self._short(rows, new)
@@ -165,7 +152,7 @@ class SharedRoom:
         kept = better.nonzero().flatten()
         self.now.put(rows[kept], new.take(kept))
         self.cost[rows[kept]], self.sound[rows[kept]] = cost[kept], sound[kept]
-        whole = better & (self.step[rows] >= 1.0) & (not first)
+        whole = better & (self.step[rows] >= 1.0)
         self.needed[rows[whole]] += short[whole]
         self.step[rows] = torch.where(better, (ON * self.step[rows]).clamp(max=1.0), BACK * self.step[rows])
         self.live[rows] = ~small & (self.step[rows] > SHORTEST)
@@ -173,17 +160,16 @@ class SharedRoom:
         if len(again):
             self._exchange(rows, again, sides)
 
-    def _room(self, rows: Tensor, first: bool) -> tuple[Room, Tensor]:
+    def _room(self, rows: Tensor) -> tuple[Room, Tensor]:
         """Planes between the vehicles of some, halfway between where they are and where forces ask them to be; and
         places (c, V, K, d) to begin with."""
         p, step = self.fleet.places(self.now.take(rows).X), self.step[rows].view(-1, 1, 1, 1)
         normals, gap = between_two(p)
-        step = 0.0 * step if first else step
         middle = p + step * self.shift[rows]
         offsets = 0.5 * (normals * (middle.unsqueeze(2) + middle.unsqueeze(1))).sum(-1)
         needed = self.needed[rows]
         lacks = (needed - gap).clamp(min=0.0)
-        needed = torch.minimum(needed, gap + step * lacks - (1.0 - step) * LOOSE * needed) * (not first)
+        needed = torch.minimum(needed, gap + step * lacks - (1.0 - step) * LOOSE * needed)
         return Room(normals, offsets, needed, self.needed[rows]), middle
 
     def _solved(self, i: int, rows: Tensor, room: Room, p: Tensor) -> Sides:
@@ -236,38 +222,17 @@ class SharedRoom:
     def _exchange(self, rows: Tensor, again: Tensor, sides: Sequence[Sides]) -> None:
         """Where forces between the vehicles would move them, of some of the fleets in `rows`."""
         c, (V, K, d) = len(again), self.shift.shape[1:]
-        forces, responses = self.shift.new_zeros(c, V, K, d), self.shift.new_zeros(c, V, (K - 1) * d, (K - 1) * d)
+        forces, answers = self.shift.new_zeros(c, V, K, d), self.shift.new_zeros(c, V, (K - 1) * d, (K - 1) * d)
         for part in sides:
             position = self.fleet.members[part.whose[0]].position
             push = part.forces(position)
             for place, v in enumerate(part.whose):
                 forces[:, v] = push[place * len(rows) + again]
             at = torch.cat([place * len(rows) + again for place in range(len(part.whose))])
-            found = torch.cat([part.responses(some, position) for some in at.split(AT_ONCE)])
+            found = part.responses(at, position)
             for place, v in enumerate(part.whose):
-                responses[:, v] = found[place * c : (place + 1) * c]
+                answers[:, v] = found[place * c : (place + 1) * c]
         chosen = rows[again]
         normals, gap = between_two(self.fleet.places(self.now.take(chosen).X))
         for i, c in enumerate(chosen.tolist()):
-            self.shift[c] = balancing_forces(normals[i], gap[i], self.needed[c], forces[i], responses[i], NEAR)
-
-
-def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
-    """Normals (c, V, V, K, d) of planes between any two of the places p (c, V, K, d), and how far apart these are along
-    them, (c, V, V, K), m.
-
-    At each knot the shortest way between the two, then or in the stages beside it: so who passes whom on which side
-    stays as it is, however fast they are.
-    """
-    away = p.unsqueeze(2) - p.unsqueeze(1)
-    a, along = away[..., :-1, :], away.diff(dim=-2)
-    share = -(a * along).sum(-1) / along.square().sum(-1).clamp(min=torch.finfo(p.dtype).tiny)
-    nearest = a + share.clamp(0.0, 1.0).unsqueeze(-1) * along
-    before, after = (torch.cat(ends, dim=-2) for ends in ((nearest[..., :1, :], nearest), (nearest, nearest[..., -1:, :])))
-    nearer = (before.norm(dim=-1) < after.norm(dim=-1)).unsqueeze(-1)
-    way = torch.where(nearer, before, after)
-    size = way.norm(dim=-1, keepdim=True)
-    v, aside = torch.arange(p.shape[1]), torch.zeros_like(away)
-    aside[..., 0] = (v.unsqueeze(1) - v).sign().view(1, len(v), len(v), 1).to(away)  # of two at one place
-    normals = torch.where(size > TINY, way / size.clamp(min=TINY), aside)
-    return normals, (normals * away).sum(-1)
+            self.shift[c], _ = balancing_forces(normals[i], gap[i], self.needed[c], forces[i], answers[i], NEAR)

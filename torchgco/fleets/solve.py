@@ -14,6 +14,7 @@ from torch import Tensor
 from torchgco.base import clock
 from torchgco.base.tree import put, take
 from torchgco.fleets.among import Among
+from torchgco.fleets.coming_apart import ComingApart
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, aside
 from torchgco.fleets.plans import Plans, Solve, cat
@@ -76,10 +77,12 @@ def solve_fleet(
         warnings.simplefilter("ignore")
         first = alone(fleet, solve, seed, ids, solver)
         best, forms = _Best(fleet, first.take(torch.arange(fleet.B))), [Among(one, Known()) for one, _ in fleet.forms]
-        rows = best.open
-        if len(rows) and not late():
-            guesses = [aside(fleet, forms, rows, first.take(rows), side) for side in SIDES]
-            _improved(best, forms, rows, guesses, late)
+        for side in SIDES:
+            rows = best.open
+            if len(rows) == 0 or late():
+                break
+            guess = aside(fleet, forms, rows, first.take(rows), side)
+            _improved(best, forms, rows, [ComingApart(fleet, forms, rows, guess, late).run()], late)
         rows = best.open
         if len(rows) and not late():
             orders = [order for b in rows.tolist() for order in _orders(fleet, seed, int(ids[b]))]

@@ -1,0 +1,152 @@
+"""Vehicles that are in each other's way come apart: forces push them, and each answers by its own least cost.
+
+In every round the forces are those of a quadratic programme that would bring all pairs as far apart as they have to be,
+by linear responses of the trajectories (`forces`). Each vehicle is then solved under its forces, and not far from where
+they should bring it, so there is always a solution, whatever the vehicles can do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchgco.base.tree import is_users
+from torchgco.costs.base import Cost
+from torchgco.fleets.among import Among
+from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.forces import balancing_forces, between_two, responses
+from torchgco.fleets.plans import Plans
+from torchgco.problem.known import Known
+from torchgco.problem.problem import Problem
+from torchgco.solvers.interior import InteriorPoint
+
+ROUNDS = 12  # at most
+WIDEST = 0.25  # as a share of what they keep, how far vehicles move in the first round at most
+WIDER, NARROWER = 2.0, 0.3  # times as far after a round that brings them farther apart, and after another one
+CLOSE = 0.02  # share of what a pair keeps that it may lack in the end
+NEAR = 1.0  # by how many times what they keep two may be farther apart whose forces are looked for
+SOLVER = InteriorPoint(tolerance=1e-6, initial_barrier=1e-2, max_iterations=100)
+
+
+@dataclass(frozen=True)
+class Pulled(Cost):
+    """A cost with forces on the position, and springs: cost - force . p + weight / 2 |p - target|^2 at all knots."""
+
+    cost: Cost
+    pull: Tensor  # (B, N+1, d): force + weight target
+    weight: Tensor  # (B, 1)
+    position: slice
+
+    batched: ClassVar[tuple[str, ...]] = ("cost", "pull", "weight")
+    calls_function = property(lambda self: is_users(self.cost))
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        pull = self.pull[:, k] if isinstance(k, int) and x.dim() == 2 else self.pull[:, k : k + 1] if isinstance(k, int) else self.pull[:, k]
+        return self.cost.stage(x, u, k) + self._more(x, pull)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        pull = self.pull[:, -1] if x.dim() == 2 else self.pull[:, -1:]
+        return self.cost.terminal(x) + self._more(x, pull)
+
+    def _more(self, x: Tensor, pull: Tensor) -> Tensor:
+        p = x[..., self.position]
+        weight = self.weight if x.dim() == 2 else self.weight.unsqueeze(1)
+        return ((0.5 * weight * p - pull) * p).sum(-1)
+
+    def rest_controls(self, like: Tensor) -> Tensor:
+        return self.cost.rest_controls(like)
+
+
+class ComingApart:
+    """Rounds of C guesses side by side.
+
+    Args:
+        fleet: of which these are.
+        forms: of its vehicles.
+        of: which of the fleets each of the C is, (C,).
+        plans: guesses, whose controls needn't lead to their states.
+        late: whether the time is over.
+    """
+
+    def __init__(
+        self, fleet: Fleet, forms: Sequence[Among], of: Tensor, plans: Plans, late: Callable[[], bool] = lambda: False
+    ) -> None:
+        self.fleet, self.forms, self.of, self.late = fleet, forms, of, late
+        self.plans = plans.take(torch.arange(len(of)))
+        self.target = fleet.places(plans.X)
+        self.force = torch.zeros_like(self.target)
+        kept = fleet.distances.amax(-1)
+        cost = torch.stack([one.cost.total(x, u) for one, x, u in zip(self._members(of), plans.X, plans.U, strict=True)], 1)
+        self.weight = cost.abs() / (fleet.N * kept.square().clamp(min=1e-12))  # (C, V)
+        self.known = [Known() for _ in forms]
+        self.live = torch.ones(len(of), dtype=torch.bool)
+        self.last: list[_Point | None] = [None] * len(of)
+        self.radius = kept.amax().repeat(len(of)) * WIDEST
+
+    def _members(self, rows: Tensor) -> list[Problem]:
+        return [one.take(rows) for one in self.fleet.members]
+
+    def run(self) -> Plans:
+        """The plans of the last round."""
+        for _ in range(ROUNDS):
+            rows = self.live.nonzero().flatten()
+            if len(rows) == 0 or self.late():
+                break
+            self._round(rows)
+        return self.plans
+
+    def _round(self, rows: Tensor) -> None:
+        c, (V, K, d) = len(rows), self.target.shape[1:]
+        now = self.plans.take(rows)
+        answers = self.target.new_zeros(c, V, (K - 1) * d, (K - 1) * d)
+        for i, (form, (_, whose)) in enumerate(zip(self.forms, self.fleet.forms, strict=True)):
+            own = torch.cat([place * self.fleet.B + self.of[rows] for place in range(len(whose))])
+            bare = form.problem.take(own)
+            weight = torch.cat([self.weight[rows, v] for v in whose])
+            pull = torch.cat([self.force[rows, v] + self.weight[rows, v].view(-1, 1, 1) * self.target[rows, v] for v in whose])
+            problem = bare._with({"cost": Pulled(bare.cost, pull, weight.unsqueeze(-1), bare.position)}, known=self.known[i])
+            X, U = (torch.cat([part[v][rows] for v in whose]) for part in (self.plans.X, self.plans.U))
+            found = SOLVER.solve(problem, U, X0=X)
+            answer = responses(bare, found, bare.position)
+            for place, v in enumerate(whose):
+                at = place * c + torch.arange(c)
+                now.set(v, torch.arange(c), found, at)
+                self.plans.iterations[rows, v] += found.iterations[at]
+                answers[:, v] = answer[at]
+        p = self.fleet.places(now.X)
+        normals, gaps = between_two(p)
+        needed = self.fleet.distances.unsqueeze(-1).expand(V, V, K)
+        short = (needed - gaps).clamp(min=0.0).flatten(1)
+        lacks = short.sum(-1)
+        force = self.force[rows] + self.weight[rows][..., None, None] * (self.target[rows] - p)
+        for i, row in enumerate(rows.tolist()):
+            last = self.last[row]
+            if last is None or lacks[i] < last.lacks:
+                self.plans.put(rows[i : i + 1], now.take(torch.tensor([i])))
+                self.radius[row] *= WIDER
+                if float(short[i].amax()) <= CLOSE * float(self.fleet.distances.amax()):
+                    self.live[row] = False
+                    continue
+                moved, balanced = balancing_forces(normals[i], gaps[i], needed, force[i], answers[i], NEAR)
+                last = self.last[row] = _Point(float(lacks[i]), p[i], force[i], moved, balanced)
+                self.weight[row] = 1.0 / answers[i].diagonal(dim1=-2, dim2=-1).mean(-1)
+            else:
+                self.radius[row] *= NARROWER
+            share = min(1.0, float(self.radius[row] / last.moved.norm(dim=-1).amax()))
+            self.target[row] = last.p + share * last.moved
+            self.force[row] = last.force + share * (last.balanced - last.force)
+
+
+@dataclass
+class _Point:
+    """Where vehicles of a fleet are, and where forces would move them, as far as is known there."""
+
+    lacks: float  # by how much all pairs are too close, m
+    p: Tensor  # (V, K, d)
+    force: Tensor
+    moved: Tensor
+    balanced: Tensor
