@@ -9,6 +9,23 @@ from torch import Tensor
 from torchgco.obstacles.moved import Moved
 from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Call
+from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.session import Session
+
+
+@dataclass(frozen=True)
+class Plain(InteriorPoint, named="solver"):
+    """The interior point alone: what it doesn't solve is no result, so nothing else is looked for there."""
+
+    def run(self, call: Call) -> Solution:
+        session = Session(call, own_units=True)
+        return session.finished(self.solved(session.call), self.admitted(call.problem))
+
+
+# From near guesses: a large barrier would lose them.
+SOLVER = Plain(tolerance=1e-6, initial_barrier=1e-2, max_iterations=100)
 
 
 @dataclass(frozen=True)

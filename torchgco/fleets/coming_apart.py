@@ -16,20 +16,19 @@ from torch import Tensor
 
 from torchgco.base.tree import is_users
 from torchgco.costs.base import Cost
-from torchgco.fleets.among import Among
+from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.forces import balancing_forces, between_two, responses
 from torchgco.fleets.plans import Plans
 from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
-from torchgco.solvers.interior import InteriorPoint
 
 ROUNDS = 12  # at most
+PATIENCE, LEFT = 5, 0.7  # rounds, after which no more than this share of what was lacking may be left
 WIDEST = 0.25  # as a share of what they keep, how far vehicles move in the first round at most
 WIDER, NARROWER = 2.0, 0.3  # times as far after a round that brings them farther apart, and after another one
 CLOSE = 0.02  # share of what a pair keeps that it may lack in the end
 NEAR = 1.0  # by how many times what they keep two may be farther apart whose forces are looked for
-SOLVER = InteriorPoint(tolerance=1e-6, initial_barrier=1e-2, max_iterations=100)
 
 
 @dataclass(frozen=True)
@@ -85,6 +84,7 @@ class ComingApart:
         self.known = [Known() for _ in forms]
         self.live = torch.ones(len(of), dtype=torch.bool)
         self.last: list[_Point | None] = [None] * len(of)
+        self.history: list[list[float]] = [[] for _ in of]
         self.radius = kept.amax().repeat(len(of)) * WIDEST
 
     def _members(self, rows: Tensor) -> list[Problem]:
@@ -136,6 +136,10 @@ class ComingApart:
                 self.weight[row] = 1.0 / answers[i].diagonal(dim1=-2, dim2=-1).mean(-1)
             else:
                 self.radius[row] *= NARROWER
+            past = self.history[row]
+            past.append(last.lacks)
+            if len(past) > PATIENCE and past[-1] > LEFT * past[-1 - PATIENCE]:
+                self.live[row] = False
             share = min(1.0, float(self.radius[row] / last.moved.norm(dim=-1).amax()))
             self.target[row] = last.p + share * last.moved
             self.force[row] = last.force + share * (last.balanced - last.force)

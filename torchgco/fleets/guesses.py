@@ -8,15 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchgco.fleets.among import Among
+from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.plans import Plans
-from torchgco.solvers.interior import InteriorPoint
 
 TINY = 1e-9  # share of a way
 SIDES = 1.0, -1.0  # to the right, to the left
-# From near guesses: a large barrier would lose them.
-SOLVER = InteriorPoint(tolerance=1e-6, initial_barrier=1e-2, max_iterations=100)
 
 
 def bent(X: Tensor, position: slice, side: float, width: Tensor) -> Tensor:

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED
-from torchgco.fleets.among import Among
+from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.guesses import SIDES, SOLVER, bent, in_conflict, late, widths
+from torchgco.fleets.guesses import SIDES, bent, in_conflict, late, widths
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords, states_goal
 from torchgco.judging.judge import judge

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
-from torchgco.fleets.among import Among
+from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.forces import balancing_forces, between_two, responses
 from torchgco.fleets.plans import Plans
@@ -31,7 +31,6 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.measured import segment_distance
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
-from torchgco.solvers.interior import InteriorPoint
 
 ROUNDS = 12  # of planes, at most
 LEAST_GAIN = 1e-3  # share of the cost: rounds that gain less are the last
@@ -39,10 +38,8 @@ FLAT = 100.0  # radius of the balls whose surfaces stand for planes, as a multip
 NEAR = 1.0  # as such a multiple, how much farther apart two may be whose forces are looked for
 MORE = 1e-4  # m, by which pairs stay farther apart between the knots than where they touch
 BEYOND = 1.5  # times what touches an obstacle between the knots, by which it is larger in the next round
-BACK, ON, SHORTEST = 0.3, 2.0, 0.02  # the step of the planes: times after a round that fails, and that serves; least
+BACK, ON, SHORTEST = 0.3, 2.0, 0.05  # the step of the planes: times after a round that fails, and that serves; least
 LOOSE = 0.03  # share of what two keep by which they may come closer on the way to it: planes with no room have no inside
-# From near guesses: a large barrier would lose them.
-SOLVER = InteriorPoint(tolerance=1e-6, initial_barrier=1e-3, max_iterations=60)
 
 
 @dataclass
@@ -155,7 +152,7 @@ class SharedRoom:
         whole = better & (self.step[rows] >= 1.0)
         self.needed[rows[whole]] += short[whole]
         self.step[rows] = torch.where(better, (ON * self.step[rows]).clamp(max=1.0), BACK * self.step[rows])
-        self.live[rows] = ~small & (self.step[rows] > SHORTEST)
+        self.live[rows] = ~small & (self.step[rows] > torch.where(self.sound[rows], BACK, SHORTEST))
         again = (better & self.live[rows]).nonzero().flatten()
         if len(again):
             self._exchange(rows, again, sides)

@@ -92,7 +92,7 @@ def solve_fleet(
             for plans in parts:
                 best.offer(rows, plans)
             if not late():
-                _improved(best, forms, rows, parts, late)
+                _improved(best, forms, rows, [best.plans.take(rows)], late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
 
