@@ -60,9 +60,9 @@ from torchgco.dynamics import (
     Unicycle,
 )
 from torchgco.fleets import Fleet, FleetSolution
+from torchgco.fleets.judging import judge
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
-from torchgco.judging.judge import judge
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, Moved, OscillatingBoxes, Spheres

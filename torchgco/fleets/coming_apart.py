@@ -8,8 +8,8 @@ they should bring it, so there is always a solution, whatever the vehicles can d
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,7 +21,6 @@ from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.forces import balancing_forces, between_two, responses
 from torchgco.fleets.plans import Plans
 from torchgco.problem.known import Known
-from torchgco.problem.problem import Problem
 
 ROUNDS = 12  # at most
 PATIENCE, LEFT = 5, 0.7  # rounds, after which no more than this share of what was lacking may be left
@@ -44,7 +43,8 @@ class Pulled(Cost):
     calls_function = property(lambda self: is_users(self.cost))
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        pull = self.pull[:, k] if isinstance(k, int) and x.dim() == 2 else self.pull[:, k : k + 1] if isinstance(k, int) else self.pull[:, k]
+        at = slice(k, k + 1) if isinstance(k, int) and x.dim() == 3 else k  # samples of one knot have an axis, too
+        pull = self.pull[:, at]
         return self.cost.stage(x, u, k) + self._more(x, pull)
 
     def terminal(self, x: Tensor) -> Tensor:
@@ -79,16 +79,15 @@ class ComingApart:
         self.target = fleet.places(plans.X)
         self.force = torch.zeros_like(self.target)
         kept = fleet.distances.amax(-1)
-        cost = torch.stack([one.cost.total(x, u) for one, x, u in zip(self._members(of), plans.X, plans.U, strict=True)], 1)
+        each = zip(fleet.members, plans.X, plans.U, strict=True)
+        cost = torch.stack([one.take(of).cost.total(x, u) for one, x, u in each], dim=1)
+        # Until the responses are known: what leads a vehicle all the way by what it keeps costs as much as its way.
         self.weight = cost.abs() / (fleet.N * kept.square().clamp(min=1e-12))  # (C, V)
         self.known = [Known() for _ in forms]
         self.live = torch.ones(len(of), dtype=torch.bool)
         self.last: list[_Point | None] = [None] * len(of)
         self.history: list[list[float]] = [[] for _ in of]
         self.radius = kept.amax().repeat(len(of)) * WIDEST
-
-    def _members(self, rows: Tensor) -> list[Problem]:
-        return [one.take(rows) for one in self.fleet.members]
 
     def run(self) -> Plans:
         """The plans of the last round."""
@@ -100,49 +99,50 @@ class ComingApart:
         return self.plans
 
     def _round(self, rows: Tensor) -> None:
+        now, answers = self._solved(rows)
+        p = self.fleet.places(now.X)
+        normals, gaps = between_two(p)
+        needed = self.fleet.distances.unsqueeze(-1).expand(gaps.shape[1:])
+        short = (needed - gaps).clamp(min=0.0).flatten(1)
+        force = self.force[rows] + self.weight[rows][..., None, None] * (self.target[rows] - p)
+        for i, c in enumerate(rows.tolist()):
+            last, lacks = self.last[c], float(short[i].sum())
+            if last is None or lacks < last.lacks:
+                self.plans.put(rows[i : i + 1], now.take(torch.tensor([i])))
+                self.radius[c] *= WIDER
+                if float(short[i].amax()) <= CLOSE * float(needed.amax()):
+                    self.live[c] = False
+                    continue
+                moved, balance = balancing_forces(normals[i], gaps[i], needed, force[i], answers[i], NEAR)
+                last = self.last[c] = _Point(lacks, p[i], force[i], moved, balance)
+                self.weight[c] = 1.0 / answers[i].diagonal(dim1=-2, dim2=-1).mean(-1)
+            else:
+                self.radius[c] *= NARROWER
+            past = self.history[c]
+            past.append(last.lacks)
+            self.live[c] = len(past) <= PATIENCE or past[-1] <= LEFT * past[-1 - PATIENCE]
+            share = min(1.0, float(self.radius[c] / last.moved.norm(dim=-1).amax()))
+            self.target[c] = last.p + share * last.moved
+            self.force[c] = last.force + share * (last.balance - last.force)
+
+    def _solved(self, rows: Tensor) -> tuple[Plans, Tensor]:
+        """What vehicles do under their forces, and responses (c, V, N d, N d)."""
         c, (V, K, d) = len(rows), self.target.shape[1:]
-        now = self.plans.take(rows)
-        answers = self.target.new_zeros(c, V, (K - 1) * d, (K - 1) * d)
+        now, answers = self.plans.take(rows), self.target.new_zeros(c, V, (K - 1) * d, (K - 1) * d)
         for i, (form, (_, whose)) in enumerate(zip(self.forms, self.fleet.forms, strict=True)):
-            own = torch.cat([place * self.fleet.B + self.of[rows] for place in range(len(whose))])
-            bare = form.problem.take(own)
-            weight = torch.cat([self.weight[rows, v] for v in whose])
-            pull = torch.cat([self.force[rows, v] + self.weight[rows, v].view(-1, 1, 1) * self.target[rows, v] for v in whose])
-            problem = bare._with({"cost": Pulled(bare.cost, pull, weight.unsqueeze(-1), bare.position)}, known=self.known[i])
+            bare = form.problem.take(torch.cat([place * self.fleet.B + self.of[rows] for place in range(len(whose))]))
+            of_each = self.weight, self.force, self.target
+            weight, force, target = (torch.cat([part[rows, v] for v in whose]) for part in of_each)
+            cost = Pulled(bare.cost, force + weight.view(-1, 1, 1) * target, weight.unsqueeze(-1), bare.position)
             X, U = (torch.cat([part[v][rows] for v in whose]) for part in (self.plans.X, self.plans.U))
-            found = SOLVER.solve(problem, U, X0=X)
+            found = SOLVER.solve(bare._with({"cost": cost}, known=self.known[i]), U, X0=X)
             answer = responses(bare, found, bare.position)
             for place, v in enumerate(whose):
                 at = place * c + torch.arange(c)
                 now.set(v, torch.arange(c), found, at)
                 self.plans.iterations[rows, v] += found.iterations[at]
                 answers[:, v] = answer[at]
-        p = self.fleet.places(now.X)
-        normals, gaps = between_two(p)
-        needed = self.fleet.distances.unsqueeze(-1).expand(V, V, K)
-        short = (needed - gaps).clamp(min=0.0).flatten(1)
-        lacks = short.sum(-1)
-        force = self.force[rows] + self.weight[rows][..., None, None] * (self.target[rows] - p)
-        for i, row in enumerate(rows.tolist()):
-            last = self.last[row]
-            if last is None or lacks[i] < last.lacks:
-                self.plans.put(rows[i : i + 1], now.take(torch.tensor([i])))
-                self.radius[row] *= WIDER
-                if float(short[i].amax()) <= CLOSE * float(self.fleet.distances.amax()):
-                    self.live[row] = False
-                    continue
-                moved, balanced = balancing_forces(normals[i], gaps[i], needed, force[i], answers[i], NEAR)
-                last = self.last[row] = _Point(float(lacks[i]), p[i], force[i], moved, balanced)
-                self.weight[row] = 1.0 / answers[i].diagonal(dim1=-2, dim2=-1).mean(-1)
-            else:
-                self.radius[row] *= NARROWER
-            past = self.history[row]
-            past.append(last.lacks)
-            if len(past) > PATIENCE and past[-1] > LEFT * past[-1 - PATIENCE]:
-                self.live[row] = False
-            share = min(1.0, float(self.radius[row] / last.moved.norm(dim=-1).amax()))
-            self.target[row] = last.p + share * last.moved
-            self.force[row] = last.force + share * (last.balanced - last.force)
+        return now, answers
 
 
 @dataclass
@@ -153,4 +153,4 @@ class _Point:
     p: Tensor  # (V, K, d)
     force: Tensor
     moved: Tensor
-    balanced: Tensor
+    balance: Tensor  # (V, K, d), the forces that do

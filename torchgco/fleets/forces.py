@@ -60,46 +60,47 @@ def balancing_forces(
     push.index_put_((i, k), size.unsqueeze(-1) * normal, accumulate=True)
     push.index_put_((j, k), -size.unsqueeze(-1) * normal, accumulate=True)
     moved = freed + (responses @ push.flatten(1).unsqueeze(-1)).view(V, K - 1, d)
-    return torch.cat((torch.zeros_like(moved[:, :1]), moved), dim=1), torch.cat((torch.zeros_like(push[:, :1]), push), dim=1)
+    return torch.cat((torch.zeros_like(moved[:, :1]), moved), dim=1), torch.cat(
+        (torch.zeros_like(push[:, :1]), push), dim=1
+    )
 
 
 def balanced(M: Tensor, q: Tensor) -> Tensor:
-    """The l >= 0 (R,) with M l - q >= 0 and l'(M l - q) = 0, M (R, R) symmetric and positive semidefinite."""
-    M = 0.5 * (M + M.T)
-    M = M + SOFT * M.diagonal().mean() * torch.eye(len(q), dtype=M.dtype)
-    scale = q.abs().max().clamp(min=1e-12) / M.diagonal().mean()
-    l, w = torch.full_like(q, float(scale)), torch.full_like(q, float(q.abs().max().clamp(min=1e-12)))
+    """The l >= 0 (R,) with M l - q >= 0 and l'(M l - q) = 0, M (R, R) symmetric and positive semidefinite.
+
+    By the primal-dual method of S. Mehrotra (1992).
+    """
+    M = 0.5 * (M + M.T) + SOFT * M.diagonal().mean() * torch.eye(len(q), dtype=M.dtype)
+    most = q.abs().max().clamp(min=TINY)
+    l, w = torch.full_like(q, float(most / M.diagonal().mean())), torch.full_like(q, float(most))
     first = float(l @ w) / len(q)
     for _ in range(STEPS):
-        r, mean = M @ l - q - w, float(l @ w) / len(q)
-        if mean < ENOUGH * first and float(r.abs().max()) < 1e-9:
+        left, mean = M @ l - q - w, float(l @ w) / len(q)
+        if mean < ENOUGH * first and float(left.abs().max()) < TINY:
             break
-        factor, info = torch.linalg.cholesky_ex(M + torch.diag(w / l))
-        if int(info) != 0:
+        factor, failed = torch.linalg.cholesky_ex(M + torch.diag(w / l))
+        if int(failed) != 0:
             break
-        change = torch.zeros_like(l)
-        other = torch.zeros_like(w)
-        for center in (0.0, None):
-            if center is None:
-                t = min(_most(l, change), _most(w, other))
-                center = (float((l + t * change) @ (w + t * other)) / len(q) / mean) ** 3 * mean
-                target = center - change * other
-            else:
-                target = torch.zeros_like(l)
-            right = -r + (target - l * w) / l
-            change = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
-            other = (target - l * w - w * change) / l
-        t = SHORT * min(_most(l, change), _most(w, other))
-        t = min(t, 1.0)
-        l, w = l + t * change, w + t * other
+        dl, dw = _step(factor, left, l, w, torch.zeros_like(l))
+        t = min(_most(l, dl), _most(w, dw))
+        center = (float((l + t * dl) @ (w + t * dw)) / len(q) / mean) ** 3 * mean
+        dl, dw = _step(factor, left, l, w, center - dl * dw)
+        t = min(1.0, SHORT * min(_most(l, dl), _most(w, dw)))
+        l, w = l + t * dl, w + t * dw
     return l
+
+
+def _step(factor: Tensor, left: Tensor, l: Tensor, w: Tensor, aim: Tensor) -> tuple[Tensor, Tensor]:
+    """The step of l and w to where, to first order, no gap is left and the products l w are `aim`."""
+    right = -left + (aim - l * w) / l
+    dl = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
+    return dl, (aim - l * w - w * dl) / l
 
 
 def _most(z: Tensor, change: Tensor) -> float:
     """The step up to which z stays at least 0, at most 1 / SHORT."""
     ratio = torch.where(change < 0, -z / change, torch.inf)
     return min(float(ratio.min()), 1.0 / SHORT)
-
 
 
 def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
@@ -113,7 +114,8 @@ def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
     a, along = away[..., :-1, :], away.diff(dim=-2)
     share = -(a * along).sum(-1) / along.square().sum(-1).clamp(min=torch.finfo(p.dtype).tiny)
     nearest = a + share.clamp(0.0, 1.0).unsqueeze(-1) * along
-    before, after = (torch.cat(ends, dim=-2) for ends in ((nearest[..., :1, :], nearest), (nearest, nearest[..., -1:, :])))
+    before = torch.cat((nearest[..., :1, :], nearest), dim=-2)
+    after = torch.cat((nearest, nearest[..., -1:, :]), dim=-2)
     nearer = (before.norm(dim=-1) < after.norm(dim=-1)).unsqueeze(-1)
     way = torch.where(nearer, before, after)
     size = way.norm(dim=-1, keepdim=True)
@@ -125,7 +127,8 @@ def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
 
 def responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
     """Of places at knots 1..N to forces there, (B, N d, N d), m per unit; NaN where the minimum isn't strict."""
-    return torch.cat([_responses(problem.take(rows), solution.take(rows), position) for rows in torch.arange(problem.B).split(AT_ONCE)])
+    parts = torch.arange(problem.B).split(AT_ONCE)
+    return torch.cat([_responses(problem.take(rows), solution.take(rows), position) for rows in parts])
 
 
 def _responses(problem: Problem, solution: Solution, position: slice) -> Tensor:

@@ -69,7 +69,7 @@ class Plans:
         """
         good = torch.stack([one.feasible for one in verdict.vehicles], dim=1) & verdict.apart
         claims = torch.isin(self.status, torch.tensor([Status.CONVERGED, Status.FEASIBLE]))
-        self.status = torch.where(good & ~claims, int(Status.FEASIBLE), self.status)
+        self.status = torch.where(good & ~claims & (not late), int(Status.FEASIBLE), self.status)
         lost = Status.TIME_LIMIT if late else Status.INFEASIBLE
         self.status = torch.where(~good & claims, int(lost), self.status)
         return tuple(self._solution(v, one) for v, one in enumerate(fleet.members))

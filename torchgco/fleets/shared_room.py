@@ -38,8 +38,11 @@ FLAT = 100.0  # radius of the balls whose surfaces stand for planes, as a multip
 NEAR = 1.0  # as such a multiple, how much farther apart two may be whose forces are looked for
 MORE = 1e-4  # m, by which pairs stay farther apart between the knots than where they touch
 BEYOND = 1.5  # times what touches an obstacle between the knots, by which it is larger in the next round
-BACK, ON, SHORTEST = 0.3, 2.0, 0.05  # the step of the planes: times after a round that fails, and that serves; least
-LOOSE = 0.03  # share of what two keep by which they may come closer on the way to it: planes with no room have no inside
+BACK, ON = 0.3, 2.0  # times the step of the planes after a round that fails, and after one that serves
+SHORTEST = 0.05  # step
+LOOSE = (
+    0.03  # share of what two keep by which they may come closer on the way to it: planes with no room have no inside
+)
 
 
 @dataclass
