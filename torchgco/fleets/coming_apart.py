@@ -26,7 +26,7 @@ ROUNDS = 12  # at most
 PATIENCE, LEFT = 5, 0.7  # rounds, after which no more than this share of what was lacking may be left
 WIDEST = 0.25  # as a share of what they keep, how far vehicles move in the first round at most
 WIDER, NARROWER = 2.0, 0.3  # times as far after a round that brings them farther apart, and after another one
-CLOSE = 0.02  # share of what a pair keeps that it may lack in the end
+CLOSE, NEARLY = 0.02, 0.25  # shares of what a pair keeps: with so little lacking there is no other round, and planes do
 NEAR = 1.0  # by how many times what they keep two may be farther apart whose forces are looked for
 
 
@@ -69,7 +69,12 @@ class ComingApart:
         of: which of the fleets each of the C is, (C,).
         plans: guesses, whose controls needn't lead to their states.
         late: whether the time is over.
+
+    Attributes:
+        near: which of them are so far apart in the end that planes can do the rest, (C,) bool.
     """
+
+    near: Tensor
 
     def __init__(
         self, fleet: Fleet, forms: Sequence[Among], of: Tensor, plans: Plans, late: Callable[[], bool] = lambda: False
@@ -84,7 +89,7 @@ class ComingApart:
         # Until the responses are known: what leads a vehicle all the way by what it keeps costs as much as its way.
         self.weight = cost.abs() / (fleet.N * kept.square().clamp(min=1e-12))  # (C, V)
         self.known = [Known() for _ in forms]
-        self.live = torch.ones(len(of), dtype=torch.bool)
+        self.live, self.near = torch.ones(len(of), dtype=torch.bool), torch.zeros(len(of), dtype=torch.bool)
         self.last: list[_Point | None] = [None] * len(of)
         self.history: list[list[float]] = [[] for _ in of]
         self.radius = kept.amax().repeat(len(of)) * WIDEST
@@ -110,7 +115,9 @@ class ComingApart:
             if last is None or lacks < last.lacks:
                 self.plans.put(rows[i : i + 1], now.take(torch.tensor([i])))
                 self.radius[c] *= WIDER
-                if float(short[i].amax()) <= CLOSE * float(needed.amax()):
+                worst = float(short[i].amax() / needed.amax())
+                self.near[c] = worst <= NEARLY
+                if worst <= CLOSE:
                     self.live[c] = False
                     continue
                 moved, balance = balancing_forces(normals[i], gaps[i], needed, force[i], answers[i], NEAR)

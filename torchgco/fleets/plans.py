@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -82,10 +82,3 @@ class Plans:
             X, U, self.K[v], torch.zeros_like(U), Multipliers.zero(one, 1.0), one.cost.total(X, U), violation, status,
             self.iterations[:, v], none, none,
         )  # fmt: skip
-
-
-def cat(parts: Sequence[Plans]) -> Plans:
-    """Plans of several batches of fleets as those of one."""
-    X, U, K = ([torch.cat(of) for of in zip(*(getattr(one, name) for one in parts), strict=True)] for name in "XUK")
-    status, iterations = (torch.cat([getattr(one, name) for one in parts]) for name in ("status", "iterations"))
-    return Plans(X, U, K, status, iterations)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,7 @@ from torchgco.fleets.among import Among
 from torchgco.fleets.coming_apart import ComingApart
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, aside
-from torchgco.fleets.plans import Plans, Solve, cat
+from torchgco.fleets.plans import Plans, Solve
 from torchgco.fleets.prioritised import Prioritised
 from torchgco.fleets.shared_room import SharedRoom
 from torchgco.fleets.solution import FleetSolution
@@ -72,38 +72,33 @@ def solve_fleet(
         solver: of vehicles alone.
         ends: the time of the clock after which nothing more is begun, s.
     """
-    ids, late = torch.arange(fleet.B) if ids is None else ids, partial(_late, ends)
+    ids = torch.arange(fleet.B) if ids is None else ids
+    late = partial(_late, ends)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         first = alone(fleet, solve, seed, ids, solver)
         best, forms = _Best(fleet, first.take(torch.arange(fleet.B))), [Among(one, Known()) for one, _ in fleet.forms]
         for side in SIDES:
-            rows = best.open
-            if len(rows) == 0 or late():
-                break
-            guess = aside(fleet, forms, rows, first.take(rows), side)
-            _improved(best, forms, rows, [ComingApart(fleet, forms, rows, guess, late).run()], late)
-        rows = best.open
-        if len(rows) and not late():
-            orders = [order for b in rows.tolist() for order in _orders(fleet, seed, int(ids[b]))]
+            if len(rows := best.open) > 0 and not late():
+                apart = ComingApart(fleet, forms, rows, aside(fleet, forms, rows, first.take(rows), side), late)
+                plans = apart.run()
+                near = apart.near.nonzero().flatten()
+                _improve(best, forms, rows[near], plans.take(near), late)
+        if len(rows := best.open) > 0 and not late():
+            orders = [order for number in ids[rows].tolist() for order in _orders(fleet, seed, number)]
             of = rows.repeat_interleave(ORDERS)
             teams = Prioritised(fleet, forms, of, first.take(of), orders, late).run()
-            parts = [teams.take(torch.arange(i, len(of), ORDERS)) for i in range(ORDERS)]
-            for plans in parts:
-                best.offer(rows, plans)
-            if not late():
-                _improved(best, forms, rows, [best.plans.take(rows)], late)
+            for i in range(ORDERS):
+                best.offer(rows, teams.take(torch.arange(i, len(of), ORDERS)))
+            rows = rows[best.verdict.reached[rows]]
+            _improve(best, forms, rows, best.plans.take(rows), late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
 
-def _improved(
-    best: _Best, forms: list[Among], rows: Tensor, guesses: Sequence[Plans], late: Callable[[], bool]
-) -> None:
-    """Offer what sharing the room makes of guesses for some fleets, (b,) each."""
-    every = cat(guesses)
-    found = SharedRoom(best.fleet, forms, rows.repeat(len(guesses)), every, late).run()
-    for i in range(len(guesses)):
-        best.offer(rows, found.take(torch.arange(i * len(rows), (i + 1) * len(rows))))
+def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
+    """Offer what sharing the room makes of plans for some fleets, (b,)."""
+    if len(rows) > 0 and not late():
+        best.offer(rows, SharedRoom(best.fleet, forms, rows, plans, late).run())
 
 
 def _orders(fleet: Fleet, seed: int, number: int) -> list[list[int]]:
