@@ -22,7 +22,7 @@ from torchgco.fleets.forces import balancing_forces, between_two, responses
 from torchgco.fleets.plans import Plans
 from torchgco.problem.known import Known
 
-ROUNDS = 12  # at most
+ROUNDS = 24  # at most
 PATIENCE, LEFT = 5, 0.7  # rounds, after which no more than this share of what was lacking may be left
 WIDEST = 0.25  # as a share of what they keep, how far vehicles move in the first round at most
 WIDER, NARROWER = 2.0, 0.3  # times as far after a round that brings them farther apart, and after another one
