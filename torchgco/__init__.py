@@ -33,7 +33,7 @@ from torchgco.base.errors import (
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold, IteratedMPPI
-from torchgco.compiled import MPC, Answer, Compiled, MPPIController, compile
+from torchgco.compiled import MPC, Answer, Compiled, FleetMPC, MPPIController, compile
 from torchgco.constraints import (
     Cone,
     Constraint,
@@ -91,7 +91,7 @@ __all__ = [  # noqa: RUF022
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
     "solve", "MPC", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets",
-    "Fleet", "FleetSolution",
+    "Fleet", "FleetSolution", "FleetMPC",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result
