@@ -12,6 +12,7 @@ from torch import Tensor
 
 import torchgco
 from tests.fleets.scenes import DISC, DT, D, disc, pushed, ring, swaps
+from tests.view.test_packing import part
 from torchgco import Boxes, Fleet, FreeTime, FunctionDynamics, InputError, Moved, Problem, Spheres, judge
 from torchgco.fleets.among import Among
 from torchgco.fleets.fleet import _forms
@@ -182,8 +183,8 @@ def test_problems_of_one_form_are_one_batch() -> None:
     assert whose == (0, 1, 2) and batch.B == 3
     X, U = torch.randn(3, 51, 4, dtype=D), torch.randn(3, 50, 2, dtype=D)
     for v, one in enumerate(members):
-        for part, own in zip(batch.constraints, one.constraints, strict=True):
-            torch.testing.assert_close(part.value(X, U)[v], own.value(X[[v]], U[[v]])[0])
+        for row, own in zip(batch.constraints, one.constraints, strict=True):
+            torch.testing.assert_close(row.value(X, U)[v], own.value(X[[v]], U[[v]])[0])
         torch.testing.assert_close(batch.cost.total(X, U)[v], one.cost.total(X[[v]], U[[v]])[0])
     other = disc([-2, 0], [2, 0], model=FunctionDynamics(lambda x, u: pushed(x, u), 4, 2, DT, "rk4", slice(0, 2)))
     assert len(_forms((members[0], other))) == 2
@@ -204,6 +205,10 @@ def test_a_figure_has_a_colour_for_each_vehicle() -> None:
     figure = torchgco.plot(fleet, found)
     colours = {line.get_color() for ax in figure.axes for line in ax.lines if len(line.get_xdata()) > 2}  # type: ignore[arg-type]
     assert len(colours) >= 3
+    html = torchgco.show(fleet, found).html
+    head, first = part(html, "head"), part(html, "part-0")
+    assert [one["name"] for one in head["solvers"]] == ["vehicle 0", "vehicle 1", "vehicle 2"]
+    assert len({one["colour"] for one in head["solvers"]}) == 3 and len(first["flights"]) == 3
     with pytest.raises(InputError, match="b: expected the place of a fleet, 0 to 0"):
         torchgco.plot(fleet, found, 1)
 
@@ -248,5 +253,5 @@ def test_arguments_that_fleets_do_not_take_are_named() -> None:
             torchgco.judge(fleet, U, **more)  # type: ignore[call-overload]
     with pytest.raises(InputError, match=r"solve.U0: expected None of a fleet"):
         torchgco.solve(fleet, U0=torch.zeros(1, 50, 2))  # type: ignore[call-overload]
-    with pytest.raises(InputError, match=r"a Problem, such as fleet.members\[0\]"):
+    with pytest.raises(InputError, match="solution: expected a fleet and its solution, got NoneType"):
         torchgco.show(fleet, None)  # type: ignore[arg-type]
