@@ -6,7 +6,7 @@
 # make general   48 families of constrained problems, compared with IPOPT and FATROP (ARGS="--solvers gco al_ilqr" for others)
 # make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)
 # make maps   drawn worlds as occupancy grids, and missions in worlds that are seen on the way: benchmarks/results/maps.md (under
-#             forty minutes on two cores); maps-long: the same with 100 and more missions of a kind (a day)
+#             forty minutes on two cores)
 # make floors   drawn floor plans, gco against a grid path that is pursued (ARGS="--maps DIR": real maps, too): some minutes
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
@@ -43,7 +43,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: floors study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps maps-known maps-seen maps-long \
+.PHONY: floors study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps maps-known maps-seen \
     benchmark benchmark-gpu ladder docs figures paper
 
 study: $(RUNTIME)
@@ -91,10 +91,6 @@ maps-seen: $(RUNTIME)
 
 floors: $(RUNTIME)
 	$(BIN)/python -m benchmarks.families.floors --write $(ARGS)
-
-maps-long: $(RUNTIME)
-	$(BIN)/python -m benchmarks.families.unknown --long --write
-	$(BIN)/python -m benchmarks.families.missions --many 10000 --write
 
 worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.families.worlds --write $(ARGS)

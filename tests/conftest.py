@@ -1,6 +1,7 @@
 """Settings of all tests: one thread each, because parallel test workers share the cores."""
 
 import gc
+import logging
 import os
 import signal
 import sys
@@ -46,6 +47,16 @@ def _parse_once() -> None:
 
 
 _parse_once()
+
+
+@pytest.fixture(autouse=True)
+def _logs_as_before() -> Iterator[None]:
+    """What a test has configured, as Hydra does in this process, doesn't take the lines of the next one."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
 
 
 @cache

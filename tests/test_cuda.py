@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -134,6 +135,21 @@ def test_a_network_is_solved_and_compiling_for_the_gpu_refused() -> None:
     assert_same(torchgco.solve(there, verbose=False), expected)
     with pytest.raises(InputError, match="one on the CPU"):
         torchgco.compile(there, solver="interior_point")
+
+
+def test_c_on_the_cpu_solves_problems_of_the_device() -> None:
+    """By copies, with the CPU's bits; gradients lead back to tensors of the device."""
+    use_native(True)
+    grads = []
+    for device in ("cuda", "cpu"):
+        problem, _ = discs(device)
+        x0 = problem.x0.clone().requires_grad_()
+        solution = torchgco.solve(replace(problem, x0=x0), solver="interior_point", verbose=False)
+        assert solution.X.device.type == device
+        solution.X.square().sum().backward()
+        grads.append((solution.X.detach().cpu(), x0.grad.cpu()))
+    assert torch.equal(grads[0][0], grads[1][0])
+    torch.testing.assert_close(grads[0][1], grads[1][1], rtol=1e-6, atol=1e-9)
 
 
 def test_single_precision_works() -> None:

@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from torchgco import Problem
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.reports import export, identify, report, view
+from torchgco.experiments.reports.parser import RunParser
 from torchgco.kernels import EagerWarning
 from torchgco.native import store
 from torchgco.native.compiler import find_compiler
@@ -89,20 +90,22 @@ def name_of(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+REPORTS: dict[str, Callable[[list[str]], Any]] = {
+    f"torchgco-{module.__name__.rpartition('.')[2]}": module.main for module in (report, view, export, identify)
+}
+
+
 def accept(command: str) -> None:
     """Raise, or exit, unless the program accepts the command's arguments; runs nothing."""
     program, *words = shlex.split(command, comments=True)
     if program == "torchgco":
         accept_overrides([word for word in words if word not in ("--help", "--version")])
-    elif program == "torchgco-report":
-        options = report._parser().parse_args(words)
-        assert options.folders
-    elif program == "torchgco-view":
-        view._parser().parse_args(words)
-    elif program == "torchgco-export":
-        export._parser().parse_args(words)
-    elif program == "torchgco-identify":
-        accept_overrides(identify._parser().parse_args(words).words)
+    elif program in REPORTS:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(RunParser, "run", lambda parser, arguments, work: parser.parse_args(arguments))
+            options = REPORTS[program](words)
+        assert program != "torchgco-report" or options.folders
+        accept_overrides(getattr(options, "words", []))
     elif program == "make":
         accept_make(words)
     elif program == "python":

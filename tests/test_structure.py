@@ -28,8 +28,10 @@ LAYERS = [
     ["baselines"],
     ["presets"],
     ["fleets"],
-    ["api", "envs", "experiments"],
+    ["api", "envs"],
     ["compiled"],
+    ["export"],
+    ["experiments"],
 ]
 MODULES = sorted(
     p for p in PACKAGE.rglob("*.py") if (p.name != "__main__.py" and p.parent != PACKAGE) or p.stem != "__init__"

@@ -22,9 +22,11 @@ from torchgco import presets, sensitivity
 from torchgco.api import compare, plot, show, solve
 from torchgco.base.errors import (
     ContactWarning,
+    DeviceWarning,
     GuidanceWarning,
     HorizonWarning,
     InputError,
+    RefusalWarning,
     ScaleWarning,
     StartWarning,
     StepWarning,
@@ -59,6 +61,7 @@ from torchgco.dynamics import (
     RotorTracking,
     Unicycle,
 )
+from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.judging import judge
 from torchgco.guidance import GCO, MPPI
@@ -90,15 +93,17 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "MPC", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "show", "Status", "presets",
+    "solve", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
+    "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
     "Fleet", "FleetSolution", "FleetMPC",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
-    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning", "ScaleWarning",
-    "StartWarning", "StepWarning", "TraceWarning",
+    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning",
+    "RefusalWarning", "ScaleWarning", "StartWarning", "StepWarning", "TraceWarning",
+    "DeviceWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

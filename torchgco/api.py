@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import partial
 from typing import TYPE_CHECKING, Any, Never, overload
 
 import torch
@@ -24,13 +25,14 @@ from torchgco.fleets.solve import solve_fleet
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
-from torchgco.kernels import current, open_loop
+from torchgco.kernels import copied_to, costates, current, on_cpu, open_loop
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times, guessing_times
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.refusals import spared
 from torchgco.search import Restarts
 from torchgco.search.reach import short_horizons
 from torchgco.sensitivity import asks_for_gradients, attached, check_smoothing
@@ -127,21 +129,28 @@ def solve(
     asked = problem = current_problem(problem)
     warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
-    name = _refuse(misplaced, problem, solver)
-    X0 = warm.X if X0 is None and warm is not None and problem.time is not None else X0
-    solver = _solver(solver, problem, check_value(record, bool, "record"))
-    (problem, U0), multipliers = _start(problem, warm, solver, U0), None if warm is None else warm.multipliers
-    verbose = check_value(verbose, bool | None, "verbose")
+    name, record = _refuse(misplaced, problem, solver), check_value(record, bool, "record")
+    solver, X0 = _solver(solver, problem, record), warm.X if X0 is None and warm and problem.time else X0
+    if solver.kernels is None and (there := on_cpu(problem)) is not None:
+        problem, (U0, ids, warm, X0) = there, copied_to((U0, ids, warm, X0), there.x0)
+    problem, U0 = spared(problem, partial(_start, warm, solver, U0))
+    multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-    more: dict[str, Any] = {"callback": watcher} if watcher.shows else {}
     try:
-        found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds, X0=X0, **more)
+        found = solver.solve(problem, U0, seed, ids, multipliers, watcher.callback, max_seconds, X0)
         watcher.end(found)
     finally:
         watcher.close()
-    found = replace(found, account=found.account and found.account.asked(asked, name))
     _warn(problem, found, warm is None)
+    problem, found = _returned(asked, problem, found, name)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
+
+
+def _returned(asked: Problem, problem: Problem, found: Solution, name: str | None) -> tuple[Problem, Solution]:
+    """The problem and the solution on the device of the problem that was asked for, which the solution knows."""
+    if problem.x0.device != asked.x0.device:
+        problem, found = current(asked), copied_to(found, asked.x0)
+    return problem, replace(found, account=found.account and found.account.asked(asked, name))
 
 
 def _solve_fleet(
@@ -251,7 +260,7 @@ def _refuse(misplaced: Mapping[str, Any], problem: Problem, solver: Solver | str
         made = option_places(_solver(solver, problem, False))
         near = get_close_matches(name, inspect.signature(solve).parameters, n=1)
         expected = "an argument of solve" + "".join(f", such as {other}" for other in near)
-        if places := [place for place in made if place.rpartition(".")[2] == name]:
+        if places := [path for path in made if path.rpartition(".")[2] == name]:
             whose = f"presets.{solver}(problem)" if isinstance(solver, str) else "your solver"
             expected = f"an option of the solver in its place: {', '.join(places)} of {whose}, by dataclasses.replace"
         raise InputError(f"solve.{name}", expected, shown(value))
@@ -265,10 +274,12 @@ def _checked(warm: Any) -> Solution | None:
     return warm and warm.detach()
 
 
-def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor | None) -> tuple[Problem, Tensor]:
+def _start(warm: Solution | None, solver: Solver, U0: Tensor | None, problem: Problem) -> tuple[Problem, Tensor]:
     """Controls (B, N, m) to begin with, where none are given, and the problem with the guess of its free starts."""
+    if problem.B > 0:
+        problem = current(problem)  # traced once, for the guess, for the solve and for the warnings after it
     if U0 is not None:
-        return current(problem), U0  # traced once, for the solve and for the warnings after it
+        return problem, U0
     if warm is not None:
         if problem.time is not None:
             problem = guessing_times(problem, warm.t)
@@ -278,7 +289,6 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
         return problem, warm.U
     if problem.B == 0:
         return problem, problem.x0.new_zeros(0, problem.N, problem.m)
-    problem = current(problem)  # traced once, for the guess too
     whole = for_solvers(problem)
     solver.announce(whole)
     return problem, _guess(problem, whole)
@@ -287,6 +297,8 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver, U0: Tensor |
 def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
     """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it."""
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    if solution.account is not None:
+        problem = solution.account.problem or problem  # whose code may refuse states
     if cold:
         _warn_of_horizon(problem, solution, claims)
     _warn_of_scale(problem, solution, claims)
@@ -345,7 +357,7 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None
         return
     part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]
     times = None if solution.times is None else solution.times[rows]
-    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], doubted=True)
+    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates)
     long = found.large.nonzero().flatten().tolist()
     if long:
         warnings.warn(
@@ -385,7 +397,7 @@ def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
     from torchgco.plotting.fleets import fleet_figure  # matplotlib takes a second to load
 
     _fleet_of(fleet, solution)
-    arrays = [[part.detach().cpu().double().numpy() for part in (one.X, one.U)] for one in solution]
+    arrays = [[tensor.detach().cpu().double().numpy() for tensor in (member.X, member.U)] for member in solution]
     X, U = zip(*arrays, strict=True)
     return fleet_figure(fleet.members, X, U, fleet.distances.cpu().double().numpy(), b)
 

@@ -162,7 +162,7 @@ class Solution:
             raise InputError("solution", "one of fixed times: later knots of a free time lie elsewhere", "a free time")
         last, problem = self.horizon, None if self.account is None else self.account.problem
         stage = None if last is None else last - 1
-        U, K, d = (shifted(part, steps, last=stage) for part in (self.U, self.K, self.d))
+        U, K, d = (shifted(tensor, steps, last=stage) for tensor in (self.U, self.K, self.d))
         X, multipliers = shifted(self.X, steps, last=last), self.multipliers.shifted(steps, problem)
         lost, none = torch.full_like(self.cost, torch.nan), torch.zeros_like(self.status)
         return replace(
@@ -201,13 +201,13 @@ class Solution:
 
     def to_dict(self) -> dict[str, Any]:
         """X, U and the numbers of each problem as NumPy arrays, by name; `status` as names, t where it is known."""
-        held: dict[str, Any] = {name: getattr(self, name).detach().cpu().numpy() for name in _TENSORS}
-        held["status"] = [status.name for status in self.statuses]
+        arrays: dict[str, Any] = {name: getattr(self, name).detach().cpu().numpy() for name in _TENSORS}
+        arrays["status"] = [status.name for status in self.statuses]
         if self.horizon is not None:
-            held["horizon"] = self.horizon.cpu().numpy()
+            arrays["horizon"] = self.horizon.cpu().numpy()
         with suppress(InputError):  # dynamics without a time step
-            held["t"] = self.t.detach().cpu().numpy()
-        return held
+            arrays["t"] = self.t.detach().cpu().numpy()
+        return arrays
 
     def of_first_states(self, n: int, horizon: Tensor | None = None) -> Solution:
         """The same with the first n states alone, of which K is then the feedback, and with these horizons."""
@@ -350,11 +350,11 @@ class Solution:
             raise InputError("path", "a solution file", f"{path}, whose arrays have other shapes")
         tensors: dict[str, Any] = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
         lam = tuple(tensors[f"lam{i}"] for i in range(count))
-        own: dict[str, Any] = {name: tensors[name] for name in _TENSORS}
+        tensors_kept: dict[str, Any] = {name: tensors[name] for name in _TENSORS}
         kernels = str(arrays["kernels"]) if "kernels" in arrays else None
         account = Account(t=tensors.get("t"), kernels=kernels) if "t" in tensors or kernels is not None else None
-        own |= {name: tensors.get(name) for name in ("horizon", "times")}
-        return cls(multipliers=Multipliers(lam, tensors["mu"]), account=account, **own)
+        tensors_kept |= {name: tensors.get(name) for name in ("horizon", "times")}
+        return cls(multipliers=Multipliers(lam, tensors["mu"]), account=account, **tensors_kept)
 
 
 def _places(index: Any, B: int, device: torch.device) -> Tensor:

@@ -2,7 +2,7 @@
 
 Every case is a study of missions below outputs/unknown, so that a run that was stopped resumes where it was. Missions
 fly alone, one after the other, in one thread. With --write the tables are put into results/maps.md, with date and
-commit: those of `--count` missions per case, and with --long those of the long rows, in a table of their own.
+commit.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ class Case:
 
     Args:
         overrides: of `torchgco experiment=mission_unknown`.
-        count, long: missions that the short and the long table fly.
+        count: missions that the table flies.
         at_rest: whether nothing moves, so that plans can be safe.
     """
 
     overrides: tuple[str, ...]
     count: int
-    long: int
     at_rest: bool = True
 
 
@@ -59,24 +58,24 @@ def _moving(count: int, movers: str) -> tuple[str, ...]:
 
 
 CASES = {
-    **{f"{count} cylinders": Case(_flat(count), 6, 100) for count in (41, 81, 162)},
+    **{f"{count} cylinders": Case(_flat(count), 6) for count in (41, 81, 162)},
     "300 m, 569 cylinders": Case(
         (
             "scenario=cylinders", "scenario.num_obstacles=569", "scenario.region=[[5,305],[-20,20]]", *START, *DENSE,
             "mission.explorer.region=[[-5,310],[-21,21],[0,6]]", "mission.explorer.speed=4", "mission.duration=150",
-        ), 2, 100,
+        ), 2,
     ),
-    "forest, 30 spheres": Case(("scenario=forest_mission",), 8, 100),
-    "walls": Case(("scenario=walls", "scenario.start=[1,1,0]"), 8, 100),
-    "mazes, 3 walls": Case(("scenario=mazes", "mission.duration=90"), 6, 100),
+    "forest, 30 spheres": Case(("scenario=forest_mission",), 8),
+    "walls": Case(("scenario=walls", "scenario.start=[1,1,0]"), 8),
+    "mazes, 3 walls": Case(("scenario=mazes", "mission.duration=90"), 6),
     "rooms with doors": Case(
         (
             "scenario=rooms", "mission.duration=90", "mission.explorer.speed=3",
             "mission.explorer.region=[[-2,18],[-2,14],[-1.5,4.5]]", *ALL_AROUND,
-        ), 4, 200,
+        ), 4,
     ),
-    **{f"{count} moving, known": Case(_moving(count, "known"), 3, 1000, at_rest=False) for count in (50, 100, 200)},
-    **{f"{count} moving, seen": Case(_moving(count, "tracked"), 3, 1000, at_rest=False) for count in (50, 100, 200)},
+    **{f"{count} moving, known": Case(_moving(count, "known"), 3, at_rest=False) for count in (50, 100, 200)},
+    **{f"{count} moving, seen": Case(_moving(count, "tracked"), 3, at_rest=False) for count in (50, 100, 200)},
 }  # fmt: skip
 HEAD = (
     "world", "n", *(outcome.name for outcome in Outcome), "safe periods", "flight time", "clearance", "speed",
@@ -127,10 +126,11 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     return markdown(HEAD, lines)
 
 
-def short(name: str, table: str, misses: str, *few: str) -> str:
-    """Both tables as files, and short forms of the first."""
-    missed = filed(f"{name}-misses", misses) if misses.startswith("|") else misses
-    return f"{filed(name, table, *few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
+def short(table: str, misses: str) -> str:
+    """Both tables as files, and a short form of the first."""
+    missed = filed("unknown-misses", misses) if misses.startswith("|") else misses
+    few = chosen(table, (*HEAD[:5], "flight time", "clearance"))
+    return f"{filed('unknown', table, few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
 
 
 def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
@@ -151,11 +151,8 @@ def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     return markdown(head, lines) if lines else none
 
 
-def times(log: pd.DataFrame, name: str = "unknown-times", shown: bool = True) -> str:
-    """Markdown: milliseconds of the planner and of its parts, over the periods of all missions but their first.
-
-    Those of the planner are `shown` beside the file.
-    """
+def times(log: pd.DataFrame) -> str:
+    """Markdown: milliseconds of the planner and of its parts, over the periods of all missions but their first."""
     later = log[log["step"] > 0]
     names = {
         "map: a scan's cells": "map_seconds", "field: distances and corridors": "field_seconds",
@@ -168,33 +165,28 @@ def times(log: pd.DataFrame, name: str = "unknown-times", shown: bool = True) ->
     over = int((later["planner_seconds"] > PERIOD).sum())
     head = ("milliseconds", "median", "90 %", "99 %", "longest")
     whole = markdown(head, rows)
-    few = [chosen(whole, head, milliseconds=(rows[-1][0],))] if shown else []
-    return filed(name, whole, *few, f"{over} of {len(later)} periods took longer than 50 ms.")
+    few = chosen(whole, head, milliseconds=(rows[-1][0],))
+    return filed("unknown-times", whole, few, f"{over} of {len(later)} periods took longer than 50 ms.")
 
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.families.unknown", description="Fly what isn't known.")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES), metavar="NAME")
     parser.add_argument("--count", type=int, help="missions of each case; by default its own number")
-    parser.add_argument("--long", action="store_true", help="the long table")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "unknown")
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/maps.md")
     asked = parser.parse_args(words)
-    counts = {name: asked.count or (CASES[name].long if asked.long else CASES[name].count) for name in asked.cases}
-    tables = [fly(name, count, asked.outputs) for name, count in counts.items()]
+    tables = [fly(name, asked.count or CASES[name].count, asked.outputs) for name in asked.cases]
     trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
     head = f"{origin('Flown')}, seed 0, {machine()}."
-    kind = "unknown-long" if asked.long else "unknown"
-    flights = table(trials, log)
-    few = [] if asked.long else [chosen(flights, (*HEAD[:5], "flight time", "clearance"))]
     blocks = {
-        "worlds": f"{head}\n\n{short(kind, flights, misses(trials, log), *few)}",
-        "times": times(log, f"{kind}-times", shown=not asked.long),
+        "worlds": f"{head}\n\n{short(table(trials, log), misses(trials, log))}",
+        "times": times(log),
     }
     for name, text in blocks.items():
         print(text)
         if asked.write:
-            put(RESULTS / "maps.md", f"long {name}" if asked.long else name, text)
+            put(RESULTS / "maps.md", name, text)
     return 0
 
 

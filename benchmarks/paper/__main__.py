@@ -25,7 +25,7 @@ from torchgco.plotting.style import save
 FOLDER, PAGE = RESULTS / "paper", RESULTS / "paper.md"
 DPI = 110
 ROUNDING = 5  # of the 255 shades of a colour
-DRAWS = (0, 112)  # of the two trials: 112 is the only one of 0 to 191 that passes below the circles
+DRAWS = (0, 112)  # of the two trials: 112 passes below the circles, as few do
 SOLVERS = ("al_ilqr", "gco_paper", "gco")  # of Figures 6 and 7
 MARKS = "<!-- table-A4 -->", "<!-- end table-A4 -->"
 MISSION_MARKS = "<!-- missions -->", "<!-- end missions -->"

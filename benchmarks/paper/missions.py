@@ -22,7 +22,7 @@ from torchgco.plotting.course import VIEWS, flight
 from torchgco.plotting.style import INK, PALETTE, SMALL, legend
 from torchgco.solution import Fate
 
-SHOWN = "gco_paper"  # the solver of Figures 10 to 12, A4 and A5
+FOLLOWED = "gco_paper"  # the solver of Figures 10 to 12, A4 and A5
 SNAPSHOTS = (1, 3)  # of Figure 10: guided control steps, and later ones
 SAMPLES = 30  # shown of a call of MPPI
 INFEASIBLE = 1e-3  # violation from which a plan counts as infeasible
@@ -32,7 +32,7 @@ TICKS = (5, 10, 20, 50, 100)  # ms
 
 def figures(flights: Sequence[Flight]) -> dict[str, Callable[[], Figure]]:
     """What to draw of the missions, by the names of the files."""
-    one = next(part for part in flights if part.name == SHOWN)
+    one = next(part for part in flights if part.name == FOLLOWED)
     return {
         "figure-08": lambda: times(flights),
         "figure-09": lambda: draw.distance_figure({part.name: part.fine for part in flights}, one.course),

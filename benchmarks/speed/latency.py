@@ -6,19 +6,28 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from statistics import mean
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
 
 import torchgco
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import CasADiPeer
+from torchgco.baselines import CasADiSolver
+from torchgco.baselines.casadi import PreparedCasADi
 from torchgco.experiments.config.build import Setup
 from torchgco.judging.judge import Verdict, judge
-from torchgco.kernels import kernels_of
+from torchgco.kernels import kernels_of, open_loop
 from torchgco.lagrangian.lagrangian import Multipliers, shifted
 from torchgco.scenarios import Task
 from torchgco.solution import Solution
 
 SECTION = "latency"
 SHARE = 0.15  # of the time left that a layout may take
+# As in the loops (`benchmarks.speed.loop_peers`): with its default barrier multipliers save FATROP little.
+WARM = CasADiSolver("fatrop", tolerance=1e-6, options={"mu_init": 1e-3})
 
 
 @dataclass
@@ -40,6 +49,40 @@ class Flights:
         return f"{sum(int(getattr(verdict, word).sum()) for verdict in self.verdicts)}/{len(self.verdicts)}"
 
 
+@dataclass
+class Continued(CasADiPeer):
+    """FATROP one stage later: from the shifted controls, with its own multipliers and a small first barrier."""
+
+    known: dict[str, Any] = field(default_factory=dict)  # arguments of its program
+
+    @classmethod
+    def after(cls, bench: Bench, task: Task, solution: Solution, following: Task) -> Continued:
+        """It gets its multipliers where it continues from the solution of the stage before, untimed."""
+        before, later = WARM.prepare(task.problem), following.problem
+        prepared, took = bench.timed(lambda: WARM.prepare(later), compiling=True)
+        assert isinstance(before, PreparedCasADi) and isinstance(prepared, PreparedCasADi)
+        found = before.function(**_arguments(before, solution.X, solution.U))
+        known = _arguments(prepared, open_loop(later, following.U0), following.U0)
+        multipliers = {"lam_x0": found["lam_x"], "lam_g0": found["lam_g"]}
+        return cls("fatrop", following, took.seconds, prepared=prepared, known=known | multipliers)
+
+    def solve(self, bench: Bench) -> tuple[Tensor, float, Took]:
+        found, took = bench.timed(lambda: self.prepared.function(**self.known))
+        problem, stages = self.task.problem, np.array(found["x"]).ravel()[: -self.task.problem.n]
+        U = torch.from_numpy(stages).view(1, problem.N, -1)[..., problem.n :].contiguous()
+        return U, float(self.prepared.function.stats()["iter_count"]), took
+
+
+def _arguments(prepared: PreparedCasADi, X: Tensor, U: Tensor) -> dict[str, Any]:
+    """Guess, numbers and bounds of one problem, as CasADi's function takes them."""
+    numbers = prepared.program.values(prepared.problem, 0)
+    lower, upper = prepared.program.limits.bounds(numbers, prepared.program.variables.numel())
+    guess = torch.cat((torch.cat((X[0, :-1], U[0]), dim=-1).flatten(), X[0, -1]))
+    equal = np.asarray(prepared.program.equality)
+    rows = {"lbg": np.where(equal, 0.0, -np.inf), "ubg": np.zeros(len(equal))}
+    return {"x0": guess.numpy(), "p": numbers, "lbx": lower, "ubx": upper, **rows}
+
+
 AllFlights = defaultdict[tuple[str, str], Flights]  # by start and solver
 
 
@@ -54,17 +97,20 @@ def run(bench: Bench) -> None:
         if not bench.fits(SECTION, "a further layout", known, SHARE):
             break
         began = time.monotonic()
-        solution = _fly(bench, setup, task, "cold", None, flights)
+        solution = _fly(bench, setup, CasADiPeer.ready(bench, "fatrop", task), "cold", None, flights)
         following = _next(task, solution)
-        _fly(bench, setup, following, "warm", solution.multipliers.shifted(), flights)
+        peer = Continued.after(bench, task, solution, following)
+        _fly(bench, setup, peer, "warm", solution.multipliers.shifted(), flights)
         _fly_compiled(bench, task, following, flights)
         known = time.monotonic() - began
     _say(bench, flights)
 
 
-def _fly(bench: Bench, setup: Setup, task: Task, start: str, warm: Multipliers | None, flights: AllFlights) -> Solution:
+def _fly(
+    bench: Bench, setup: Setup, peer: CasADiPeer, start: str, warm: Multipliers | None, flights: AllFlights
+) -> Solution:
     """Fly FATROP, `gco`, FATROP, so that a drift of the machine's speed cancels in the ratio."""
-    peer = CasADiPeer.ready(bench, "fatrop", task)
+    task = peer.task
     peer.fly(bench)
     setup_time = bench.timed(lambda: kernels_of(task.problem), compiling=True)[1]
     solution, took = bench.timed(lambda: setup.solver.solve(task.problem, task.U0, seed=setup.seed, warm=warm))

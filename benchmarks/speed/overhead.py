@@ -183,7 +183,7 @@ def table(cases: Sequence[str], repeats: int) -> str:
 
 
 main = Command(
-    __doc__, "speed", table, "{repeats} repeats", "CasADi", mark="overhead",
+    __doc__, "overhead", table, "{repeats} repeats", "CasADi",
     cases=(CASES, "which, by default all", CASES), repeats=(16, "of each, or forests"),
 )  # fmt: skip
 

@@ -35,7 +35,7 @@ class Results:
             raise ValueError(f"a row has the columns {COLUMNS}, not {tuple(row)}")
         self.rows.append(row)
         with self.growing.open("a", newline="") as file:
-            csv.DictWriter(file, COLUMNS).writerow(row)
+            csv.DictWriter(file, COLUMNS, lineterminator="\n").writerow(row)
 
     def finish(self, section: str, device: str) -> None:
         """Replace the section's rows of former runs on that device by the new rows."""
@@ -61,6 +61,6 @@ def read_rows(path: Path) -> list[Row]:
 
 def _write(path: Path, rows: list[Row]) -> None:
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

@@ -20,7 +20,7 @@ WORDS = {
     "families": "Drawn layouts (seed 1000), of which the peers fly the first, before and after `gco`; the second\n"
     "table has each peer's seconds per problem / those of `gco`.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
-    "rest of the solution, `gco` from its multipliers as well; `compile` is the same step by a compiled problem.\n"
+    "rest of the solution and from their own multipliers; `compile` is the same step by a compiled problem.\n"
     "Set-up does not count: `gco` traces the model and finds its kernels, `compile` makes its first solve, FATROP's\n"
     "program is built.",
     "loop": "A car (4 states, 2 controls, RK4) follows a reference between two discs, 20 stages of 0.1 s: time of a\n"

@@ -18,6 +18,7 @@ import torch
 from tests.baselines.test_casadi import PLUGINS, three_problems
 from tests.slow import mostly
 from torchgco import Field, InputError, Problem, Status, solve
+from torchgco.base.clock import processor_seconds
 from torchgco.baselines import CasADiSolver
 from torchgco.baselines.limited import limited
 from torchgco.maps import OccupancyGrid
@@ -149,3 +150,20 @@ def _is_running(process: int) -> bool:
             return file.read().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+@pytest.mark.parametrize("limit", [60.0, 0.2])
+def test_the_clock_counts_what_a_child_uses(limit: float) -> None:
+    """Benchmarks compare by it: a peer in a process of its own isn't free, nor is one that is ended."""
+
+    def works() -> None:
+        began = time.process_time()
+        while time.process_time() - began < 0.4:
+            pass
+
+    began = processor_seconds()
+    try:
+        limited(works, limit, signal.ITIMER_PROF)
+    except TimeoutError:
+        assert limit < 0.4
+    assert 0.5 * min(limit, 0.4) < processor_seconds() - began < 2.0

@@ -28,6 +28,7 @@ from benchmarks.speed import (
     targets,
 )
 from benchmarks.speed.bench import Bench
+from benchmarks.speed.peers import CasADiPeer
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
@@ -206,3 +207,21 @@ def test_the_published_page_matches_the_published_rows(tmp_path: Path) -> None:
         (tmp_path / page).write_text((folder / page).read_text())
     rewrite(tmp_path, read_rows(folder / "results" / "speed.csv"))
     assert [(tmp_path / page).read_text() for page in pages] == [(folder / page).read_text() for page in pages]
+
+
+@pytest.mark.slow
+def test_one_stage_later_fatrop_continues_with_its_multipliers(tmp_path: Path) -> None:
+    """As torchgco does beside it: to the same trajectory in fewer iterations."""
+    bench = tiny(tmp_path)
+    setup = bench.setup("scenario=forest")
+    task = setup.task(setup.scenario.draw([0], setup.seed))
+    solution = latency.WARM.prepare(task.problem).solve(task.problem, task.U0)
+    following = latency._next(task, solution)
+    fresh, warm = (
+        CasADiPeer.ready(bench, "fatrop", following), latency.Continued.after(bench, task, solution, following)
+    )  # fmt: skip
+    for peer in (fresh, warm):
+        peer.fly(bench)
+    assert warm.iterations < fresh.iterations
+    assert fresh.verdict is not None and warm.verdict is not None
+    assert torch.allclose(warm.verdict.cost, fresh.verdict.cost, rtol=1e-4)

@@ -21,7 +21,7 @@ from torchgco.experiments.config.build import compose, compose_config
 from torchgco.experiments.config.groups import options_of
 from torchgco.experiments.flying import progress, study
 from torchgco.experiments.results.folder import COLUMNS
-from torchgco.experiments.results.identity import decisive
+from torchgco.experiments.results.identity import decisive, digest
 from torchgco.scenarios import Layouts
 from torchgco.solvers.augmented_lagrangian import OuterLoop
 
@@ -99,6 +99,16 @@ def test_the_configuration_chooses_the_kernels() -> None:
             assert decisive(setup.configuration, {})["device"] == {"name": "cpu", "dtype": "float64", "kernels": name}
     finally:
         kernels.use_native(True)
+
+
+def test_the_order_of_a_table_is_part_of_a_study() -> None:
+    """Its rows work one after another: in another order they give other results, in the same folder until now."""
+    setup = compose([])
+    settings = setup.configuration["solver"]
+    turned = settings | {"passes": dict(reversed(settings["passes"].items()))}
+    other_keys = dict(reversed(settings.items()))
+    codes = [digest(decisive(setup.configuration, {"gco": solver})) for solver in (settings, turned, other_keys)]
+    assert codes[0] != codes[1] and codes[0] == codes[2]
 
 
 @pytest.mark.usefixtures("without_report")

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 import torchgco
+from tests.problems import planar_batch
 from torchgco import (
     ControlBounds,
     FreeTime,
@@ -29,6 +30,7 @@ from torchgco import (
     judge,
 )
 from torchgco.judging.steps import step_errors
+from torchgco.kernels import costates, current
 
 D, DT, N = torch.float64, 0.1, 40
 NAMES = ("place", "speed", "force")
@@ -257,3 +259,14 @@ def test_limits_and_unit_quaternions_are_kept_within_half_steps() -> None:
     U = torch.full((1, 5, 4), 15000.0, dtype=D) if speed is None else speed.unsqueeze(1).expand(1, 5, 4)
     found = judge(hover, U.contiguous())
     assert float(found.step_error) < 0.05 and bool(torch.isfinite(found.step_cost).all())
+
+
+def test_costates_in_c_say_what_steps_cost() -> None:
+    problem, U0 = planar_batch(B=4, N=30, obstacles=4, seed=1)
+    problem = current(problem)
+    found = torchgco.solve(problem, U0)
+    assert any(bool(lam.any()) for lam in found.multipliers.lam)
+    both = [step_errors(problem, found.X, found.U, None, found.multipliers.lam, costates=by) for by in (costates, None)]
+    assert costates(problem, found.X, found.U, found.multipliers.lam) is not None
+    torch.testing.assert_close(both[0].step_cost, both[1].step_cost, rtol=1e-8, atol=1e-12)
+    assert bool((both[0].step_cost > 0).all())

@@ -49,7 +49,7 @@ def test_values_and_expansions_are_pytorchs(d: int, names: tuple[str, ...], phr:
     kernels = in_c(problem)
     assert kernels is not None
     torch.testing.assert_close(kernels.value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(kernels.slack(lagrangian, X, U), lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(kernels.judged(lagrangian, X, U).slack, lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
     slopes, H = kernels.expand(problem, X, U, lagrangian)
     want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
     kept = [i for i in range(s + 1) if i != n]

@@ -30,7 +30,7 @@ from torchgco import (
     judge,
 )
 from torchgco.base.shapes import lead
-from torchgco.kernels import EagerWarning
+from torchgco.kernels import EagerWarning, choice
 from torchgco.native import engine
 from torchgco.native.identity import signature
 
@@ -395,3 +395,22 @@ def test_a_module_with_trainable_parameters_is_a_model(native: bool) -> None:
     assert not solution.X.requires_grad and not solution.cost.requires_grad
     assert float(certify(problem, solution.X, solution.U).dynamics_residual.max()) < 1e-9
     assert bool(torch.isfinite(judge(problem, solution.U, [4.0, 1.0], 0.5).cost).all())
+
+
+def test_what_is_made_of_torchgcos_own_parts_stays_while_their_numbers_do(monkeypatch) -> None:
+    sought: list[Problem] = []
+    seek = choice._engine
+    monkeypatch.setattr(choice, "_engine", lambda problem: sought.append(problem) or seek(problem))
+    x0 = torch.zeros(2, 6, dtype=D)
+    parts = [ControlBounds([-3.0, -3.0], [3.0, 3.0]), torchgco.Spheres([[0.6, 0.5]], [0.1], 0.1)]
+    problem = Problem(Planar(dt=0.1), QuadraticCost([1] * 6, [1, 1], [9] * 6, x_ref=[1, 1, 0, 0, 0, 0]), parts, x0, N)
+    first, again = torchgco.solve(problem), torchgco.solve(problem)
+    assert len(sought) == 1 and torch.equal(first.U, again.U)
+    bounds: Any = problem.constraints[0]
+    bounds.upper.fill_(0.2)  # numbers of its own, and unlike any that it was given
+    tight = torchgco.solve(problem)
+    assert len(sought) == 2 and float(tight.U.max()) <= 0.2 + 1e-6 < float(first.U.max())
+    users = boat()
+    torchgco.solve(users)
+    torchgco.solve(users)
+    assert len(sought) == 4

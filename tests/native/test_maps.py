@@ -15,7 +15,7 @@ from torchgco import MPPI, ControlBounds, Field, Goal, Planar, Problem, Quadrati
 from torchgco.base.draws import DrawKey
 from torchgco.eager import sampling
 from torchgco.guidance import mppi
-from torchgco.kernels import measured, value
+from torchgco.kernels import chord_clearance, kernels_of, measured, open_loop, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.maps import DistanceField, OccupancyGrid
@@ -41,17 +41,30 @@ def mapped_batch(d: int, interpolation: str, B: int = 5, N: int = 30) -> Problem
 
 @pytest.mark.parametrize("mapped", [False, True])
 def test_copies_of_one_problem_are_measured_as_it_is(mapped: bool) -> None:
-    """They share its packed form, but for which map is each one's."""
     whole = mapped_batch(2, "linear", B=4) if mapped else planar_batch(4, 30, 3)[0]
     one = whole.take([2])
     X, U = random_trajectory(whole, spread=0.8)
     copies = one.take([0, 0, 0, 0])
-    assert copies.one is one and copies.take([1, 2]).one is one and whole.take([0, 0]).one is None
     found = measured(copies, X, U)
     assert torch.equal(found, torch.cat([measured(one, X[b : b + 1], U[b : b + 1]) for b in range(4)]))
     assert bool(found.any()) or not mapped
     lagrangian = Lagrangian(copies, Multipliers.zero(copies, 3.0), None, True)
     torch.testing.assert_close(value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_problems_of_a_batch_are_computed_from_its_numbers_as_from_their_own(mapped: bool) -> None:
+    whole = mapped_batch(2, "linear", B=5) if mapped else planar_batch(5, 30, 3)[0]
+    part, X = whole.take([3, 1, 1, 4]).take([3, 0, 1]), random_trajectory(whole, spread=0.8)[0][:3]
+    own, U = part.renewed(), 0.3 * torch.ones(3, whole.N, whole.m, dtype=torch.float64)
+    assert part.part_of is not None and part.part_of[0] is whole and own.part_of is None
+    assert part.part_of[1].tolist() == [4, 3, 1] and torch.equal(part.x0, whole.x0[[4, 3, 1]])
+    for find in (open_loop, lambda p, U: chord_clearance(p, X), lambda p, U: measured(p, X, U)):
+        assert torch.equal(find(part, U), find(own, U))
+    lam = Multipliers(tuple(torch.rand(3, *shape, dtype=torch.float64) for shape in whole.row_shapes), U[:, 0, 0])
+    found = [kernels_of(p).judged(Lagrangian(p, lam, None, True), X, U) for p in (part, own)]
+    for a, b in zip(*((one.worst, one.slack, one.step.gains) for one in found), strict=True):
+        assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize("interpolation", ["smooth", "linear"])
@@ -70,7 +83,9 @@ def test_values_expansions_and_violations_are_pytorchs(d: int, interpolation: st
         lam = [torch.rand(t.shape, generator=generator, dtype=t.dtype).clamp(min=least) - least for t in zero.lam]
         lagrangian = Lagrangian(problem, Multipliers(tuple(lam), zero.mu), None, True)
         torch.testing.assert_close(kernels.value(lagrangian, X, U), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
-        torch.testing.assert_close(kernels.slack(lagrangian, X, U), lagrangian.slack(X, U), rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(
+            kernels.judged(lagrangian, X, U).slack, lagrangian.slack(X, U), rtol=1e-10, atol=1e-10
+        )
         slopes, H = kernels.expand(problem, X, U, lagrangian)
         want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
         kept = [i for i in range(s + 1) if i != n]

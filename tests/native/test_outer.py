@@ -146,7 +146,7 @@ def test_violations_slacks_and_clearances_equal_those_of_pytorch(moving: bool) -
     for held in (lam, tuple(part.clamp(min=0.5) - 0.5 for part in lam)):
         lagrangian = Lagrangian(problem, Multipliers(held, torch.ones_like(X[:, 0, 0])), None, True)
         slack = lagrangian.slack(X, U)
-        torch.testing.assert_close(kernels_of(problem).slack(lagrangian, X, U), slack, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(kernels_of(problem).judged(lagrangian, X, U).slack, slack, rtol=1e-12, atol=1e-12)
         assert bool((slack > 0).all())
     for share in (0.0, 0.05, 0.3):
         rows = torch.stack([part.chord_clearance(X, share) for part in problem.obstacles])

@@ -240,3 +240,17 @@ def test_what_comes_to_rest_is_no_faster_than_states_may_be_and_turns_as_before(
     assert float(X[..., 3].min()) >= -0.3 - 1e-9 and float(X[..., 3].max()) <= 1.0 + 1e-9
     turned, back = X[0, :, -1, 2].abs() > 0.5, X[0, :, -1, :2].norm(dim=-1) > 0.15  # at 0.3 m/s, for 0.7 s
     assert bool((turned & back).any()) and bool((X[1, :, -1, 0] > 0.9).any())
+
+
+def test_a_robot_speeds_up_in_a_bend_where_only_that_serves() -> None:
+    """Further candidates have controls half-way beside others at their bounds; they are tried where no other serves."""
+    problem = drives()
+    first, mixed = stopping(problem, None), stopping(problem, None, mixed=True)
+    assert first is not None and mixed is not None
+    # Before braking, at full acceleration and half of the largest rate of turn: none of the first ones does so.
+    bend = torch.tensor([1.0, 0.75], dtype=torch.float64)
+    begins = lambda U: (U[0, :, :3] - bend).abs().amax((1, 2)) < 1e-9
+    assert not bool(begins(first).any()) and bool(begins(mixed).any())
+    assert float((problem.dynamics.step(problem.x0, mixed[:, 0, -1])).abs().max()) < 1.0
+    one = Problem(PULLED, QuadraticCost([1.0] * 4, [0.1] * 2, [1.0] * 4), [], [[0.0, 0, 1, 0]], N)
+    assert stopping(one, None, mixed=True) is None, "no bounds, no shares of them"

@@ -93,6 +93,24 @@ def test_a_body_takes_the_way_of_the_ball_around_it(seed: int) -> None:
     assert clear_of_cells(cells, solution.X[0], size)
 
 
+@pytest.mark.parametrize("mirrored", mostly([False, True], False))
+def test_a_way_that_cannot_be_brought_clear_gives_way_to_another(mirrored: bool) -> None:
+    """In the bend behind the near door the body touches between two knots, and there is no room; a door is far away."""
+    cells = filled((6.0, 5.0), [(0.05, 0.05, 5.95, 4.95)])
+    cells[48:52] = True
+    cells[48:52, 20:33] = cells[48:52, 74:94] = False
+    cells[65:71, :56] = True
+    turn = (lambda y: 5.0 - y) if mirrored else (lambda y: y)
+    cells, goal = np.ascontiguousarray(cells[:, ::-1] if mirrored else cells), [5.2, turn(1.2)]
+    field = Field(OccupancyGrid(cells, [0.0, 0.0], CELL), Body.covering([-0.35, -0.25], [0.35, 0.25], [3, 2]))
+    limits = [ControlBounds([-1, -1.5], [1, 1.5]), StateBounds([-math.inf] * 3 + [-0.3], [math.inf] * 3 + [1.0])]
+    cost = QuadraticCost([0.1, 0.1, 0, 0.1], [0.5, 0.5], [200, 200, 0, 10], [*goal, 0, 0])
+    start = torch.tensor([[0.8, turn(1.325), 0.0, 0.0]], dtype=torch.float64)
+    task = Problem(Unicycle(dt=0.1), cost, [field, *limits], start, 160, Goal(goal, 0.3))
+    verdict = judge(task, solve(task).U)
+    assert bool(verdict.reached) and float(verdict.clearance) >= 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_a_body_backs_into_a_dock(seed: int) -> None:

@@ -49,9 +49,9 @@ def made(monkeypatch) -> list[int]:
     """Numbers of iterations and Newton steps, noted in every solve."""
     made: list[int] = []
 
-    def descend(self, lagrangian, state, how, limit, real=NativeKernels.descend):
+    def descend(self, lagrangian, state, how, limit, begins=False, real=NativeKernels.descend):
         before = int(state.iterations.sum())
-        end = real(self, lagrangian, state, how, limit)
+        end = real(self, lagrangian, state, how, limit, begins)
         made.append(int(state.iterations.sum()) - before)
         return end
 

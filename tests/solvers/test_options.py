@@ -33,11 +33,9 @@ CHANGES = {
         noise_knots=3, decay=0.3, elite=4, dwell_cost=10.0, dtype="float32",
     ),
 }  # fmt: skip
-# `slots` changes no result (test_batch_contract); test_ilqr tests the line search, test_restarts replaced iterates,
-# test_reported_figures violations by the kernels.
+# `slots` changes no result (test_batch_contract); test_ilqr tests the line search, test_restarts replaced iterates.
 ELSEWHERE = {
-    (AugmentedLagrangian, "slots"), (AugmentedLagrangian, "by_kernels"), (ILQR, "line_search"),
-    (GCO, "start_from_sample"),
+    (AugmentedLagrangian, "slots"), (ILQR, "line_search"), (GCO, "start_from_sample"),
 }  # fmt: skip
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),

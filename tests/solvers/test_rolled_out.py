@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.problems import planar_batch
-from torchgco.kernels import followed, open_loop
-from torchgco.solvers.interior import rolled_out
+from torchgco.kernels import followed, open_loop, rolled_out
+from torchgco.lagrangian.quality import violation
 
 D = torch.float64
 NOISY = 1e8  # of gains that rounding decides on, beside rows as stiff as those of a tight solution
@@ -25,11 +25,13 @@ def test_gains_of_rounding_move_no_controls() -> None:
     K[2:, :, :, 0] = -0.1
     along = followed(problem, X, U, K)
     assert not torch.allclose(along[1][1], U[1], rtol=0, atol=1e-9)
-    x, u = rolled_out(problem, X, U, K)
+    gains = torch.nn.functional.pad(K, (0, 1), value=3.0)
+    x, u, worst = rolled_out(problem, X, U, gains)
+    torch.testing.assert_close(worst, violation(problem.constraints, x, u), rtol=1e-9, atol=1e-12)
     assert torch.equal(u[:2], U[:2])
     assert torch.equal(x[2:], along[0][2:]) and torch.equal(u[2:], along[1][2:])
     assert not torch.equal(u[3], U[3])
     for b in range(4):  # each alone, too
         row = torch.tensor([b])
-        alone = rolled_out(problem.take(row), X[row], U[row], K[row])
+        alone = rolled_out(problem.take(row), X[row], U[row], gains[row])
         assert torch.equal(alone[0], x[row]) and torch.equal(alone[1], u[row])

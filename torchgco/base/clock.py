@@ -38,8 +38,14 @@ def seconds() -> float:
 
 
 def processor_seconds() -> float:
-    """The same of all processors that this process uses, its children apart."""
+    """The same of all processors that this process uses, and children whose time was `added`."""
     return (_left.since or _now())[1] - _left.out[1]
+
+
+def added(processor: float) -> None:
+    """A child process that has ended, and did this thread's work, took so many seconds of processors."""
+    wall, left_out = _left.out
+    _left.out = wall, left_out - processor
 
 
 def _now() -> tuple[float, float]:

@@ -59,6 +59,10 @@ class GuidanceWarning(UserWarning):
     """Guidance, or a part of it, can't be used for a problem, which is solved without it."""
 
 
+class DeviceWarning(UserWarning):
+    """A problem of another device is solved on the CPU, in a fraction of the time."""
+
+
 class StartWarning(UserWarning):
     """A start that may be free is held at its guess: the solver can't choose it."""
 
@@ -73,6 +77,10 @@ class HorizonWarning(UserWarning):
 
 class StepWarning(UserWarning):
     """A model's time step is too long: half of it gives other states, or another cost."""
+
+
+class RefusalWarning(UserWarning):
+    """A user's code raises an error for a state that a trajectory goes through; it counts as not finite."""
 
 
 class TraceWarning(UserWarning):

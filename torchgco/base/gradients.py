@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import is_dataclass
 from functools import lru_cache
@@ -29,10 +29,14 @@ def recording() -> Iterator[None]:
         _recording.reset(token)
 
 
-@contextmanager
-def not_recording() -> Iterator[None]:
+def not_recording() -> AbstractContextManager[None]:
     """Nothing is recorded, neither for backward passes nor of tensors in forward mode."""
-    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False) if is_forward() else nullcontext():
+    return _without_tangents() if is_forward() else torch.no_grad()
+
+
+@contextmanager
+def _without_tangents() -> Iterator[None]:
+    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
         yield
 
 
@@ -66,7 +70,8 @@ def leaves(tree: Any) -> list[Any]:
             flat.append(node)
         elif id(node) not in seen:  # parts may hold each other
             seen.add(id(node))
-            waiting += [child for _, child in _parts(node)]
+            held = node if isinstance(node, (Mapping, tuple, list)) else getattr(node, "__dict__", {})
+            waiting += held.values() if isinstance(held, Mapping) else held
     return flat
 
 
@@ -86,14 +91,3 @@ def without_gradients(tree: Any) -> Any:
     if not asking(tree):  # it may hold itself
         return tree
     return mapped(tree, lambda leaf: leaf.detach() if asks(leaf) else leaf)
-
-
-def _parts(tree: Any) -> list[tuple[Any, Any]]:
-    """What a sequence, a mapping or a dataclass holds, by place or name; nothing of all else."""
-    if isinstance(tree, Mapping):
-        return list(tree.items())
-    if isinstance(tree, (tuple, list)):
-        return list(enumerate(tree))
-    if _holds(type(tree)) and hasattr(tree, "__dict__"):
-        return list(vars(tree).items())
-    return []

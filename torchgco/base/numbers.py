@@ -96,10 +96,10 @@ def as_floats(value: Any, name: str) -> Floats:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
-        given = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-        if given.dtype.kind not in "biufO":  # NumPy would drop imaginary parts, and read text and dates
+        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+        if array.dtype.kind not in "biufO":  # NumPy would drop imaginary parts, and read text and dates
             raise TypeError
-        return given.astype(np.float64)
+        return array.astype(np.float64)
     except (TypeError, ValueError, NotImplementedError):
         raise InputError(name, "numbers", type(value).__name__) from None
 
@@ -119,7 +119,7 @@ def numbers(
     ]
 
 
-def numbers_of_fields(part: Any, where: str, place: str | int) -> list[Number]:
+def numbers_of_fields(part: Any, where: str, index: str | int) -> list[Number]:
     """The floating numbers of any part, its `values` by their own names."""
     entries = []
     for field in (*part.batched, *part.per_element) if isinstance(part, PerElement) else ():
@@ -129,10 +129,10 @@ def numbers_of_fields(part: Any, where: str, place: str | int) -> list[Number]:
             names = (*value.names, *value.knot_names)
             tensors = dict(zip(names, (*value.rows, *value.knot_rows), strict=True))
         elif isinstance(value, PerElement):
-            entries += numbers_of_fields(value, f"{where}.{field}", place)
+            entries += numbers_of_fields(value, f"{where}.{field}", index)
         for key, tensor in tensors.items():
             if isinstance(tensor, Tensor) and tensor.is_floating_point() and tensor.dim() > 0:
-                entries += numbers(where, {key: (tensor, finite)}, place)
+                entries += numbers(where, {key: (tensor, finite)}, index)
     return entries
 
 

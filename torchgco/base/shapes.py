@@ -12,7 +12,7 @@ Dimensions, always these letters in this order:
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,11 +126,16 @@ def check_device(device: Any) -> torch.device:
         raise InputError("device", "a device that is there, such as cpu", repr(device)) from None
 
 
-@contextmanager
-def computing_on(device: torch.device) -> Iterator[None]:
+def computing_on(device: torch.device) -> AbstractContextManager[None]:
     """No gradients are recorded, and new tensors lie on `device`, whatever the process's default device is."""
-    elsewhere = torch.get_default_device() != device
-    with not_recording(), device if elsewhere else nullcontext():
+    if torch.get_default_device() == device:
+        return not_recording()
+    return _elsewhere(device)
+
+
+@contextmanager
+def _elsewhere(device: torch.device) -> Iterator[None]:
+    with not_recording(), device:
         yield
 
 

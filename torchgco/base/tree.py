@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import lru_cache
 from operator import is_
@@ -28,7 +28,7 @@ class PerElement(Brief):
 
     def take(self, index: Rows) -> Self:
         """The same part for the problems in `index` (int64, (B',), or a slice)."""
-        changes = {name: take(getattr(self, name), index) for name in self.batched}
+        changes = taken(self, self.batched, index)
         for name in self.per_element:
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.dim() > 0 and value.shape[0] != 1:
@@ -55,16 +55,24 @@ def is_whole(index: Rows, B: int) -> bool:
 
 def take(tree: Any, index: Rows) -> Any:
     """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
-    if type(tree) is Tensor:  # most of all; each solve takes thousands
+    if isinstance(tree, Tensor):
         return tree[index]
     if isinstance(tree, PerElement):
         return tree.take(index)
     if isinstance(tree, tuple):
-        rows = [take(leaf, index) for leaf in tree]
+        rows = [leaf[index] if type(leaf) is Tensor else take(leaf, index) for leaf in tree]
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
-    if isinstance(tree, Tensor):
-        return tree[index]
-    return _each(tree, take, index) if field_names(type(tree)) else tree
+    names = field_names(type(tree))
+    return _made(type(tree), taken(tree, names, index)) if names else tree
+
+
+def taken(tree: Any, names: tuple[str, ...], index: Rows) -> dict[str, Any]:
+    """Rows `index` of these attributes. Most are tensors, and each solve takes thousands: no call for these."""
+    parts = ((name, getattr(tree, name)) for name in names)
+    return {
+        name: part[index] if type(part) is Tensor else None if part is None else take(part, index)
+        for name, part in parts
+    }
 
 
 def changed(part: Any, changes: Mapping[str, Any]) -> Any:
@@ -75,11 +83,6 @@ def changed(part: Any, changes: Mapping[str, Any]) -> Any:
     for name in field_names(type(part)):
         object.__setattr__(other, name, changes[name] if name in changes else getattr(part, name))
     return other
-
-
-def _each(tree: Any, change: Callable[..., Any], *others: Any) -> Any:
-    """A dataclass with each of its fields changed."""
-    return _made(type(tree), {name: change(getattr(tree, name), *others) for name in field_names(type(tree))})
 
 
 def _made(kind: type, values: Mapping[str, Any]) -> Any:
@@ -177,8 +180,11 @@ def copied(tree: Any) -> Any:
     if isinstance(tree, Tensor):
         return tree.clone()
     if isinstance(tree, tuple):
-        return tuple([copied(leaf) for leaf in tree])
-    return _each(tree, copied) if field_names(type(tree)) else tree
+        return tuple([leaf.clone() if type(leaf) is Tensor else copied(leaf) for leaf in tree])
+    if not (names := field_names(type(tree))):
+        return tree
+    parts = ((name, getattr(tree, name)) for name in names)
+    return _made(type(tree), {name: part.clone() if type(part) is Tensor else copied(part) for name, part in parts})
 
 
 def spread(values: Tensor, rows: Tensor) -> Tensor:
@@ -192,9 +198,14 @@ def put(tree: Any, index: Tensor, rows: Any) -> None:
     """Write `rows` into rows `index` of every tensor of `tree`, in place; the two have the same structure."""
     if isinstance(tree, Tensor):
         tree[index] = rows
-    elif isinstance(tree, tuple):
-        for leaf, new in zip(tree, rows, strict=True):
-            put(leaf, index, new)
+        return
+    pairs: Iterable[tuple[Any, Any]]
+    if isinstance(tree, tuple):
+        pairs = zip(tree, rows, strict=True)
     else:
-        for name in field_names(type(tree)):
-            put(getattr(tree, name), index, getattr(rows, name))
+        pairs = ((getattr(tree, name), getattr(rows, name)) for name in field_names(type(tree)))
+    for leaf, new in pairs:
+        if type(leaf) is Tensor:
+            leaf[index] = new
+        elif leaf is not None:
+            put(leaf, index, new)

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from threading import TIMEOUT_MAX
 from typing import Any, NoReturn, TypeVar
 
+from torchgco.base.clock import added
+
 T = TypeVar("T")
 
 TIMERS = {signal.ITIMER_REAL: signal.SIGALRM, signal.ITIMER_PROF: signal.SIGPROF}
@@ -24,6 +26,7 @@ def limited(work: Callable[[], T], seconds: float, timer: int = signal.ITIMER_RE
     """The result of `work`, arrays and plain values, from a child process that shares what was built here.
 
     The child ends with its time, on an exception in this process, such as Ctrl-C, and (on Linux) with this process.
+    `processor_seconds` counts what it uses.
 
     Args:
         seconds: above 0.
@@ -51,7 +54,9 @@ def limited(work: Callable[[], T], seconds: float, timer: int = signal.ITIMER_RE
         os.kill(child, signal.SIGKILL)
         raise
     finally:
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        _, ended, used = os.wait4(child, 0)
+        added(used.ru_utime + used.ru_stime)
+        code = os.waitstatus_to_exitcode(ended)
     if code == -TIMERS[timer]:
         raise TimeoutError(f"took longer than {seconds:g} s")
     if code != 0 or not answer:

@@ -102,10 +102,10 @@ class MPPIController:
             before = shifted(self.U, self._stages) if shift and self._commands else self.U
             key = DrawKey(self.seed, self._ids, torch.full_like(self._ids, self._commands))
             now = current(with_numbers_as_they_are(self._problem))
-            found = self.sampler.improved(now, before, key)
+            improved = self.sampler.improved(now, before, key)
             if not now.known.in_c:  # only PyTorch's kernels call code that looks at values
-                check_rows(now, open_loop(now, found), found)
-            self.U = found
+                check_rows(now, open_loop(now, improved), improved)
+            self.U = improved
         self._commands += 1
         u = self.U[:, 0].clone()
         return u[0] if state.ndim == 1 and B == 1 else u

@@ -122,11 +122,11 @@ class Compiled:
             self._begin(with_own_numbers(problem))
 
     def _begin(self, problem: Problem) -> None:
-        found = numbers_of(problem)
-        found = found if problem.time is None else numbers_in_time(found, problem)
-        every = Numbers(found, self._note)
+        all_numbers = numbers_of(problem)
+        all_numbers = all_numbers if problem.time is None else numbers_in_time(all_numbers, problem)
+        every = Numbers(all_numbers, self._note)
         chosen = None if self.changes is None else {every.find(name).name for name in self.changes}
-        self.numbers = Numbers([n for n in found if chosen is None or n.name in chosen], self._note)
+        self.numbers = Numbers([n for n in all_numbers if chosen is None or n.name in chosen], self._note)
         self._problem, self._changed = problem, set[str | int]()
         self._lock = threading.Lock()
         self._warm = np.zeros(problem.B, dtype=bool)  # which problems have an answer to begin with
@@ -218,17 +218,17 @@ class Compiled:
     def _moved(self, shift: Any, elapsed: Any) -> float:
         """By how much the horizon has moved since the last call: stages, or seconds where the time is free."""
         free = self._problem.time is not None
-        own, other = ("elapsed", "shift") if free else ("shift", "elapsed")
-        given, wrong = (elapsed, shift) if free else (shift, elapsed)
+        name, other = ("elapsed", "shift") if free else ("shift", "elapsed")
+        moved, wrong = (elapsed, shift) if free else (shift, elapsed)
         if wrong is not None:
             raise InputError(
-                other, f"None where the time is {'free' if free else 'fixed'}: `{own}` serves", shown(wrong)
+                other, f"None where the time is {'free' if free else 'fixed'}: `{name}` serves", shown(wrong)
             )
-        if given is None:
+        if moved is None:
             return int(self.receding)
-        if isinstance(given, bool) or not isinstance(given, int | float) or not 0 <= given < math.inf:
-            raise InputError(own, f"a number of {'seconds' if free else 'stages'}, at least 0", shown(given))
-        return given
+        if isinstance(moved, bool) or not isinstance(moved, int | float) or not 0 <= moved < math.inf:
+            raise InputError(name, f"a number of {'seconds' if free else 'stages'}, at least 0", shown(moved))
+        return moved
 
     @property
     def problem(self) -> Problem:
@@ -306,13 +306,13 @@ class Compiled:
                 parts = kept.read(parts, self.now)
         elif shift:
             kept.shift(shift)
-        for part in parts:
-            if part == "dynamics":
+        for changed in parts:
+            if changed == "dynamics":
                 kept.refresh_model()
-            elif part == "cost" and kept.engine.cost is not None:
+            elif changed == "cost" and kept.engine.cost is not None:
                 kept.refresh_cost()
-            elif isinstance(part, int):
-                kept.refresh_constraint(part)
+            elif isinstance(changed, int):
+                kept.refresh_constraint(changed)
         self._changed.clear()
         kept.start()
         if kept.is_outdated:  # C reads what functions capture as it is now
@@ -358,8 +358,8 @@ class Compiled:
         good = kept.finite & (kept.statuses == CONVERGED) & (worst <= self.interior.violation_tolerance)
         return np.asarray(rows & good)
 
-    def _begun(self, found: Solution, rows: Tensor, begin: Begin, until: float) -> Tensor:
-        """Solve the problems `rows` by C from other trajectories, into `found`; those that are left to the solver."""
+    def _begun(self, answer: Solution, rows: Tensor, begin: Begin, until: float) -> Tensor:
+        """Solve the problems `rows` by C from other trajectories, into `answer`; those that are left to the solver."""
         kept = self._kept
         assert kept is not None
         kept.begin_at(rows, *begin(self.now.take(rows), rows))
@@ -368,13 +368,13 @@ class Compiled:
         left = until - clock.seconds()
         if left > 0:
             kept.solve(marked, self.interior.initial_barrier, seconds=left)
-            some = self._packed_solution(good := self._good(marked))
+            tries = self._packed_solution(good := self._good(marked))
             done = torch.from_numpy(good).nonzero().flatten()
-            put(found, done, replace(some.take(done), iterations=(found.iterations + some.iterations)[done]))
+            put(answer, done, replace(tries.take(done), iterations=(answer.iterations + tries.iterations)[done]))
             rows, left = rows[~torch.from_numpy(good)[rows]], until - clock.seconds()
         if left > 0:
             return rows
-        found.status[rows] = TIME_LIMIT
+        answer.status[rows] = TIME_LIMIT
         return rows[:0]
 
     def _violation(self) -> Tensor:
@@ -400,14 +400,14 @@ class Compiled:
             times=kept.times,
         )  # fmt: skip
 
-    def _again(self, found: Solution, rows: Tensor, until: float) -> None:
-        """Solve the problems `rows` from the start by the solver, into `found` and what the next call begins with."""
-        kept, tried = self._kept, found.iterations[rows]
+    def _again(self, answer: Solution, rows: Tensor, until: float) -> None:
+        """Solve the problems `rows` from the start by the solver, into `answer` and what the next call begins with."""
+        kept, tried = self._kept, answer.iterations[rows]
         assert kept is not None
         now = self.now.take(rows)
         solution = self._by_solver(None, until, now)
         bare = replace(solution, trace=None, search=None, account=None, needed=None)
-        put(found, rows, replace(bare, iterations=solution.iterations + tried))
+        put(answer, rows, replace(bare, iterations=solution.iterations + tried))
         kept.take_over(rows, solution)
 
     def _by_solver(self, shift: float | None, until: float, problem: Problem | None = None) -> Solution:
@@ -419,10 +419,10 @@ class Compiled:
         return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:
-        found, kept = self._found, self._kept
-        if found is not None:
+        last, kept = self._found, self._kept
+        if last is not None:
             X, U, K, worst, iterations, status = (
-                part.clone() for part in (found.X, found.U, found.K, found.violation, found.iterations, found.status)
+                tensor.clone() for tensor in (last.X, last.U, last.K, last.violation, last.iterations, last.status)
             )
         else:
             assert kept is not None
@@ -431,8 +431,8 @@ class Compiled:
         # The next call may begin with solutions, and with what only the time was over for.
         ended = status.numpy()
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
-        t = found.times if found is not None else None
-        if found is None and isinstance(kept, KeptInTime):
+        t = last.times if last is not None else None
+        if last is None and isinstance(kept, KeptInTime):
             with _plainly():
                 t = kept.times
         return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), clock.seconds() - began, t)

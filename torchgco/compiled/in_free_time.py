@@ -68,22 +68,22 @@ class KeptInTime(Kept):
             return
         user, count = self.user, len(self.user.constraints)
         factors = factors_in(user, self.X)
-        at = Elapsed.of(user, factors, by)
-        X = at.states(self.X[..., : user.n])
-        U = at.controls(self.U[..., : user.m], times_of(user, factors).diff(dim=1))
-        lam = at.multipliers(self.lam[:count], self._knots[2 : 2 + count])
-        for own, new in zip((self.X, self.U, *self.lam), (*states_in_time(user, X, U, at.factors), *lam), strict=False):
-            own.copy_(new)
+        span = Elapsed.of(user, factors, by)
+        X = span.states(self.X[..., : user.n])
+        U = span.controls(self.U[..., : user.m], times_of(user, factors).diff(dim=1))
+        lam = span.multipliers(self.lam[:count], self._knots[2 : 2 + count])
+        for z, new in zip((self.X, self.U, *self.lam), (*states_in_time(user, X, U, span.factors), *lam), strict=False):
+            z.copy_(new)
 
-    def take_over(self, rows: Tensor, found: Solution) -> None:
+    def take_over(self, rows: Tensor, solution: Solution) -> None:
         """See `Kept`."""
         user = self.user.take(rows)
-        assert found.times is not None
-        self.X[rows], self.U[rows] = states_in_time(user, found.X, found.U, factors_of(user, found.times))
+        assert solution.times is not None
+        self.X[rows], self.U[rows] = states_in_time(user, solution.X, solution.U, factors_of(user, solution.times))
         for lam in self.lam:
             lam[rows] = 0.0
-        for lam, own in zip(self.lam, found.multipliers.scaled(1.0 / self.unit[rows]).lam, strict=False):
-            lam[rows] = own
+        for lam, solved in zip(self.lam, solution.multipliers.scaled(1.0 / self.unit[rows]).lam, strict=False):
+            lam[rows] = solved
 
     def read(self, changed: set[str | int], now: Problem) -> set[str | int]:
         """Put numbers of the user's parts that have changed where the form `in_time` has copies of them.
@@ -121,12 +121,12 @@ def kept_in_time(problem: Problem, options: BarrierOptions) -> KeptInTime | None
     return KeptInTime(kernels, problem, whole, options)
 
 
-def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:
+def numbers_in_time(by_problem: list[Number], problem: Problem) -> list[Number]:
     """The numbers of a problem with a free time: those of the problem, of the time, and checks of what is by stage."""
     time = problem.time
     assert time is not None
     by_stage = problem.cost.names_by_stage()
-    for number in found:
+    for number in by_problem:
         if number.part == "cost" and number.name.rpartition(".")[2] in by_stage:
             number.check = partial(_steady, number, problem.N, number.check)
     tensors = {name: getattr(time, name) for name in ("least", "most", "weight", "guess")}
@@ -136,7 +136,7 @@ def numbers_in_time(found: list[Number], problem: Problem) -> list[Number]:
         if tensor is not None
     }
     views = {name: tensor.numpy() for name, (tensor, _) in fields.items()}
-    return found + numbers("time", fields, "time", joint=partial(_crossed, views))
+    return by_problem + numbers("time", fields, "time", joint=partial(_crossed, views))
 
 
 def later(problem: Problem, last: Solution, shift: float) -> Solution:
@@ -150,18 +150,18 @@ def _later_in_time(problem: Problem, last: Solution, seconds: float) -> Solution
     """A guess for problems with a free time, so many seconds after the solution `last` began."""
     assert last.times is not None
     factors, knots = factors_of(problem, last.times), torch.arange(problem.N + 1)
-    at = Elapsed.of(problem, factors, seconds)
-    rows = [knots[part.knots].tolist() for part in problem.constraints]
-    lam = at.multipliers(last.multipliers.lam, rows)
-    X, U = at.states(last.X), at.controls(last.U, last.times.diff(dim=1))
+    elapsed = Elapsed.of(problem, factors, seconds)
+    rows = [knots[constraint.knots].tolist() for constraint in problem.constraints]
+    lam = elapsed.multipliers(last.multipliers.lam, rows)
+    X, U = elapsed.states(last.X), elapsed.controls(last.U, last.times.diff(dim=1))
     multipliers = Multipliers(lam, last.multipliers.mu)
-    return replace(last, X=X, U=U, multipliers=multipliers, times=times_of(problem, at.factors), needed=None)
+    return replace(last, X=X, U=U, multipliers=multipliers, times=times_of(problem, elapsed.factors), needed=None)
 
 
-def _differ(own: Any, lifted: Any) -> bool:
+def _differ(users: Any, lifted: Any) -> bool:
     """Whether a part has numbers that its form in free time has copies of."""
-    there = {part.data_ptr() for part in own_tensors(lifted)}
-    return any(part.data_ptr() not in there for part in own_tensors(own))
+    there = {tensor.data_ptr() for tensor in own_tensors(lifted)}
+    return any(tensor.data_ptr() not in there for tensor in own_tensors(users))
 
 
 def _copy(old: Any, new: Any) -> None:
@@ -179,9 +179,9 @@ def _steady(number: Number, N: int, check: Any, new: Floats) -> Wrong:
 
 
 def _crossed(views: dict[str, Floats], new: Any) -> Wrong:
-    own = {name: new.get(f"time.{name}", view) for name, view in views.items()}
-    inner: Sequence[Floats] = [own["guess"]] if "guess" in own else []
-    for low, high in zip([own["least"], *inner], [*inner, own["most"]], strict=True):
+    times = {name: new.get(f"time.{name}", view) for name, view in views.items()}
+    inner: Sequence[Floats] = [times["guess"]] if "guess" in times else []
+    for low, high in zip([times["least"], *inner], [*inner, times["most"]], strict=True):
         if (low > high).any():
             return "time.least at most time.guess and time.most", f"{low[low > high][0]:g} and {high[low > high][0]:g}"
     return None

@@ -75,8 +75,8 @@ class MPC:
         tolerance: float | None = None,
     ) -> None:
         problem = current_problem(problem)
-        for name, given in (("horizon", problem.horizon), ("free_start", problem.free_start)):
-            if given is not None:
+        for name, value in (("horizon", problem.horizon), ("free_start", problem.free_start)):
+            if value is not None:
                 raise InputError(f"problem.{name}", "None in a loop, which starts from measured states", "one")
         self._free = problem.time is not None
         self.dt = float(problem.dynamics.dt) if self._free else stage_of(problem)
@@ -86,7 +86,7 @@ class MPC:
         self.max_seconds = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
-        self._previous = [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if follows(part)]
+        self._previous = [f"constraints[{i}].previous" for i, c in enumerate(problem.constraints) if follows(c)]
         changes = None if changes is None else ["x0", *self._previous, *changes]
         self.compiled: Compiled = compile(problem, solver, changes, tolerance=tolerance)
         self._problem, self._limit = problem, self.max_seconds
@@ -205,9 +205,9 @@ class MPC:
     def _known(self, problem: Problem, rows: Tensor, now: float, known: dict[int, Held]) -> tuple[Tensor, Tensor]:
         """States and controls that the problems in `rows` could fly by now; `known` takes them."""
         plan = self.plan
-        found = held(problem, None if plan is None else plan.take(rows), now)
-        known |= {b: Held(*(part[i : i + 1] for part in found)) for i, b in enumerate(rows.tolist())}
-        return found.X, found.U
+        flyable = held(problem, None if plan is None else plan.take(rows), now)
+        known |= {b: Held(*(tensor[i : i + 1] for tensor in flyable)) for i, b in enumerate(rows.tolist())}
+        return flyable.X, flyable.U
 
     def _hold(
         self, answer: Answer, solved: np.ndarray, now: float, state: np.ndarray, known: dict[int, Held]
@@ -221,13 +221,13 @@ class MPC:
             missing = torch.tensor([b for b in rows.tolist() if b not in known], dtype=torch.int64)
             if missing.numel() > 0:
                 self._known(self.compiled.now.take(missing), missing, now, known)
-            found = Held(*map(torch.cat, zip(*(known[b] for b in rows.tolist()), strict=True)))
-            found = better(self.compiled.now.take(rows), found, answer.U[rows])
-            plan = plan.with_rows(rows, replace(plan.take(rows), X=found.X, U=found.U, K=found.K))
+            flyable = Held(*map(torch.cat, zip(*(known[b] for b in rows.tolist()), strict=True)))
+            flyable = better(self.compiled.now.take(rows), flyable, answer.U[rows])
+            plan = plan.with_rows(rows, replace(plan.take(rows), X=flyable.X, U=flyable.U, K=flyable.K))
             # At other times than its knots a plan before isn't, to the last millimetre, what was looked at.
             at_knots = [isinstance(stages_between(float(now - self._begun[b]) / self.dt), int) for b in rows.tolist()]
-            kept[rows.numpy()] = found.is_before.numpy() & at_knots
-            self._feasible[rows.numpy()] = found.feasible
+            kept[rows.numpy()] = flyable.is_before.numpy() & at_knots
+            self._feasible[rows.numpy()] = flyable.feasible
         self._begun = np.where(kept, self._begun, now)
         if before is not None:
             rows = torch.from_numpy(kept).nonzero().flatten()

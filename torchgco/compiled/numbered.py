@@ -29,16 +29,16 @@ def with_own_numbers(problem: Problem) -> Problem:
 
 def numbers_of(problem: Problem) -> list[Number]:
     """The numbers of a problem that has memory of its own for each, `with_own_numbers`."""
-    found = [Number("x0", (problem.x0.numpy(),), "x0", False, lambda new: None)]
-    found += problem.cost.numbers("cost") + numbers_of_fields(problem.dynamics, "dynamics", "dynamics")
-    for i, part in enumerate(problem.constraints):
-        found += part.numbers(f"constraints[{i}]", i)
-    return found
+    collected = [Number("x0", (problem.x0.numpy(),), "x0", False, lambda new: None)]
+    collected += problem.cost.numbers("cost") + numbers_of_fields(problem.dynamics, "dynamics", "dynamics")
+    for i, constraint in enumerate(problem.constraints):
+        collected += constraint.numbers(f"constraints[{i}]", i)
+    return collected
 
 
 def with_numbers_as_they_are(problem: Problem) -> Problem:
     """The same problems after numbers were written, with nothing that was computed from the previous ones."""
-    constraints = tuple(part.remade() for part in problem.constraints)
+    constraints = tuple(constraint.remade() for constraint in problem.constraints)
     known = replace(problem.known, row_shapes=None, interior=None, packed={}, lifted={})
     now = problem._with({"constraints": constraints}, known)
     if now.goal is None or now.goal.assumed:

@@ -18,11 +18,11 @@ class Numbers(Mapping[str, Floats]):
     `numbers[name]` is a copy, and `numbers[name] = value` writes.
     """
 
-    def __init__(self, found: list[Number], changed: Callable[[Number], None]) -> None:
-        self._all = {number.name: number for number in found}
-        short = [_short(number.name) for number in found]
+    def __init__(self, numbers: list[Number], changed: Callable[[Number], None]) -> None:
+        self._all = {number.name: number for number in numbers}
+        short = [_short(number.name) for number in numbers]
         self._by_name = dict(self._all)
-        for name, number in zip(short, found, strict=True):
+        for name, number in zip(short, numbers, strict=True):
             if Counter(short)[name] == 1:
                 self._by_name.setdefault(name, number)
         self._changed = changed
@@ -36,24 +36,24 @@ class Numbers(Mapping[str, Floats]):
         number = self._by_name.get(name)
         if number is None:
             alike = [full for full in self._all if _short(full) == name]
-            raise InputError("numbers", f"one of {', '.join(alike or map(self._named, self._all))}", name)
+            raise InputError("numbers", f"one of {', '.join(alike or map(self.short, self._all))}", name)
         return number
 
-    def named(self, *given: Mapping[str, Any] | None) -> dict[str, Any]:
+    def named(self, *mappings: Mapping[str, Any] | None) -> dict[str, Any]:
         """Values by full names, from mappings by any names.
 
         Raises:
             InputError: no mapping, a name that isn't there, or a number that is given twice, by whichever names.
         """
-        if wrong := [part for part in given if not isinstance(part, Mapping | None)]:
+        if wrong := [mapping for mapping in mappings if not isinstance(mapping, Mapping | None)]:
             raise InputError("numbers", "a dict of numbers by name", shown(wrong[0]))
-        found, names = dict[str, Any](), dict[str, str]()
-        for name, value in ((name, value) for part in given for name, value in (part or {}).items()):
+        values, names = dict[str, Any](), dict[str, str]()
+        for name, value in ((name, value) for mapping in mappings for name, value in (mapping or {}).items()):
             full = self.find(name).name
-            if full in found:
+            if full in values:
                 raise InputError("numbers", "each number once", f"{full} twice, as {names[full]} and {name}")
-            found[full], names[full] = value, name
-        return found
+            values[full], names[full] = value, name
+        return values
 
     def __getitem__(self, name: str) -> Floats:
         return self.find(name).value
@@ -65,12 +65,12 @@ class Numbers(Mapping[str, Floats]):
         """Write several; all are checked before the first is written."""
         new = [(number := self.find(name), number.checked(value)) for name, value in self.named(values).items()]
         joint = [(number, check) for number, _ in new if (check := number.joint) is not None]
-        together = {number.name: np.broadcast_to(given, number.shape) for number, given in new} if joint else {}
+        together = {number.name: np.broadcast_to(checked, number.shape) for number, checked in new} if joint else {}
         for number, check in joint:
             if (wrong := check(together)) is not None:
                 raise InputError(number.name, *wrong)
-        for number, given in new:
-            number.write(given)
+        for number, checked in new:
+            number.write(checked)
             self._changed(number)
 
     def __iter__(self) -> Iterator[str]:
@@ -80,11 +80,12 @@ class Numbers(Mapping[str, Floats]):
         return len(self._all)
 
     def __repr__(self) -> str:
-        rows = [(self._named(name), "x".join(map(str, n.shape)), name) for name, n in self._all.items()]
+        rows = [(self.short(name), "x".join(map(str, n.shape)), name) for name, n in self._all.items()]
         widths = [max(len(row[i]) for row in rows) for i in (0, 1)]
         return "\n".join(f"{a:{widths[0]}}  {b:{widths[1]}}  {c}" for a, b, c in [("name", "shape", "where"), *rows])
 
-    def _named(self, name: str) -> str:
+    def short(self, name: str) -> str:
+        """The shortest name of the number with this full name."""
         short = _short(name)
         return short if self._by_name.get(short) is self._all[name] else name
 

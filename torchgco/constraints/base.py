@@ -109,9 +109,9 @@ class Constraint(PerElement):
             return self.knots.start <= k < self.knots.stop
         return bool((self.knots == k).any())
 
-    def numbers(self, where: str, place: int) -> list[Number]:
+    def numbers(self, where: str, index: int) -> list[Number]:
         """Its numbers, which a compiled problem writes; `where` it is in the problem, such as "constraints[1]"."""
-        return numbers_of_fields(self, where, place)
+        return numbers_of_fields(self, where, index)
 
     @property
     def kernel(self) -> str:

@@ -63,10 +63,10 @@ class _Bounds(Constraint):
             raise InputError(name, "at least one finite bound", "none")
         return replace(self, lower=lower, upper=upper, knots=knots, above=above, below=below)
 
-    def numbers(self, where: str, place: int) -> list[Number]:
+    def numbers(self, where: str, index: int) -> list[Number]:
         fields = {side: (getattr(self, side), partial(self._check_new, side=side)) for side in ("lower", "upper")}
         joint = crossed(self, where, np.greater, "lower bounds of at most the upper ones")
-        pair = numbers(where, fields, place, joint=joint)
+        pair = numbers(where, fields, index, joint=joint)
         for number, none in zip(pair, (-np.inf, np.inf), strict=True):
             number.none = none
         return pair
@@ -358,8 +358,8 @@ class RateBounds(_Bounds):
         first = U[:, :1] if self.previous is None else self.previous.unsqueeze(1).expand(U.shape[0], 1, -1)
         return (U - torch.cat((first, U[:, :-1]), dim=1))[:, self.knots]
 
-    def numbers(self, where: str, place: int) -> list[Number]:
-        return numbers_of_fields(self, where, place)
+    def numbers(self, where: str, index: int) -> list[Number]:
+        return numbers_of_fields(self, where, index)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         if self.states is None:

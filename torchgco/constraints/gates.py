@@ -109,11 +109,11 @@ class GateBalls(NormBounds):
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return f"the radius of gate {int((self.places[0] == knot).nonzero()[0]) + 1}"
 
-    def numbers(self, where: str, place: int) -> list[Number]:
+    def numbers(self, where: str, index: int) -> list[Number]:
         """Of gates, which keep their knots."""
         centers, radii = self.centers, self.sizes
         fields = {"centers": (centers, finite), "radius": (radii, above_zero)}
-        return numbers("gates", fields, place, after=lambda: self.write(centers, radii))
+        return numbers("gates", fields, index, after=lambda: self.write(centers, radii))
 
     def on_the_way(self, X: Tensor) -> Tensor:
         return X[..., self.components].unsqueeze(-2)
@@ -161,11 +161,11 @@ class GateSquares(Vectors):
         gate = gate if bool(gate.any()) else off == (2 if row > 0 else -1)
         return f"the {what} of gate {int(gate.nonzero()[0]) + 1}"
 
-    def numbers(self, where: str, place: int) -> list[Number]:
+    def numbers(self, where: str, index: int) -> list[Number]:
         normals = self.axes[:, :, 0].clone()
         fields = {"centers": (self.centers, finite), "half_widths": (self.half_widths, above_zero)}
-        fresh = numbers("gates", fields, place, after=self.write)
-        return fresh + numbers("gates", {"normals": (normals, directions)}, place, after=lambda: self.write(normals))
+        fresh = numbers("gates", fields, index, after=self.write)
+        return fresh + numbers("gates", {"normals": (normals, directions)}, index, after=lambda: self.write(normals))
 
     def write(self, normals: Tensor | None = None) -> None:
         """Make the rows of the centres and half widths as they are, and of other normals (B, G, d), in this memory."""

@@ -56,7 +56,7 @@ class Vectors(Constraint):
         add_blocks(add, X.shape[-1], x[0], u[0], x[1], u[1])
         H[:, self.knots] += add
 
-    def numbers(self, where: str, place: int) -> list[Number]:
+    def numbers(self, where: str, index: int) -> list[Number]:
         checks: dict[str, Check] = {
             "lower": lengths, "upper": above_zero_or_infinite, "center": finite, "apex": finite, "angle": angles,
             "axis": directions,
@@ -65,7 +65,7 @@ class Vectors(Constraint):
         joint = crossed(self, where, np.greater_equal, "lower bounds below the upper ones") if both else None
         tensors = {field: getattr(self, field) for field in self.per_element if field in checks}
         fields = {field: (tensor, checks[field]) for field, tensor in tensors.items() if tensor is not None}
-        return numbers(where, fields, place, joint=joint)
+        return numbers(where, fields, index, joint=joint)
 
     def _components_told(self) -> str:
         places = ", ".join(map(str, self.components.tolist()))  # type: ignore[union-attr]

@@ -118,15 +118,15 @@ class Separation(Distance):
         return self.away(X)
 
     def measured(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        at, ways = [], []
+        distances, ways = [], []
         for first, second in zip(*self.ends, strict=True):
             away = X[..., first] - X[..., second]
             along = away.diff(dim=1)
             square = along.square().sum(-1).clamp(min=torch.finfo(X.dtype).tiny)
             share = (-(away[:, :-1] * along).sum(-1) / square).clamp(0.0, 1.0).unsqueeze(-1)
-            at.append(away.norm(dim=-1))
+            distances.append(away.norm(dim=-1))
             ways.append((away[:, :-1] + share * along).norm(dim=-1))
-        return torch.stack(at, dim=-1) - self.kept, torch.stack(ways, dim=-1) - self.kept
+        return torch.stack(distances, dim=-1) - self.kept, torch.stack(ways, dim=-1) - self.kept
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -177,21 +177,21 @@ class BoundQuadratic(Cost):
         return replace(self, **{name: lead(factor, W) * W for name, W in weights.items() if W is not None})
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        def at_k(values: Tensor) -> Tensor:
-            if not isinstance(k, int) or (x.dim() == 3 and values.shape[1] == 1):
-                return values
-            index = k if values.shape[1] > 1 else 0
-            # The axis of samples, if any, follows the batch axis.
-            return values[:, index] if x.dim() == 2 else values[:, index : index + 1]
-
-        ex, eu = x - at_k(self.x_ref), u - at_k(self.u_ref)
-        value = 0.5 * ((ex * self._times(at_k(self.Q), ex)).sum(-1) + (eu * self._times(at_k(self.R), eu)).sum(-1))
-        if self.q is not None:
-            value = value + (at_k(self.q) * ex).sum(-1)
-        if self.r is not None:
-            value = value + (at_k(self.r) * eu).sum(-1)
-        if self.H is not None:
-            value = value + (eu * (at_k(self.H) * ex.unsqueeze(-2)).sum(-1)).sum(-1)
+        parts: Sequence[Any] = self.x_ref, self.u_ref, self.Q, self.R, self.q, self.r, self.H
+        if isinstance(k, int):
+            parts = [part if part is None else _at(part, k, x.dim()) for part in parts]
+        x_ref, u_ref, Q, R, q, r, H = parts
+        ex, eu = x - x_ref, u - u_ref
+        if self.diagonal:
+            value = 0.5 * ((ex * (Q * ex)).sum(-1) + (eu * (R * eu)).sum(-1))
+        else:
+            value = 0.5 * ((ex * self._times(Q, ex)).sum(-1) + (eu * self._times(R, eu)).sum(-1))
+        if q is not None:
+            value = value + (q * ex).sum(-1)
+        if r is not None:
+            value = value + (r * eu).sum(-1)
+        if H is not None:
+            value = value + (eu * (H * ex.unsqueeze(-2)).sum(-1)).sum(-1)
         return value
 
     def rest_controls(self, like: Tensor) -> Tensor:
@@ -206,7 +206,7 @@ class BoundQuadratic(Cost):
             xf_ref, Qf = xf_ref.unsqueeze(1), Qf.unsqueeze(1)
             qf = None if qf is None else qf.unsqueeze(1)
         e = x - xf_ref
-        value = 0.5 * (e * self._times(Qf, e)).sum(-1)
+        value = 0.5 * (e * (Qf * e if self.diagonal else self._times(Qf, e))).sum(-1)
         return value if qf is None else value + (qf * e).sum(-1)
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
@@ -244,6 +244,14 @@ class BoundQuadratic(Cost):
         if W.requires_grad and e.dim() == 3 and W.dim() == 4 and W.shape[1] == 1:
             return torch.bmm(e, W[:, 0].mT.expand(len(e), *W.shape[2:]))  # products of all knots would be kept
         return W * e if self.diagonal else (W * e.unsqueeze(-2)).sum(-1)
+
+
+def _at(values: Tensor, k: int, axes: int) -> Tensor:
+    """Values (B|1, N|1, ...) of stage k for states of so many axes: that of samples follows the batch axis."""
+    if axes == 3 and values.shape[1] == 1:
+        return values
+    index = k if values.shape[1] > 1 else 0
+    return values[:, index] if axes == 2 else values[:, index : index + 1]
 
 
 def _weight(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor:

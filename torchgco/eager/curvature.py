@@ -54,11 +54,11 @@ def _rows(values: Tensor, z: Tensor) -> Tensor:
     basis = torch.eye(values.shape[-1], dtype=z.dtype, device=z.device)
     basis = basis.view(-1, *[1] * (values.dim() - 1), values.shape[-1])
     parts = []
-    for some in basis.split(max(1, DIRECTIONS_AT_ONCE // max(1, z.numel()))):
-        many = some.expand(-1, *values.shape)
-        found = torch.autograd.grad(values, z, many, retain_graph=True, is_grads_batched=True, allow_unused=True)[0]
+    for directions in basis.split(max(1, DIRECTIONS_AT_ONCE // max(1, z.numel()))):
+        many = directions.expand(-1, *values.shape)
+        gradients = torch.autograd.grad(values, z, many, retain_graph=True, is_grads_batched=True, allow_unused=True)[0]
         # Slopes of an affine function depend on its weights, which may ask for gradients, and not on z.
-        parts.append(z.new_zeros(len(some), *z.shape) if found is None else found)
+        parts.append(z.new_zeros(len(directions), *z.shape) if gradients is None else gradients)
     return torch.cat(parts).movedim(0, -2)
 
 

@@ -44,13 +44,13 @@ class Functions:
         Raises:
             InputError: rows of a constraint that join knots.
         """
-        one = problem.take(slice(0, 1))
-        n, (X, U) = problem.n, one.at_rest
+        alone = problem.take(slice(0, 1))
+        n, (X, U) = problem.n, alone.at_rest
         for i in called:
-            if is_users(part := one.constraints[i]) and not is_function(part) and joins_knots(part, one):
+            if is_users(user := alone.constraints[i]) and not is_function(user) and joins_knots(user, alone):
                 raise InputError(f"constraints[{i}].value", ONE_KNOT, "rows that change with other knots")
-        rows = {i: expansion_of(*_by_knots(one.constraints[i], X, U)[:2]) for i in called}
-        step = lambda z: one.along.step(z[..., :n], z[..., n:])
+        rows = {i: expansion_of(*_by_knots(alone.constraints[i], X, U)[:2]) for i in called}
+        step = lambda z: alone.along.step(z[..., :n], z[..., n:])
         return cls(problem, rows, expansion_of(step, torch.cat((X[:, :-1], U), dim=-1)))
 
     def among(self, problem: Problem) -> Functions:
@@ -85,21 +85,21 @@ class Functions:
 
     def expand_row(self, i: int, X: Tensor, U: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes (b, K, p, S) of constraint i, and Hessians (b, K, S, S) of lam' c, for lam (b, K, p)."""
-        part, S = self.problem.constraints[i], X.shape[-1] + U.shape[-1]
-        function, w, columns = _by_knots(part, X, U)
+        constraint, S = self.problem.constraints[i], X.shape[-1] + U.shape[-1]
+        function, w, columns = _by_knots(constraint, X, U)
         parts = self.rows[i](function, w, lam)
-        J, H = (found if found.shape[1] == lam.shape[1] else found[:, part.knots] for found in parts)
+        J, H = (z if z.shape[1] == lam.shape[1] else z[:, constraint.knots] for z in parts)
         slopes, curvature = J.new_zeros(*J.shape[:3], S), H.new_zeros(*J.shape[:2], S, S)
         slopes[..., columns], curvature[..., columns, columns] = J, H
         return slopes, curvature
 
     def nearby(self, X: Tensor, U: Tensor, start: Tensor, controls: Tensor) -> Tensor:
         """States (b, N+1, n) that follow from others than X, U, with the same gaps."""
-        ahead, found = self.step(X, U), [start]
+        ahead, states = self.step(X, U), [start]
         for k in range(U.shape[1]):
-            step = self.problem.dynamics.at(k).step(found[-1], controls[:, k])
-            found.append(X[:, k + 1] + (step - ahead[:, k]))
-        return torch.stack(found, dim=1)
+            step = self.problem.dynamics.at(k).step(states[-1], controls[:, k])
+            states.append(X[:, k + 1] + (step - ahead[:, k]))
+        return torch.stack(states, dim=1)
 
 
 def joined(X: Tensor, U: Tensor) -> Tensor:
@@ -116,9 +116,9 @@ def joins_knots(part: Constraint, problem: Problem) -> bool:
     z = joined(*problem.at_rest)
     z = z + STATE_OFFSET * (1.0 + z.abs()) * (1.0 + 0.5 * scattered(z))
     value, n = lambda z: part.value(z[..., :n], z[:, :-1, n:]), problem.n
-    place = torch.arange(problem.N + 1, device=z.device)
+    knot = torch.arange(problem.N + 1, device=z.device)
     for digit in range(problem.N.bit_length()):
-        for moves in ((place >> digit & 1).bool(), ~(place >> digit & 1).bool()):
+        for moves in ((knot >> digit & 1).bool(), ~(knot >> digit & 1).bool()):
             tangent = moves.to(z.dtype).view(1, -1, 1) * (1.0 + 0.5 * scattered(z))
             change = torch.func.jvp(value, (z,), (tangent,))[1]
             if bool((change[:, ~moves[part.knots]] != 0).any()):

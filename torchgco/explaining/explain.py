@@ -207,8 +207,8 @@ def _duration(solved: Solved, b: int, single: _One) -> list[str]:
     lines = [f"duration {number(float(single.t[-1]))} s, of {number(float(least))} to {number(float(most))} s allowed"]
     if solved.needed is not None and float(solved.violation[b]) > ADMITTED:
         needed = float(solved.needed[b])
-        told = "none longer that was tried does" if needed != needed else f"{number(needed)} s would do"
-        lines.append(f"no duration up to time.most was found to do; {told}")
+        reason = "none longer that was tried does" if needed != needed else f"{number(needed)} s would do"
+        lines.append(f"no duration up to time.most was found to do; {reason}")
     return lines
 
 
@@ -221,12 +221,12 @@ def _caught(solved: Solved, b: int, single: _One | None) -> list[str]:
         index = (rows == b).nonzero().flatten()
         if index.numel() == 0:
             return ["no: the first solve wasn't stopped between obstacles"]
-        told = caught_told(single.held, X[index], single.full_U, single.t)
-        return [f"the first solve was stopped {told}" if told else "the first solve was stopped between obstacles"]
+        lines = caught_told(single.held, X[index], single.full_U, single.t)
+        return [f"the first solve was stopped {lines}" if lines else "the first solve was stopped between obstacles"]
     if single.lost_at is not None:
         return []
-    told = caught_told(single.held, single.full_X, single.full_U, single.t, ADMITTED)
-    return [f"the returned trajectory lies {told}"] if told else []
+    lines = caught_told(single.held, single.full_X, single.full_U, single.t, ADMITTED)
+    return [f"the returned trajectory lies {lines}"] if lines else []
 
 
 def _passes(solved: Solved, b: int, account: Account, facts: Facts) -> list[str]:

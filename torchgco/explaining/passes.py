@@ -116,12 +116,12 @@ def _gained(before: _Standing | None, after: _Standing | None) -> str:
 
 def _compared(comparisons: list[Comparison], number_: int, b: int, again: bool) -> str | None:
     """What became of the candidates of a pass; None where it compared none."""
-    told = []
+    lines = []
     for trial in comparisons:
         index = (trial.rows == b).nonzero().flatten().tolist()
         if trial.number == number_ and trial.again == again and index:
-            told.append(_fates(trial, index[0]))
-    return ". Then ".join(told) if told else None
+            lines.append(_fates(trial, index[0]))
+    return ". Then ".join(lines) if lines else None
 
 
 def _fates(trial: Comparison, i: int) -> str:

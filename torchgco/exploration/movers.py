@@ -145,7 +145,6 @@ class Movers(Protocol):
 
     def note(self, seen: SeenMap, changed: np.ndarray) -> None:
         """Cells of the map have changed, given by flat indices."""
-        ...
 
     def now(self, t: float) -> Moving:
         """The bodies at time t, s."""

@@ -255,7 +255,8 @@ class Exploration:
         U = torch.where(ends_at_rest(kept.X).view(-1, 1, 1), U, hover)  # one that doesn't end at rest is no start
         solution = self.local.solve(problem, U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
-        K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), solution.X, solution.U).K
+        bare = Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True)
+        K = optimality(bare, solution.X, solution.U).gains[..., :-1]
         excess = unflyable(problem, solution.X, solution.U)
         best = [self._best(solution.X[b::B], solution.cost[b::B], excess[b::B], kept.X[b], b) for b in range(B)]
         for b, scout in enumerate(self.scouts):

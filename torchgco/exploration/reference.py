@@ -73,12 +73,7 @@ def along(corners: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def motion(
-    corners: np.ndarray,
-    velocity: np.ndarray,
-    pace: Pace,
-    count: int,
-    dt: float,
-    swing: np.ndarray | float = SWERVE,
+    corners: np.ndarray, velocity: np.ndarray, pace: Pace, count: int, dt: float, swing: np.ndarray | float = SWERVE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities (count + 1, 3) along a polyline (K, 3) that begins at the vehicle, every dt, s.
 

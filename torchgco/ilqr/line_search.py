@@ -53,11 +53,8 @@ class LineSearch(Checked, named="line_search"):
     smallest: ClassVar[float] = 1e-4  # no shorter step is tried, but for one as printed: the first below this
 
     def ladder(self, accept_last: bool) -> list[float]:
-        """1, phi, phi^2, ... down to `smallest`, and with `accept_last` the first one below."""
-        rungs = [1.0]
-        while rungs[-1] >= self.smallest:
-            rungs.append(rungs[-1] * self.shrink)
-        return rungs if accept_last else rungs[:-1]
+        """See `rungs_of`."""
+        return rungs_of(self.shrink, self.smallest, accept_last)
 
     def search(
         self,
@@ -129,3 +126,11 @@ class LineSearch(Checked, named="line_search"):
             merged[name] = getattr(rollouts, name).clone()
             merged[name][target] = getattr(tried, name)[source]
         return Rollouts(**merged)
+
+
+def rungs_of(shrink: float, smallest: float, accept_last: bool) -> list[float]:
+    """1, phi, phi^2, ... down to `smallest`, and with `accept_last` the first one below."""
+    rungs = [1.0]
+    while rungs[-1] >= smallest:
+        rungs.append(rungs[-1] * shrink)
+    return rungs if accept_last else rungs[:-1]

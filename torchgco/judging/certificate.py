@@ -206,6 +206,8 @@ def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     reduced, terms, start = _reduced(problem, X, U, gX, gU)
     free = _free(problem)
     slopes = torch.cat((reduced.flatten(1), start[0][:, free]), dim=1).cpu().numpy()
+    if not np.isfinite(slopes).all():  # where the code refuses states, or is no number there, no multipliers fit
+        return torch.full_like(X[0, 0, 0], torch.nan)
     senses = [equality for equality, (rows, _) in active for _ in rows]
     rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool)))
     return _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])), _hardly_seen(problem, X, U))

@@ -82,13 +82,13 @@ def _depth(obstacle: Obstacles, places: np.ndarray, dt: float, states: np.ndarra
     return beneath.amax(-1).numpy() if beneath.shape[-1] else np.full(len(places) - 1, -np.inf)
 
 
-def _beneath(part: Obstacles, X: Tensor) -> Tensor:
+def _beneath(body: Obstacles, X: Tensor) -> Tensor:
     """The same (P, M) beneath the full surfaces; of a kind that can't be judged, by its own distances at the ends."""
-    X = X.to(part.vehicle_radius.device, part.vehicle_radius.dtype)
+    X = X.to(body.vehicle_radius.device, body.vehicle_radius.dtype)
     try:
-        ways, bulge = part.measured(X.unsqueeze(0))[1][0], part.even_bulge(X.unsqueeze(0))[0]
+        ways, bulge = body.measured(X.unsqueeze(0))[1][0], body.even_bulge(X.unsqueeze(0))[0]
         gaps = (ways.unflatten(-1, (bulge.shape[-1], -1)) - bulge.unsqueeze(-1)).flatten(1)
     except InputError:
-        ends = part.signed_distance(X[None, :, part.position], part.dt * torch.arange(len(X), device="cpu").to(X))[0]
+        ends = body.signed_distance(X[None, :, body.position], body.dt * torch.arange(len(X), device="cpu").to(X))[0]
         gaps = torch.minimum(ends[:-1], ends[1:])
     return -gaps.detach().double().cpu()

@@ -7,7 +7,7 @@ Differential Equations I, section II.4). A model whose field isn't known can't t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -35,6 +35,7 @@ HARMLESS_ERROR = {"euler": 0.05, "midpoint": 0.0, "rk4": 0.0}
 LEAST_RANGE = 1e-3  # of a state's largest size: its range counts as no less
 LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 ELASTIC = 100.0  # by how many per cent no cost changes where a state changes by one per cent of its range
+Costates = Callable[[Problem, Tensor, Tensor, Sequence[Tensor]], Tensor | None]  # of problems, X, U and multipliers
 JACOBIANS_AT_ONCE = 2**20  # numbers of one intermediate tensor at once: 8 MB
 
 
@@ -69,6 +70,7 @@ def step_errors(
     times: Tensor | None = None,
     multipliers: Sequence[Tensor] | None = None,
     doubted: bool = False,
+    costates: Costates | None = None,
 ) -> StepErrors:
     """The errors of the steps along trajectories X (B, N+1, n), U (B, N, m), where each state follows from the last.
 
@@ -77,6 +79,7 @@ def step_errors(
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
             all stages together to be large, or no error is above `HARMLESS_ERROR`.
+        costates: finds them, or returns None where autodiff has to; None: it always has.
     """
     lost = X.new_full((problem.B,), torch.nan)
     zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
@@ -97,7 +100,9 @@ def step_errors(
             if chosen.numel() > 0:
                 numbers = chosen + rows.start
                 parts = X[numbers], U[numbers], e[chosen], None if times is None else times[numbers]
-                costs[chosen] = _cost_of(problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()])
+                costs[chosen] = _cost_of(
+                    problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()], costates
+                )
             error.step_cost[rows] = costs
         method, stages = problem.dynamics.integrator, problem.stages.to(X.dtype)
         too_much = (COARSE / stages ** ORDER_OF[method]).clamp(min=LARGE_COST)
@@ -141,26 +146,38 @@ def _along(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> tupl
 
 
 def _cost_of(
-    problem: Problem, X: Tensor, U: Tensor, e: Tensor, times: Tensor | None, multipliers: Sequence[Tensor]
+    problem: Problem,
+    X: Tensor,
+    U: Tensor,
+    e: Tensor,
+    times: Tensor | None,
+    multipliers: Sequence[Tensor],
+    costates: Costates | None,
 ) -> Tensor:
     """`StepErrors.step_cost` (B,) of the differences e (B, N, n)."""
-    n = problem.n
+    found = None if costates is None or times is not None else costates(problem, X, U, multipliers)
     whole, X, U = at_times(within_horizons(problem), X, at_rest_after(problem, U), times)
-    pairs = list(zip(whole.constraints, multipliers, strict=False))
+    try:
+        found = _costates(whole, X, U, multipliers) if found is None else found
+    except RuntimeError:  # code that autograd can't differentiate, which samplers serve
+        return torch.full_like(X[:, 0, 0], torch.nan)
+    change = (found[:, 1:, : problem.n] * e).flatten(1).sum(-1)
+    return torch.where(change != 0, change.abs() / _size(whole, X, U), 0.0)
+
+
+def _costates(problem: Problem, X: Tensor, U: Tensor, multipliers: Sequence[Tensor]) -> Tensor:
+    """Slopes (B, N+1, n) of J_var + lam'c by the states, where later states follow from each; by autodiff."""
+    pairs = list(zip(problem.constraints, multipliers, strict=False))
 
     def lagrangian(x: Tensor) -> Tensor:
         pushes = (torch.where(lam != 0, lam * c.value(x, U), 0.0).flatten(1).sum(-1) for c, lam in pairs)
-        return sum(pushes, whole.cost.total(x, U))
+        return sum(pushes, problem.cost.total(x, U))
 
-    try:
-        (slopes,), fx = gradients_at_once(lagrangian, X), _by_states(whole, X[:, :-1], U)
-    except RuntimeError:  # code that autograd can't differentiate, which samplers serve
-        return torch.full_like(X[:, 0, 0], torch.nan)
+    (slopes,), fx = gradients_at_once(lagrangian, X), _by_states(problem, X[:, :-1], U)
     costates, rows = [slopes[:, -1:]], slopes.unsqueeze(2).unbind(1)
     for k, by_x in zip(range(problem.N - 1, 0, -1), reversed(fx.unbind(1)[1:]), strict=True):
         costates.append(torch.baddbmm(rows[k], costates[-1], by_x))
-    change = (torch.cat(costates[::-1], dim=1)[..., :n] * e).flatten(1).sum(-1)
-    return torch.where(change != 0, change.abs() / _size(whole, X, U), 0.0)
+    return torch.cat((slopes[:, :1], *costates[::-1]), dim=1)
 
 
 def _by_states(problem: Problem, x: Tensor, U: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """What solvers compute with: in PyTorch (`in_pytorch.Kernels`) and in C, chosen once per form of problems.
 
 Solvers call the functions of `verbs`, which ask `choice.kernels_of` whose they are. `in_c` hands a problem to
-`native`; where its code can't be traced, a warning names it, and `in_pytorch` computes the same. It imports `native`
+`native`; where its code can't be traced, a warning names it, and `in_pytorch` computes the same. `elsewhere` brings
+problems of a GPU to the CPU. It imports `native`
 and `eager`. Begin with `in_pytorch.py`, which says what kernels are asked.
 """
 
@@ -12,9 +13,12 @@ from torchgco.kernels.choice import kernels_of as kernels_of
 from torchgco.kernels.choice import native as native
 from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
+from torchgco.kernels.elsewhere import copied_to as copied_to
+from torchgco.kernels.elsewhere import on_cpu as on_cpu
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_scale as cost_scale
 from torchgco.kernels.verbs import cost_unit as cost_unit
+from torchgco.kernels.verbs import costates as costates
 from torchgco.kernels.verbs import followed as followed
 from torchgco.kernels.verbs import interior_of as interior_of
 from torchgco.kernels.verbs import is_convex as is_convex
@@ -22,4 +26,5 @@ from torchgco.kernels.verbs import measured as measured
 from torchgco.kernels.verbs import open_loop as open_loop
 from torchgco.kernels.verbs import path_clearance as path_clearance
 from torchgco.kernels.verbs import reproducible as reproducible
+from torchgco.kernels.verbs import rolled_out as rolled_out
 from torchgco.kernels.verbs import value as value

@@ -6,10 +6,12 @@ import warnings
 from collections.abc import Hashable
 
 import torch
+from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.gradients import is_forward
+from torchgco.base.gradients import is_forward, leaves
 from torchgco.base.memory import trim
+from torchgco.base.tree import is_users
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.compiler import NativeError, find_compiler
@@ -21,6 +23,7 @@ from torchgco.problem.problem import Problem
 from torchgco.tracing import CAPTURED, Facts
 
 ENGINES_KEPT = 64  # engines, the most recent ones
+CURRENT, OWN = "current", "own tensors"  # what a problem keeps of its solves: see `current`
 
 
 _uses_native = True
@@ -46,16 +49,44 @@ class EagerWarning(UserWarning):
 
 
 def current(problem: Problem) -> Problem:
-    """The problem as its parts are now: nothing is kept from an earlier solve but code of the same computation.
+    """The problem as its parts are now: nothing is kept from an earlier solve but what can't have changed since.
 
-    Every solve begins with this call: the tensors, numbers and modules that a user's code captures may have changed.
-    Within a solve, subsets and other forms of the problem share the kernels of its beginning.
+    Every solve begins with this call: the tensors, numbers and modules that a user's code captures may have changed,
+    and then code of the same computation alone is kept. Of torchgco's own parts everything stays that was made of them
+    while their numbers do: forms, scales, structures that C reads. Within a solve, subsets and other forms of the
+    problem share the kernels of its beginning.
     """
     if problem.known.current:
         return problem
+    facts, (then, before) = _standing(problem), problem.derived.get(CURRENT, (None, problem))
+    if facts is not None and facts == then and before.known.in_c is not False:
+        return before
     fresh = problem.renewed()
     fresh.known.current, fresh.known.warned = True, problem.known.warned
+    if facts is not None:
+        problem.derived[CURRENT] = facts, fresh
     return fresh
+
+
+def _standing(problem: Problem) -> tuple[Hashable, ...] | None:
+    """What says whether the numbers of a problem of torchgco's own parts are as they were; None of others.
+
+    Those that it was given are looked at by `Problem.current`; into what it has made of them PyTorch alone writes.
+    """
+    if problem.given is None:
+        return None
+    own = problem.derive(OWN, lambda: _own_tensors(problem))
+    return None if own is None else (find_compiler(), *(tensor._version for tensor in own))
+
+
+def _own_tensors(problem: Problem) -> tuple[Tensor, ...] | None:
+    """All tensors of a problem; None where a part is a user's, or one is of inference mode, which counts no writes."""
+    parts = problem.dynamics, problem.cost, *problem.constraints
+    if any(map(is_users, parts)):
+        return None
+    every = leaves((parts, problem.x0, problem.goal, problem.horizon, problem.free_start, problem.time))
+    own = [leaf for leaf in every if isinstance(leaf, Tensor)]
+    return None if any(tensor.is_inference() for tensor in own) else tuple(own)
 
 
 def kernels_of(problem: Problem) -> Kernels:
@@ -65,25 +96,39 @@ def kernels_of(problem: Problem) -> Kernels:
     can't be traced or nothing compiles, which an EagerWarning explains.
     """
     known = problem.known
-    if native() and problem.x0.dtype == torch.float64 and problem.x0.device.type == "cpu":
-        if known.in_c is None:
-            known.in_c = _natively(problem) or False
-        if known.in_c:
-            return known.in_c
+    if _uses_native and known.in_c is None and problem.x0.dtype == torch.float64 and problem.x0.device.type == "cpu":
+        known.in_c = _natively(problem) or False
+    if _uses_native and known.in_c:
+        return known.in_c
     if known.in_pytorch is None:
         _check_eager(problem)
         known.in_pytorch = Kernels()
     return known.in_pytorch
 
 
+def serves(problem: Problem) -> bool:
+    """Whether C serves problems of this form, on the CPU in float64; no warning says where it doesn't."""
+    known = problem.known
+    if known.in_c is None:
+        try:
+            known.in_c = _in_c(problem)
+        except (InputError, NativeError):
+            known.in_c = False
+    return bool(known.in_c)
+
+
 def _natively(problem: Problem) -> NativeKernels | None:
-    warned = problem.known.warned
     try:
-        return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
+        return _in_c(problem)
     except (InputError, NativeError) as error:
         _check_eager(problem)
-        _warn(warned, error)
+        _warn(problem.known.warned, error)
         return None
+
+
+def _in_c(problem: Problem) -> NativeKernels:
+    warned = problem.known.warned
+    return NativeKernels(_engine(problem), lambda error: _warn(warned, error))
 
 
 def _check_eager(problem: Problem) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
-from functools import lru_cache
+from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -14,12 +14,12 @@ from torchgco.base.status import Status
 from torchgco.eager.sampling import Sampling
 from torchgco.ilqr import descent, lifted
 from torchgco.ilqr.descent import Descent
-from torchgco.ilqr.line_search import Rollouts
+from torchgco.ilqr.line_search import Rollouts, rungs_of
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import keep_lifted
-from torchgco.kernels.in_pytorch import Kernels, clearance_of
+from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
 from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
-from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine, InteriorKernels
@@ -69,6 +69,14 @@ class NativeKernels(Kernels):
         self.engine.run("tgco_value", B, packed)
         return cost, merit
 
+    def begun(self, lagrangian: Lagrangian, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        problem, B = lagrangian.problem, len(U)
+        X, cost, merit = U.new_empty(B, problem.N + 1, problem.n), U.new_empty(B), U.new_empty(B)
+        X[:, 0] = problem.x0
+        packed = self.engine.terms(lagrangian, X=X, U=U.contiguous(), cost=cost, merit=merit)
+        self.engine.run("tgco_begin", B, packed)
+        return X, cost, merit
+
     def scale(self, problem: Problem) -> None:
         if self.engine.cost is not None:
             slopes, H = self.expand(problem, *problem.at_rest)
@@ -110,28 +118,44 @@ class NativeKernels(Kernels):
         self.engine.run("tgco_chords", problem.B, packed)
         return clearance_of(others, X, share, least)
 
-    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
-        B, slack = lagrangian.problem.B, X.new_zeros(lagrangian.problem.B)
-        packed = self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=slack, merit=slack)
-        self.engine.run("tgco_slack", B, packed)
-        return slack
+    def rolled_out(self, problem: Problem, X: Tensor, U: Tensor, gains: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        B, worst = problem.B, X.new_empty(problem.B)
+        X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
+        packed = self.engine.placed(problem, X=X, U=U, gains=gains.contiguous(), merit=worst)
+        self.engine.run("tgco_follow", B, packed)
+        return X, U, worst if self.engine.measures else super().violation(problem, X, U)
 
-    def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
-        B, problem = lagrangian.problem.B, lagrangian.problem
+    def judged(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Judged:
+        B, X, U = lagrangian.problem.B, X.contiguous(), U.contiguous()
+        slack, worst, sensitive = X.new_empty(B), X.new_empty(B), _flags(B)
+        more = {"slack": slack, "violation": worst, "sensitive": sensitive, "nudge": CONTROL_NUDGE}
+        run = partial(self._backward, lagrangian, X, U)
+        step = run(X.new_zeros(B), gain=AMPLIFIED * CONTROL_NUDGE, **more)
+        if not self.engine.measures:
+            worst = super().violation(lagrangian.problem, X, U)
+        return Judged(step, slack, worst, sensitive != 0, run)
 
-        def backward(mu: Tensor) -> BackwardPass:
-            G, status = X.new_empty(B, problem.N, problem.m, problem.n + 1), _flags(B)
-            linear, quadratic = torch.zeros_like(mu), torch.zeros_like(mu)
-            packed = self.engine.terms(
-                lagrangian, X=X.contiguous(), U=U.contiguous(), regularisation=mu.contiguous(), cost=linear,
-                merit=quadratic, gains=G, status=status, optimality=True,
-            )  # fmt: skip
-            self.engine.run("tgco_gains", B, packed)
-            return BackwardPass(G.transpose(0, 1), linear, quadratic, status != Status.RUNNING)
+    def _backward(self, lagrangian: Lagrangian, X: Tensor, U: Tensor, mu: Tensor, **more: Any) -> BackwardPass:
+        B, N, m, n = *U.shape, X.shape[-1]
+        G, status, linear, quadratic = X.new_empty(B, N, m, n + 1), _flags(B), X.new_empty(B), X.new_empty(B)
+        packed = self.engine.terms(
+            lagrangian, X=X, U=U, regularisation=mu.contiguous(), cost=linear, merit=quadratic, gains=G, status=status,
+            optimality=True, **more,
+        )  # fmt: skip
+        self.engine.run("tgco_gains", B, packed)
+        return BackwardPass(G.transpose(0, 1), linear, quadratic, status != Status.RUNNING)
 
-        return backward
+    def costates(self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> Tensor:
+        """See `kernels.costates`."""
+        found, none = torch.zeros_like(X), X.new_zeros(problem.B)
+        lagrangian = Lagrangian(problem, Multipliers(tuple(lam), none), None, True)
+        packed = self.engine.terms(
+            lagrangian, X=X.contiguous(), U=U.contiguous(), cost=none, merit=none, slopes=found, optimality=True
+        )
+        self.engine.run("tgco_costates", problem.B, packed)
+        return found
 
-    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
+    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
         B = lagrangian.problem.B
         for name in ITERATED:
             setattr(s, name, getattr(s, name).contiguous())
@@ -141,7 +165,7 @@ class NativeKernels(Kernels):
             lagrangian, None, **state, **out, options=native_options(how), limit=limit,
             replicas=self.engine.replicas_of(B),
         )  # fmt: skip
-        self.engine.run("tgco_ilqr", B, packed)
+        self.engine.run("tgco_descend" if begins else "tgco_ilqr", B, packed)
         end = pass_end(out)
         if out["lost"].any():
             rows = out["lost"].nonzero().flatten()
@@ -180,20 +204,13 @@ class NativeKernels(Kernels):
             self._samplers[how.dtype] = Sampler(self.engine, how.dtype)
         return self._samplers[how.dtype].improve(problem, U, how)
 
-    def differing(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-        start = problem.held_at(X[:, 0])
-        other = self.open_loop(start, U + CONTROL_NUDGE * U.abs().amax(dim=1, keepdim=True))
-        scale = X.abs().flatten(1).amax(-1).clamp(min=CONTROL_NUDGE)
-        return (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * CONTROL_NUDGE * scale)).nonzero().flatten()
-
 
 def native_options(how: Descent) -> Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
-    rungs = search.ladder(printed)
-    return Options.complete(
-        ladder=_numbers(*rungs), rungs=len(rungs), back=-1 if search.back is None else search.back, accept_last=printed,
-        ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
+    return _options(
+        search.shrink, back=-1 if search.back is None else search.back,
+        accept_last=printed, ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
         max_iterations=how.max_iterations, tolerance=0.0 if printed else how.tolerance,
         absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,
         regularisation_first=descent.REGULARISATION_FIRST, regularisation_growth=descent.REGULARISATION_GROWTH,
@@ -203,8 +220,10 @@ def native_options(how: Descent) -> Options:
 
 
 @lru_cache(maxsize=64)
-def _numbers(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
+def _options(shrink: float, **numbers: Any) -> Options:
+    """The structure with these fields: there are few of them, and filling one takes long beside a small solve."""
+    rungs = rungs_of(shrink, numbers["smallest"], numbers["accept_last"])
+    return Options.complete(ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs), **numbers)
 
 
 def _flags(B: int) -> Tensor:

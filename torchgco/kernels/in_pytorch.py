@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.riccati import BackwardPass, backward
 from torchgco.ilqr.step import iterate
 from torchgco.kernels.outer import NativeOuter
+from torchgco.lagrangian.barrier import ROUNDINGS
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
@@ -23,6 +25,16 @@ from torchgco.native.called import CalledInterior
 from torchgco.native.interior import InteriorKernels
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.problem.problem import Problem
+
+
+class Judged(NamedTuple):
+    """What is found along trajectories with their multipliers, for the verdict on them."""
+
+    step: BackwardPass  # the backward pass on J_var + lam'c
+    slack: Tensor  # (B,), see `Lagrangian.slack`
+    worst: Tensor  # (B,): the largest violation
+    sensitive: Tensor  # (B,) bool: whether rounding may decide where a rollout by PyTorch ends
+    run: Callable[[Tensor], BackwardPass]  # the backward pass for regularisations mu_r (B,)
 
 
 class Kernels:
@@ -55,6 +67,11 @@ class Kernels:
         """J_var (B,) and L_M (B,)."""
         return lagrangian.value(X, U)
 
+    def begun(self, lagrangian: Lagrangian, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """X from the problem's start and controls U, J_var (B,) and L_M (B,)."""
+        X = self.open_loop(lagrangian.problem, U)
+        return X, *self.value(lagrangian, X, U)
+
     def scale(self, problem: Problem) -> None:
         """Have the problem keep its `cost_scale`, where that can be computed without autodiff."""
 
@@ -66,17 +83,31 @@ class Kernels:
         """See `kernels.chord_clearance`."""
         return clearance_of([c.bare for c in problem.constraints], X, share)
 
-    def slack(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
-        """See `Lagrangian.slack`."""
-        return lagrangian.slack(X, U)
+    def rolled_out(self, problem: Problem, X: Tensor, U: Tensor, gains: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `kernels.rolled_out`."""
+        K = gains[..., :-1].nan_to_num(0.0, 0.0, 0.0)
+        rollout = self.closed_loop(problem, X, U, K)
+        rows = (~_is_rounding(X, rollout[0])).nonzero().flatten()
+        if rows.numel() > 0:
+            alone = self.closed_loop(problem.take(rows), X[rows], U[rows], torch.zeros_like(K[rows]))
+            better = _is_rounding(X[rows], alone[0])
+            for whole, single in zip(rollout, alone, strict=True):
+                whole[rows[better]] = single[better]
+        return *rollout, self.violation(problem, *rollout)
 
-    def optimality_pass(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
-        """The backward pass on J_var + lam'c, for regularisations mu_r (B,)."""
-        F, H = linearise(lagrangian.problem, X, U), lagrangian.expand_optimality(X, U)
-        return lambda mu: backward(F, H, mu)
+    def judged(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Judged:
+        """What a verdict on trajectories needs."""
+        problem = lagrangian.problem
+        F, H = linearise(problem, X, U), lagrangian.expand_optimality(X, U)
+        run, worst = partial(backward, F, H), self.violation(problem, X, U)
+        step = run(torch.zeros_like(worst))
+        return Judged(step, lagrangian.slack(X, U), worst, torch.zeros_like(worst, dtype=torch.bool), run)
 
-    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int) -> PassEnd:
-        """Iterations of every problem's inner solve, in place: one at least, `limit` at most."""
+    def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
+        """Iterations of every problem's inner solve, in place: one at least, `limit` at most.
+
+        Where they are `compiled` also the beginning: of `s` only the first states and U are then read.
+        """
         return iterate(how, s, lagrangian)
 
     def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:
@@ -103,9 +134,11 @@ class Kernels:
         """Controls (B, N, m): the weighted mean of the last round's samples, the first drawn around U."""
         return sampling.sample(problem, U, how)
 
-    def differing(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-        """Problems (b,) of which rounding may decide where a rollout of U by PyTorch ends, for these X."""
-        return torch.zeros(0, dtype=torch.int64, device=X.device)
+
+def _is_rounding(old: Tensor, new: Tensor) -> Tensor:
+    """Whether trajectories (B, N+1, n) are one, up to rounding along the stages, (B,)."""
+    most = ROUNDINGS * torch.finfo(old.dtype).eps * old.abs().amax(1, keepdim=True)
+    return ((new - old).abs() <= most).flatten(1).all(-1)
 
 
 def clearance_of(parts: list[Any], X: Tensor, share: float | None, least: Tensor | None = None) -> Tensor:

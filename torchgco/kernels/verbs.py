@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from torchgco.constraints.base import Distance
 from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.dynamics import rollout
-from torchgco.kernels.choice import kernels_of
+from torchgco.kernels.choice import kernels_of, native
 from torchgco.kernels.in_pytorch import clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.interior import InteriorKernels
@@ -37,17 +37,27 @@ def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor,
     return kernels_of(problem).closed_loop(problem, torch.cat((start.unsqueeze(1), X[:, 1:]), dim=1), U, K)
 
 
-def reproducible(problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+def rolled_out(problem: Problem, X: Tensor, U: Tensor, gains: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The rollout that a solve's states X (B, N+1, n) and controls U (B, N, m) stand for, and its violation (B,).
+
+    It follows X by the feedback u = U + K (x - X), which closes gaps; but where U alone leads to X up to rounding,
+    there are none to close. Active rows of a tight solution may be so stiff that rounding decides on the gains, which
+    then make a change that counts of one in the last bit: where they do, U alone.
+
+    Args:
+        X: from the problem's start, or what is chosen of it.
+        gains: (B, N, m, n+1), of which K is used; those that aren't finite count as 0.
+    """
+    return kernels_of(problem).rolled_out(problem, X, U, gains)
+
+
+def reproducible(problem: Problem, X: Tensor, U: Tensor, rows: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n) and U (B, N, m) of a problem's kernels, repaired where PyTorch's rollout of U would not give X.
 
-    The two kinds of kernels differ in the last bits. Where unstable dynamics amplify this, as a rollout of slightly
-    different controls shows, PyTorch tracks X with the `gains` (b, N, m, n) of these rows (b,), and X and U of that
-    rollout are returned.
+    The two kinds of kernels differ in the last bits. In the problems `rows` (b,), unstable dynamics amplify this, as a
+    rollout of slightly different controls has shown: PyTorch tracks X with the gains K (b, N, m, n), and X and U of
+    that rollout are returned.
     """
-    rows = kernels_of(problem).differing(problem, X, U)
-    if rows.numel() == 0:
-        return X, U
-    K = gains(rows)
     G = torch.cat((K, torch.zeros_like(K[..., :1])), dim=-1).nan_to_num(0.0).transpose(0, 1)
     X, U, alpha = X.clone(), U.clone(), torch.zeros_like(X[rows, 0, 0])
     X[rows], U[rows] = rollout.closed_loop(problem.dynamics.take(rows), X[rows], U[rows], G.contiguous(), alpha)
@@ -57,6 +67,18 @@ def reproducible(problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor
 def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
     """J_var (B,) and L_M (B,)."""
     return kernels_of(lagrangian.problem).value(lagrangian, X, U)
+
+
+def costates(problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> Tensor | None:
+    """Slopes (B, N+1, n) of J_var + lam'c by the states, where later states follow from each; but those of the start.
+
+    None where no kernels in C have worked on problems of just this form.
+    """
+    if not problem.known.in_c or not native() or problem.horizon is not None:
+        return None
+    if any(row.joins_knots for row in problem.constraints):
+        return None
+    return problem.known.in_c.costates(problem, X, U, lam)
 
 
 def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
@@ -71,8 +93,10 @@ def cost_unit(problem: Problem) -> Tensor:
 
 def cost_scale(problem: Problem) -> CostScale:
     """`problem.cost_scale`, computed without autodiff where compiled code can; the problem keeps it."""
-    if "cost_scale" not in problem.derived:
-        kernels_of(problem).scale(problem)
+    whole = problem if problem.part_of is None else problem.part_of[0]
+    if "cost_scale" not in problem.derived and "cost_scale" not in whole.derived:
+        first = whole if whole.B <= problem.B else problem
+        kernels_of(first).scale(first)
     return problem.cost_scale
 
 
@@ -97,11 +121,15 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     Exact where a path may touch; elsewhere that of its chords, which are then farther away than it leaves them.
     """
+    if not any(isinstance(row.bare, Distance) for row in problem.constraints):
+        return X.new_full(X.shape[:1], torch.inf)
     clearance = chord_clearance(problem, X)
     if not bends(problem):
         return clearance
     off = bulge(problem, X, U)
     near = (clearance < off).nonzero().flatten()
+    if near.numel() == 0:
+        return clearance
     for path in paths(problem.take(near), X[near], U[near], off[near]):
         if path.pieces > 1:
             rows = near[path.rows]

@@ -54,7 +54,7 @@ def goal_tolerance(problem: Problem) -> Tensor | None:
     the edge of a large goal would return trajectories that a few more iterations make cheaper. A required goal's rows
     say what arrives: all that keeps them, as far as trajectories that count as feasible do.
     """
-    return problem.derive("goal tolerance", lambda: _goal_tolerance(problem))  # many steps of a solve ask for it
+    return problem.derive_rows("goal tolerance", _goal_tolerance)  # many steps of a solve ask for it
 
 
 def _goal_tolerance(problem: Problem) -> Tensor | None:

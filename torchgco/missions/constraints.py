@@ -150,8 +150,8 @@ class RotorLimits(Constraint):
         return self.scale * torch.cat((U - fastest, slowest - U), dim=-1)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, at = X.shape[-1], slice(X.shape[-1] + 1, X.shape[-1] + 5)
+        n, inputs = X.shape[-1], slice(X.shape[-1] + 1, X.shape[-1] + 5)
         gradient = self.scale * (g[..., :4] - g[..., 4:])
-        H[:, self.knots, at, n] += gradient
-        H[:, self.knots, n, at] += gradient
-        H[:, self.knots, at, at].diagonal(dim1=-2, dim2=-1).add_(self.scale**2 * (h[..., :4] + h[..., 4:]))
+        H[:, self.knots, inputs, n] += gradient
+        H[:, self.knots, n, inputs] += gradient
+        H[:, self.knots, inputs, inputs].diagonal(dim1=-2, dim2=-1).add_(self.scale**2 * (h[..., :4] + h[..., 4:]))

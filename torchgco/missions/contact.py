@@ -39,19 +39,19 @@ class Contact(PerElement):
         Raises:
             InputError: obstacles of a kind that can't be judged.
         """
-        found = tuple(part for part in problem.constraints if isinstance(part, Obstacles))
-        for part in found:
-            if type(part).measured is Obstacles.measured:
-                raise InputError("constraints", "obstacles that say their distances, `measured`", type(part).__name__)
-        maps = [part.map is not None for part in found]  # flown at 0.95 of the radius, too
-        shrunk = (part.grown(ADMITTED - TOUCH * part.vehicle_radius) for part in found)
-        found = tuple(less if is_map else part for less, is_map, part in zip(shrunk, maps, found, strict=True))
-        return cls(found, airframe_of(problem.dynamics) if any(part.body is not None for part in found) else None)
+        solids = tuple(solid for solid in problem.constraints if isinstance(solid, Obstacles))
+        for solid in solids:
+            if type(solid).measured is Obstacles.measured:
+                raise InputError("constraints", "obstacles that say their distances, `measured`", type(solid).__name__)
+        maps = [solid.map is not None for solid in solids]  # flown at 0.95 of the radius, too
+        shrunk = (solid.grown(ADMITTED - TOUCH * solid.vehicle_radius) for solid in solids)
+        solids = tuple(less if is_map else solid for less, is_map, solid in zip(shrunk, maps, solids, strict=True))
+        return cls(solids, airframe_of(problem.dynamics) if any(solid.body is not None for solid in solids) else None)
 
     @property
     def moving(self) -> bool:
         """Whether any obstacle moves."""
-        return any(part.moving for part in self.obstacles)
+        return any(obstacle.moving for obstacle in self.obstacles)
 
     def distance(self, x: Tensor, t: float) -> Tensor:
         """Smallest distances (B,), m, of vehicles at x (B, 17) at time t, s: negative in contact.
@@ -62,8 +62,8 @@ class Contact(PerElement):
 
     def distances(self, x: Tensor, dt: float) -> Tensor:
         """The same (B, K) of vehicles at x (B, K, 17) at times k dt, s."""
-        found = [self.distance(x[:, k], k * dt) for k in range(x.shape[1])]
-        return torch.stack(found, dim=1) if found else x[..., 0]
+        by_time = [self.distance(x[:, k], k * dt) for k in range(x.shape[1])]
+        return torch.stack(by_time, dim=1) if by_time else x[..., 0]
 
     def along(self, x: Tensor, dt: float) -> Tensor:
         """Smallest distances (B,) on the ways between x (B, K, 17), K above 0, at times k dt, s.
@@ -78,18 +78,18 @@ class Contact(PerElement):
 
     def moved(self, before: Tensor, now: Tensor) -> Tensor:
         """How far (B,), m, the part of the vehicle that moved farthest is from where it was: of x (B, 17) each."""
-        found = (now[..., :3] - before[..., :3]).norm(dim=-1)
-        for part in self.obstacles:
-            if part.body is not None:
-                a, b = (part.places(self._planning(x)) for x in (before, now))
-                found = torch.maximum(found, (b - a).norm(dim=-1).amax(-1))
-        return found
+        farthest = (now[..., :3] - before[..., :3]).norm(dim=-1)
+        for obstacle in self.obstacles:
+            if obstacle.body is not None:
+                a, b = (obstacle.places(self._planning(x)) for x in (before, now))
+                farthest = torch.maximum(farthest, (b - a).norm(dim=-1).amax(-1))
+        return farthest
 
     def _nearest(self, x: Tensor, t: float, dt: float) -> Tensor:
         p, nearest = x[..., :3].contiguous(), torch.full_like(x[:, 0, 0], torch.inf)
-        for part in self.obstacles:
-            now = part.later(t).with_step(dt) if part.moving else part
-            X = p if part.body is None else self._planning(x)
+        for obstacle in self.obstacles:
+            now = obstacle.later(t).with_step(dt) if obstacle.moving else obstacle
+            X = p if obstacle.body is None else self._planning(x)
             nearest = torch.minimum(nearest, now.clearances(X)[1])
         return nearest
 

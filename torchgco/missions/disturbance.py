@@ -40,7 +40,7 @@ class Disturbance(Checked, named="disturbance"):
     def draw(self, seed: int, ids: Sequence[int], steps: int, period: float) -> tuple[Tensor, Tensor]:
         """Forces (B, steps, 3), N, and noise (B, steps, 13) of every control step."""
         drawn = [self._draw_one(np.random.SeedSequence(seed, spawn_key=(i, 1)), steps, period) for i in ids]
-        force, noise = (torch.from_numpy(np.stack(part)) for part in zip(*drawn, strict=True))
+        force, noise = (torch.from_numpy(np.stack(draws)) for draws in zip(*drawn, strict=True))
         return force, noise
 
     def _draw_one(self, key: np.random.SeedSequence, steps: int, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -48,8 +48,8 @@ class DroneModelsPlant(RotorPlant):
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
-        states, command, push = (part.detach().cpu().double() for part in (x, self.frame.reachable(u), force))
-        errors = [column(part, states) for part in (self.mass_error, self.thrust_error, self.drag)]
+        states, command, push = (tensor.detach().cpu().double() for tensor in (x, self.frame.reachable(u), force))
+        errors = [column(tensor, states) for tensor in (self.mass_error, self.thrust_error, self.drag)]
         b = self.frame.thrust_coefficient * (1.0 + errors[1])
         parameters = parameters_of(self.frame, *(error.numpy() for error in errors))
 

@@ -76,9 +76,9 @@ def record(plant: Plant, airframe: Airframe, seed: int = 0) -> tuple[Tensor, Ten
     x[:, 7:9] += draw(0.1, 12, 2)
     x[:, 6:10] /= x[:, 6:10].norm(dim=1, keepdim=True)
     x[:, 10:13] += draw(0.5, 12, 3)
-    K, held = max(1, round(1.2 / plant.dt)), max(1, round(0.05 / plant.dt))
-    changes = draw(0.05, 8, -(-K // held), 4) + draw(0.1, 8, -(-K // held), 1)
-    turning = airframe.hover_speed * (1.0 + changes).repeat_interleave(held, dim=1)[:, :K]
+    K, steps_held = max(1, round(1.2 / plant.dt)), max(1, round(0.05 / plant.dt))
+    changes = draw(0.05, 8, -(-K // steps_held), 4) + draw(0.1, 8, -(-K // steps_held), 1)
+    turning = airframe.hover_speed * (1.0 + changes).repeat_interleave(steps_held, dim=1)[:, :K]
     steps = torch.tensor([[0.0, 1.5 * high], [3.0 * high, 0.5 * low], [0.8 * high, 0.0], [1.2 * high, 2.2 * high]])
     stepping = steps.double().repeat_interleave(-(-K // 2), dim=1)[:, :K, None].expand(-1, -1, 4)
     u, made = torch.cat((turning, stepping)), flown(plant, airframe)
@@ -111,9 +111,9 @@ def identify(x: Tensor, u: Tensor, dt: float, airframe: Airframe) -> Identified:
     thrusts = rotors.mean_thrusts(states[:, :-1, 13:].clip(min=0.0), commands, dt)
     first, second = states[:, :-1].reshape(-1, 17), states[:, 1:].reshape(-1, 17)
     F = thrusts.reshape(-1, 4)
-    calm = [np.isfinite(part).all(1) for part in (first, second, F)]
-    calm += [np.linalg.norm(part[:, 3:6], axis=1) < SLOW_FLIGHT for part in (first, second)]
-    calm += [np.linalg.norm(part[:, 10:13], axis=1) < CALM_FLIGHT for part in (first, second)]
+    calm = [np.isfinite(values).all(1) for values in (first, second, F)]
+    calm += [np.linalg.norm(values[:, 3:6], axis=1) < SLOW_FLIGHT for values in (first, second)]
+    calm += [np.linalg.norm(values[:, 10:13], axis=1) < CALM_FLIGHT for values in (first, second)]
     use = np.logical_and.reduce(calm)
     if int(use.sum()) < LEAST:
         raise InputError(
@@ -123,12 +123,12 @@ def identify(x: Tensor, u: Tensor, dt: float, airframe: Airframe) -> Identified:
     mass, drag, force_error = _mass(first, second, F, dt, airframe)
     fits = [_inertia(first, second, F, dt, airframe, b) for b in (None, rotors.b)]
     inertia, turning, torque_error = fits[fits[1][-1] < DELAY_GAIN * fits[0][-1]]
-    found = {
+    estimates = {
         "mass": mass, "drag": drag, "inertia": inertia, **turning, **rotors.limits(mass, dt, airframe),
         "hover_speed": math.sqrt(mass * airframe.gravity / 4.0 / rotors.b),
     }  # fmt: skip
     try:
-        made = replace(airframe, **found)
+        made = replace(airframe, **estimates)
     except InputError as error:
         raise InputError("x", "flights of a quadrotor", f"{error.field} {error.got}") from None
     return Identified(
@@ -160,9 +160,9 @@ class _Rotors:
         gap, r = np.sqrt(F) - end, dt / self.T
         return end**2 + 2.0 * end * gap * -np.expm1(-r) / r + gap**2 * -np.expm1(-2.0 * r) / (2.0 * r)
 
-    def limits(self, mass: float, dt: float, given: Airframe) -> dict[str, float]:
+    def limits(self, mass: float, dt: float, frame: Airframe) -> dict[str, float]:
         """The limits and the time constant of an airframe that the tracker can follow."""
-        least = LEAST_SPIN * mass * given.gravity / 4.0
+        least = LEAST_SPIN * mass * frame.gravity / 4.0
         return {
             "thrust_min": max(self.low**2, least), "thrust_max": self.high**2,
             "rotor_time_constant": max(self.T + self.late * dt, RESOLVED * dt),
@@ -174,18 +174,18 @@ def _later(u: np.ndarray, late: int) -> np.ndarray:
     return np.concatenate((u[:, :1].repeat(late, axis=1), u[:, : u.shape[1] - late]), axis=1)
 
 
-def _rotors(F: np.ndarray, u: np.ndarray, dt: float, given: Airframe) -> _Rotors:
+def _rotors(F: np.ndarray, u: np.ndarray, dt: float, frame: Airframe) -> _Rotors:
     """The fit for thrusts F (B, K+1, 4) and commands u (B, K, 4), with the delay that explains most."""
     best: _Rotors | None = None
     for late in range(min(MOST_DELAY, u.shape[1] // 2) + 1):
-        found = _rotors_late(F, u, late, dt, given)
-        if best is None or found.error < (DELAY_GAIN if best.late == 0 else 1.0) * best.error:
-            best = found
+        fit = _rotors_late(F, u, late, dt, frame)
+        if best is None or fit.error < (DELAY_GAIN if best.late == 0 else 1.0) * best.error:
+            best = fit
     assert best is not None
     return best
 
 
-def _rotors_late(F: np.ndarray, u: np.ndarray, late: int, dt: float, given: Airframe) -> _Rotors:
+def _rotors_late(F: np.ndarray, u: np.ndarray, late: int, dt: float, frame: Airframe) -> _Rotors:
     s, speed = np.sqrt(F), _later(u, late)
     before, after = s[:, late:-1].reshape(-1), s[:, late + 1 :].reshape(-1)  # what came before a flight isn't known
     speed = speed[:, late:].reshape(-1)
@@ -193,14 +193,14 @@ def _rotors_late(F: np.ndarray, u: np.ndarray, late: int, dt: float, given: Airf
     if int(use.sum()) < LEAST:
         raise InputError("x", f"at least {LEAST} finite thrusts with their commands", int(use.sum()))
     before, after, speed = before[use], after[use], speed[use]
-    hover, root = math.sqrt(given.hover_thrust), math.sqrt(given.thrust_coefficient)
+    hover, root = math.sqrt(frame.hover_thrust), math.sqrt(frame.thrust_coefficient)
 
     def left(z: np.ndarray) -> np.ndarray:
         a = math.exp(-dt / math.exp(z[0]))
         end = np.clip(math.exp(z[1]) * speed, *np.sort(z[2:] * hover))
         return (a * before + (1.0 - a) * end - after) / hover
 
-    lag = math.log(given.rotor_time_constant), math.log(root)
+    lag = math.log(frame.rotor_time_constant), math.log(root)
     ends = (math.log(dt / 20.0), lag[1] - THRUST_RANGE, 0.0, 0.0), (math.log(5.0), lag[1] + THRUST_RANGE, 100.0, 100.0)
     fits = []
     for within in (after, root * speed):  # limits that were met, and none
@@ -215,11 +215,11 @@ def _rotors_late(F: np.ndarray, u: np.ndarray, late: int, dt: float, given: Airf
 
 
 def _mass(
-    first: np.ndarray, second: np.ndarray, F: np.ndarray, dt: float, given: Airframe
+    first: np.ndarray, second: np.ndarray, F: np.ndarray, dt: float, frame: Airframe
 ) -> tuple[float, float, float]:
     """Mass, drag and the error, from states (S, 17) a time step apart and the mean thrusts (S, 4) between them."""
     lift = F.sum(1, keepdims=True) * _axis(first[:, 6:10] + second[:, 6:10])
-    rate = (second[:, 3:6] - first[:, 3:6]) / dt + (0.0, 0.0, given.gravity)
+    rate = (second[:, 3:6] - first[:, 3:6]) / dt + (0.0, 0.0, frame.gravity)
     v = 0.5 * (first[:, 3:6] + second[:, 3:6])
     per_mass, loss = np.linalg.lstsq(np.stack((lift.ravel(), -v.ravel()), axis=1), rate.ravel(), rcond=None)[0]
     if not per_mass > 0:
@@ -229,7 +229,7 @@ def _mass(
 
 
 def _inertia(
-    first: np.ndarray, second: np.ndarray, F: np.ndarray, dt: float, given: Airframe, b: float | None
+    first: np.ndarray, second: np.ndarray, F: np.ndarray, dt: float, frame: Airframe, b: float | None
 ) -> tuple[tuple[tuple[float, float, float], ...], dict[str, float], float]:
     """Inertia, `rotor_torque`, `rotational_drag`, with a thrust coefficient b `rotor_inertia`, and the error.
 
@@ -237,7 +237,7 @@ def _inertia(
     multiplied by the unknowns, noise would make the inertia small. The search begins at the torques' linear fit.
     """
     rate, w = (second[:, 10:13] - first[:, 10:13]) / dt, 0.5 * (first[:, 10:13] + second[:, 10:13])
-    torque = F @ given.allocation(torch.zeros(1, dtype=torch.float64)).numpy().T
+    torque = F @ frame.allocation(torch.zeros(1, dtype=torch.float64)).numpy().T
     torque[:, 2] = 0.0
     about, columns, spins = np.array((0.0, 0.0, 1.0)), list[np.ndarray](), np.array(ROTOR_SPINS)
     speeds = np.sqrt(second[:, 13:].clip(min=0.0)) - np.sqrt(first[:, 13:].clip(min=0.0))
@@ -247,7 +247,7 @@ def _inertia(
         J[i, j] = J[j, i] = 1.0
         columns.append(rate @ J + np.cross(w, w @ J))
     columns += [-(F @ spins)[:, None] * about, w[:, 2:] * about, *([] if b is None else [-faster[:, None] * about])]
-    A, scale = np.stack([column.ravel() for column in columns], axis=1), _scale(given)[: len(columns)]
+    A, scale = np.stack([column.ravel() for column in columns], axis=1), _scale(frame)[: len(columns)]
     begin = np.linalg.lstsq(A * scale, torque.ravel(), rcond=None)[0]
 
     def left(z: np.ndarray) -> np.ndarray:
@@ -271,11 +271,11 @@ def _unpacked(theta: np.ndarray) -> tuple[np.ndarray, float, float, float]:
     return J, float(theta[6]), float(theta[7]), float(theta[8]) if len(theta) > 8 else 0.0
 
 
-def _scale(given: Airframe) -> np.ndarray:
+def _scale(frame: Airframe) -> np.ndarray:
     """Sizes of the unknowns of `_inertia`."""
-    J = np.array(given.inertia)
+    J = np.array(frame.inertia)
     size = float(np.diag(J).mean())
-    return np.array([size] * 6 + [given.rotor_torque, size, 1e-3 * size])
+    return np.array([size] * 6 + [frame.rotor_torque, size, 1e-3 * size])
 
 
 def _axis(q: np.ndarray) -> np.ndarray:

@@ -72,8 +72,8 @@ class MissionLog:
         def empty(*shape: int) -> Tensor:
             return x.new_full((B, steps, *shape), torch.nan)
 
-        one: list[Any] = [empty() for _ in range(10)]
-        log = cls(period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3), *one)
+        scalars: list[Any] = [empty() for _ in range(10)]
+        log = cls(period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3), *scalars)
         log.x[:, 0, 0] = x  # of missions, too, that end at their start
         return log
 

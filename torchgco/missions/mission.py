@@ -91,8 +91,8 @@ class Mission:
         frame, other = airframe_of(dynamics), getattr(self.plant, "airframe", None)
         if isinstance(other, Airframe) and other != frame:
             named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(other, f.name)]
-            planned, given = (", ".join(f"{name} {getattr(one, name)}" for name in named) for one in (frame, other))
-            raise InputError("plant.airframe", f"that of the planning model, {planned}", given)
+            planned, flies = (", ".join(f"{name} {getattr(v, name)}" for name in named) for v in (frame, other))
+            raise InputError("plant.airframe", f"that of the planning model, {planned}", flies)
         if self.substeps(float(dynamics.dt)) is None:
             raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
 
@@ -291,14 +291,14 @@ class Flight:
             self._step += 1
             return frame
 
-    def _chosen(self, step: int, seen: Tensor, given: MissionPlan | Tensor | None) -> tuple[MissionPlan, float]:
+    def _chosen(self, step: int, seen: Tensor, plan_given: MissionPlan | Tensor | None) -> tuple[MissionPlan, float]:
         """The plan of a control step, from measured states `seen` (b, 17), and the seconds that it took."""
-        if given is not None and not isinstance(given, MissionPlan):
-            given = self._of_states(given, seen, step)
+        if plan_given is not None and not isinstance(plan_given, MissionPlan):
+            plan_given = self._of_states(plan_given, seen, step)
         self.pilot.sense(step, self.x, seen)
-        if given is not None:
+        if plan_given is not None:
             self._plan = None
-            return given, 0.0
+            return plan_given, 0.0
         plan, seconds, late = self._plan, 0.0, self.mission.latency == 1
         if plan is None or not late:
             plan, seconds = self.pilot.plan(step, seen, plan, seen)

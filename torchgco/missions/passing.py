@@ -54,8 +54,8 @@ class Passing(PerElement):
         """How many are passed after straight lines from a to b (B, 3), m; (B,) int64."""
         passed, each = self.passed.clone(), torch.arange(len(self.passed))
         for _ in range(self.radii.shape[1]):
-            place = passed.clamp(max=self.radii.shape[1] - 1)
-            center, reach = self.centers[each, place], self.radii[each, place] + ADMITTED
+            next_gate = passed.clamp(max=self.radii.shape[1] - 1)
+            center, reach = self.centers[each, next_gate], self.radii[each, next_gate] + ADMITTED
             more = (segment_distance(a - center, b - center) <= reach) & (passed < self.radii.shape[1])
             if not bool(more.any()):
                 break

@@ -34,7 +34,6 @@ class Pilot(Protocol):
 
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
         """Look around at a control step, from true states x (b, 17) that are measured as `measured`."""
-        ...
 
     def plan(
         self, step: int, x: Tensor, before: MissionPlan | None, measured: Tensor | None = None
@@ -47,7 +46,6 @@ class Pilot(Protocol):
 
     def take(self, index: Tensor) -> None:
         """Keep the vehicles in `index`, int64."""
-        ...
 
     def parts(self) -> Mapping[str, Tensor]:
         """Seconds of the period by part, (b,), under names of `MissionLog`; empty where they aren't measured."""

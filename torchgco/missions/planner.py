@@ -73,11 +73,11 @@ class MissionPlan(Plan):
 
         The penalty is reset in every period; over a mission it would otherwise grow without bound.
         """
-        held, parts = self.multipliers.lam, problem.constraints
-        lam = [shifted(own) for own in held]
-        for i, (own, following) in enumerate(pairwise(parts)):
-            if isinstance(own, Obstacles) and isinstance(following, Obstacles) and follows(own, following):
-                lam[i] = torch.cat((held[i][:, 1:], held[i + 1][:, :1]), dim=1)
+        before, parts = self.multipliers.lam, problem.constraints
+        lam = [shifted(group) for group in before]
+        for i, (group, following) in enumerate(pairwise(parts)):
+            if isinstance(group, Obstacles) and isinstance(following, Obstacles) and follows(group, following):
+                lam[i] = torch.cat((before[i][:, 1:], before[i + 1][:, :1]), dim=1)
         return Multipliers(tuple(lam), self.penalty)
 
     @classmethod
@@ -309,9 +309,9 @@ class _Solve:
         left = self._time_left()
         if self.local is not self.solver and rows.numel() > 0 and (left is None or left > MIN_SECONDS):
             searched = self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows])
-            found = self._plan(searched, self.allowed[rows])
-            self._replace(plan, rows, found)
-            _count(plan, rows, found)
+            other = self._plan(searched, self.allowed[rows])
+            self._replace(plan, rows, other)
+            _count(plan, rows, other)
         if again:
             self._from_waiting(plan, former)
         return replace(
@@ -329,12 +329,12 @@ class _Solve:
         left = self._time_left()
         if self.local is self.solver or rows.numel() == 0 or (left is not None and left <= MIN_SECONDS):
             return
-        part = self.problem.take(rows)
-        rest = part.cost.rest_controls(part.x0.new_zeros(part.B, part.N, part.m))
-        found = self._plan(self._solved(self.solver, part, rest, None, self.ids[rows]), self.allowed[rows])
-        arrives = ((found.violation <= self.allowed[rows]) & has_arrived(part, found.X)).nonzero().flatten()
-        plan.put(rows[arrives], found.take(arrives))
-        _count(plan, rows, found)
+        waiting = self.problem.take(rows)
+        rest = waiting.cost.rest_controls(waiting.x0.new_zeros(waiting.B, waiting.N, waiting.m))
+        other = self._plan(self._solved(self.solver, waiting, rest, None, self.ids[rows]), self.allowed[rows])
+        arrives = ((other.violation <= self.allowed[rows]) & has_arrived(waiting, other.X)).nonzero().flatten()
+        plan.put(rows[arrives], other.take(arrives))
+        _count(plan, rows, other)
 
     def _arrives(self, plan: MissionPlan) -> Tensor:
         return has_arrived(self.problem, plan.X)
@@ -352,11 +352,11 @@ class _Solve:
         rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         if rows.numel() == 0:
             return
-        part = self.problem.take(rows)
-        X = open_loop(part, U[rows])
+        violated = self.problem.take(rows)
+        X = open_loop(violated, U[rows])
         moved = replace(
             plan.take(rows), X=X, U=U[rows], K=former.K[rows], multipliers=take(former.multipliers, rows),
-            cost=part.cost.total(X, U[rows]), violation=measured(part, X, U[rows]),
+            cost=violated.cost.total(X, U[rows]), violation=measured(violated, X, U[rows]),
             shifted=torch.ones_like(rows, dtype=torch.bool),
         )  # fmt: skip
         self._replace(plan, rows, moved)

@@ -54,8 +54,8 @@ def airframe_of(dynamics: Dynamics) -> Airframe:
 
 def biased(dynamics: Dynamics, bias: Tensor) -> BiasedPlanning:
     """The planning model with a bias (B, 3), m/s^2."""
-    given = {f.name: getattr(dynamics, f.name) for f in fields(QuadrotorPlanning)}
-    return BiasedPlanning(**given, bias=bias)
+    options = {f.name: getattr(dynamics, f.name) for f in fields(QuadrotorPlanning)}
+    return BiasedPlanning(**options, bias=bias)
 
 
 def settled(problem: Problem) -> Problem:
@@ -121,7 +121,7 @@ class Margin:
 
     def between(self, problem: Problem) -> Tensor:
         """The largest part of the margins (B,) that is for what happens between two knots, m."""
-        parts = [self.of(part) for part in problem.constraints if isinstance(part, Obstacles)]
+        parts = [self.of(obstacles) for obstacles in problem.constraints if isinstance(obstacles, Obstacles)]
         return torch.stack([torch.full_like(self.step, self.size), *parts]).amax(0) - self.size
 
     def around(self, obstacles: Obstacles, N: int, dt: float, depth: Tensor, start: Tensor) -> list[Constraint]:
@@ -152,11 +152,11 @@ class Margin:
         X = open_loop(problem, U)[:, : BLIND + 1]
         times = torch.arange(X.shape[1], dtype=X.dtype) * float(problem.dynamics.dt)
         depth = torch.zeros_like(X[:, 0, 0])
-        for part in problem.constraints:
-            if isinstance(part, Obstacles) and part.absent.shape[1] > 0:
-                size = self.of(part).unsqueeze(-1)
-                distance = part.later(t).distances_of(X, times).amin(1) - size  # (B, M)
-                most = size + (1.0 - MARGIN_LEFT) * (1.0 - CONTACT_FACTOR) * part.margins
+        for obstacles in problem.constraints:
+            if isinstance(obstacles, Obstacles) and obstacles.absent.shape[1] > 0:
+                size = self.of(obstacles).unsqueeze(-1)
+                distance = obstacles.later(t).distances_of(X, times).amin(1) - size  # (B, M)
+                most = size + (1.0 - MARGIN_LEFT) * (1.0 - CONTACT_FACTOR) * obstacles.margins
                 depth = torch.maximum(depth, torch.minimum(-distance, most).clamp(min=0.0).amax(-1))
         return depth
 

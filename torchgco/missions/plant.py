@@ -70,7 +70,7 @@ class RotorPlant(PerElement):
         """See `Plant`."""
         frame = self.frame
         model = QuadrotorPlant(self.dt, airframe=frame)
-        mass_error, thrust_error, drag = (column(part, x) for part in (self.mass_error, self.thrust_error, self.drag))
+        mass_error, thrust_error, drag = (column(z, x) for z in (self.mass_error, self.thrust_error, self.drag))
         speed = (1.0 + thrust_error).sqrt() * frame.reachable(u)
 
         def rates(x: Tensor) -> Tensor:

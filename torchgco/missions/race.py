@@ -68,24 +68,24 @@ class RacePlanner(Checked, named="planner"):
         gates, time_, knots = gates_of(whole), whole.time, legs_of(whole)
         assert isinstance(gates, GateBalls) and time_ is not None
         last = min(passed + legs, len(knots) - 1)
-        first, at = knots[passed], [knot - knots[passed] for knot in knots[passed + 1 : last + 1]]
+        first, stops = knots[passed], [knot - knots[passed] for knot in knots[passed + 1 : last + 1]]
         ends = last == len(knots) - 1
         open_ = slice(passed, last - 1 if ends else last)
-        parts = [self._kept(part) for part in bounds_of(whole.constraints)]
+        parts = [self._kept(bounds) for bounds in bounds_of(whole.constraints)]
         if open_.stop > open_.start:
             sizes = gates.sizes[:, open_]
             sizes = torch.maximum(sizes - self.margin, 0.5 * sizes)
-            parts.append(Gates(gates.centers[:, open_], sizes, knots=at[: open_.stop - open_.start]))
+            parts.append(Gates(gates.centers[:, open_], sizes, knots=stops[: open_.stop - open_.start]))
         least, most = time_.least[:, passed:last].clone(), time_.most[:, passed:last]
-        least[:, 0] = least[:, 0].clamp(max=1.0 / at[0])  # of a leg that is under way a control period may be left
-        times = FreeTime(least, most, time_.weight, segments=at[:-1] or None)
+        least[:, 0] = least[:, 0].clamp(max=1.0 / stops[0])  # a control period may be left of it
+        times = FreeTime(least, most, time_.weight, segments=stops[:-1] or None)
         goal = whole.goal if ends else None
         return Problem(whole.dynamics, whole.cost, parts, whole.x0, knots[last] - first, goal, time=times)
 
-    def _kept(self, part: Bounds) -> Constraint:
+    def _kept(self, bounds: Bounds) -> Constraint:
         """Bounds for another number of stages; those on thrusts with the reserve."""
-        room = self.reserve * (part.upper - part.lower) if part.of == "u" else 0.0
-        return type(part)(part.lower + room, part.upper - room)
+        room = self.reserve * (bounds.upper - bounds.lower) if bounds.of == "u" else 0.0
+        return type(bounds)(bounds.lower + room, bounds.upper - room)
 
 
 def legs_of(problem: Problem) -> list[int]:
@@ -127,11 +127,11 @@ class RaceMission(Mission):
             raise InputError("time", "a FreeTime, and a goal that is required, in a race", "others")
         if gates.places.tolist() != [list(time_.segments[1:])] * problem.B:
             raise InputError("time.segments", "the knots of the gates", list(time_.segments[1:]))
-        for i, part in enumerate(problem.constraints):
-            fits = isinstance(part, Bounds | GateBalls) or part is problem.constraints[-1]
-            if not fits and not (isinstance(part, Obstacles) and bool(part.absent.all())):
+        for i, constraint in enumerate(problem.constraints):
+            fits = isinstance(constraint, Bounds | GateBalls) or constraint is problem.constraints[-1]
+            if not fits and not (isinstance(constraint, Obstacles) and bool(constraint.absent.all())):
                 expected = "bounds and gates alone in a race, whose plans know nothing else"
-                raise InputError(f"constraints[{i}]", expected, type(part).__name__)
+                raise InputError(f"constraints[{i}]", expected, type(constraint).__name__)
 
     def _first(self, problem: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
         """See `Mission`."""
@@ -177,13 +177,13 @@ class Racer:
         for passed in self.passing.passed.unique().tolist():
             rows = (self.passing.passed == passed).nonzero().flatten()
             left = self.t[rows, self.legs[passed + 1]] - now
-            for fresh, some in ((True, rows[left <= 0]), (False, rows[left >= self.period])):
-                if some.numel() == 0:
+            for fresh, group in ((True, rows[left <= 0]), (False, rows[left >= self.period])):
+                if group.numel() == 0:
                     continue
-                found = self._solved(some, passed, x[some], now, step, fresh)
-                flown = (found.violation <= FOLLOWED) | (self.t[some, -1] == -torch.inf)  # there is no other plan
-                self._keep(some[flown], passed, found.take(flown.nonzero().flatten()), now)
-                violation[some], iterations[some], kept[some] = found.violation, found.iterations, ~flown
+                solution = self._solved(group, passed, x[group], now, step, fresh)
+                flown = (solution.violation <= FOLLOWED) | (self.t[group, -1] == -torch.inf)  # there is no other plan
+                self._keep(group[flown], passed, solution.take(flown.nonzero().flatten()), now)
+                violation[group], iterations[group], kept[group] = solution.violation, solution.iterations, ~flown
         plan = MissionPlan.of_states(self._ahead(now), x, self.problem.dynamics, now, self.spacing)
         plan = replace(plan, cost=self.t[:, -1] - now, violation=violation, shifted=kept, iterations=iterations)
         return plan, clock.seconds() - began
@@ -216,21 +216,21 @@ class Racer:
             self._posed[passed, legs] = self.planner.posed(self.problem, passed, legs)
         problem, x0 = self._posed[passed, legs].take(rows), x[:, : self.problem.n].contiguous()
         parts = [
-            type(part)(torch.minimum(part.lower, x0), torch.maximum(part.upper, x0))
-            if isinstance(part, Bounds) and part.of == "x"
-            else part
-            for part in problem.constraints
+            type(constraint)(torch.minimum(constraint.lower, x0), torch.maximum(constraint.upper, x0))
+            if isinstance(constraint, Bounds) and constraint.of == "x"
+            else constraint
+            for constraint in problem.constraints
         ]
         return problem.started_at(x0, parts)
 
-    def _keep(self, rows: Tensor, passed: int, found: Solution, now: float) -> None:
+    def _keep(self, rows: Tensor, passed: int, solution: Solution, now: float) -> None:
         """Put plans into those of the whole race, whose later knots are passed as much later or earlier."""
         first = self.legs[passed]
-        last = first + found.U.shape[1]
-        delay = now + found.t[:, -1] - self.t[rows, last]
+        last = first + solution.U.shape[1]
+        delay = now + solution.t[:, -1] - self.t[rows, last]
         self.t[rows, last:] += torch.where(torch.isfinite(delay), delay, 0.0).unsqueeze(-1)
         knots = slice(first, last + 1)
-        self.X[rows, knots], self.U[rows, first:last], self.t[rows, knots] = found.X, found.U, now + found.t
+        self.X[rows, knots], self.U[rows, first:last], self.t[rows, knots] = solution.X, solution.U, now + solution.t
 
     def _at(self, rows: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         """States (b, K, 13) and controls (b, K, 4) of the plans at times (b, K), s; at the ends after their last knot.

@@ -80,21 +80,21 @@ class RemotePlant(Checked, named="plant"):
         try:
             line = _line(self.host, self.port)
             for first in range(0, len(rows), AT_ONCE):
-                part, number = rows[first : first + AT_ONCE], next(_numbers)
-                line.send(HEAD.pack(LETTERS, PROTOCOL, len(part), number, self.dt) + part.tobytes())
-                waiting[number] = slice(first, first + len(part))
+                vehicles, number = rows[first : first + AT_ONCE], next(_numbers)
+                line.send(HEAD.pack(LETTERS, PROTOCOL, len(vehicles), number, self.dt) + vehicles.tobytes())
+                waiting[number] = slice(first, first + len(vehicles))
             while waiting:
                 line.settimeout(max(end - time.monotonic(), 1e-6))
                 number, states = self._read(line.recv(LARGEST))
-                if (place := waiting.pop(number, None)) is not None:  # None: it comes after its time was over
-                    wanted = len(rows[place])
+                if (asked := waiting.pop(number, None)) is not None:  # None: it comes after its time was over
+                    wanted = len(rows[asked])
                     if len(states) != wanted:
                         raise InputError("plant", f"an answer with {wanted} vehicles, as it was asked", len(states))
-                    answer[place] = states
+                    answer[asked] = states
         except OSError as error:  # nobody listens, no such host, or no answer in time
-            told = "none" if isinstance(error, TimeoutError) else error
+            reason = "none" if isinstance(error, TimeoutError) else error
             wanted = f"an answer of a simulator at {self.host}:{self.port} within {self.timeout:g} s"
-            raise InputError("plant", wanted, told) from None
+            raise InputError("plant", wanted, reason) from None
         return torch.from_numpy(answer).to(x)
 
     def _read(self, data: bytes) -> tuple[int, np.ndarray]:

@@ -43,26 +43,26 @@ def unpacked(rows: np.ndarray, substeps: int, sensed: bool = False) -> dict[str,
     names = (*LOG_SCALARS, *(SENSED if sensed else ()))
     widths = [(J + 1) * STATES, J * ROTOR_COUNT, *[1] * len(names)]
     x, commands, *scalars, plan = np.split(rows, np.cumsum(widths), axis=-1)
-    arrays = {name: part[..., 0] for name, part in zip(names, scalars, strict=True)}
+    arrays = {name: column[..., 0] for name, column in zip(names, scalars, strict=True)}
     arrays |= {"x": x.reshape(B, K, J + 1, STATES), "commands": commands.reshape(B, K, J, ROTOR_COUNT)}
     return arrays | ({"plan": plan.reshape(B, K, -1, 3)} if plan.shape[-1] else {})
 
 
 def clearances(arrays: Arrays, period: float, contact: Contact) -> np.ndarray:
     """Distances (B, K) of missions from contact at the starts of their control steps, m; NaN after their ends."""
-    found = contact.distances(torch.from_numpy(arrays["x"][:, :, 0]), period).numpy()
-    return np.where(np.isnan(arrays["planner_seconds"]), np.nan, found)
+    distances = contact.distances(torch.from_numpy(arrays["x"][:, :, 0]), period).numpy()
+    return np.where(np.isnan(arrays["planner_seconds"]), np.nan, distances)
 
 
 def gates_passed(arrays: Arrays, gates: Passing) -> np.ndarray:
     """How many gates missions have passed by the starts of their control steps, between time steps too, (B, K)."""
     B, K, J = arrays["commands"].shape[:3]
-    starts, found = J * np.arange(K), []
+    starts, counts = J * np.arange(K), []
     for b in range(B):
         _, x = samples(arrays, b, 1.0)
         when, _ = gates.take(slice(b, b + 1)).along(torch.from_numpy(x[np.isfinite(x).all(-1), :3]))
-        found.append((when.numpy() <= starts[:, None]).sum(-1))
-    return np.stack(found)
+        counts.append((when.numpy() <= starts[:, None]).sum(-1))
+    return np.stack(counts)
 
 
 def mission_frame(
@@ -118,11 +118,11 @@ def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float, airframe:
     for b, number in enumerate(ids):
         u = arrays["commands"][b, : _steps(arrays, b)].reshape(-1, ROTOR_COUNT)
         u = u[: int((~np.isnan(u).all(-1)).sum())]  # of a control step in which the mission ends, a part is flown
-        t, x = (part[: len(u) + 1] for part in samples(arrays, b, period))
+        t, x = (series[: len(u) + 1] for series in samples(arrays, b, period))
         u = np.concatenate((u, u[-1:] if len(u) else np.full((1, ROTOR_COUNT), np.nan)))
         columns = {"mission": np.full(len(t), number), "t": t} | {f"x{i}": x[:, i] for i in range(STATES)}
         parts = {"f": x[:, 13:], "u": u, "r": u.clip(low, high)}
-        columns |= {f"{name}{i + 1}": part[:, i] for name, part in parts.items() for i in range(ROTOR_COUNT)}
+        columns |= {f"{name}{i + 1}": series[:, i] for name, series in parts.items() for i in range(ROTOR_COUNT)}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 
@@ -200,9 +200,9 @@ def ending(
     """How mission b ended; `contact` and `gates` are those of all missions, the goal (3,) its own; `judge_flight`."""
     _, x = samples(arrays, b, period)
     dt, finite = period / arrays["commands"].shape[2], np.isfinite(x).all(axis=-1, keepdims=True)
-    one = slice(b, b + 1)
-    own = None if gates is None else gates.take(one)
-    return judge_flight(np.where(finite, x, np.nan), dt, contact.take(one), goal, goal_radius, own)
+    row = slice(b, b + 1)
+    its_gates = None if gates is None else gates.take(row)
+    return judge_flight(np.where(finite, x, np.nan), dt, contact.take(row), goal, goal_radius, its_gates)
 
 
 def endings(log: MissionLog, problem: Problem, goal_radius: float | None = None) -> list[Ending]:

@@ -52,9 +52,9 @@ def _between(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The knots before and after the times of `Reference.at`, (K,) int64, and shares of the way between, (K, 1)."""
     times = offset + dt * torch.arange(count, dtype=dtype)
-    place = (times / period).clamp(max=knots - 1)
-    left = place.floor().long().clamp(max=knots - 2)
-    return left, left + 1, (place - left).unsqueeze(-1)
+    knot = (times / period).clamp(max=knots - 1)
+    left = knot.floor().long().clamp(max=knots - 2)
+    return left, left + 1, (knot - left).unsqueeze(-1)
 
 
 @dataclass(frozen=True)

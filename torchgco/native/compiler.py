@@ -424,13 +424,23 @@ def lanes(cpuinfo: str | None = None) -> int:
     """
     if wanted := os.environ.get("TORCHGCO_LANES"):
         return 8 if wanted == "8" else 4
+    words = _described(cpuinfo)
+    halved = words.get("vendor_id") == "AuthenticAMD" and int(words.get("cpu family", "0")) <= _AMD_HALVES
+    return 8 if "avx512f" in words.get("flags", "").split() and not halved else 4
+
+
+def neurons() -> int:
+    """Neurons of a network whose sums are made together, on which their last bits depend: as c/wide.h has it."""
+    return 8 if "avx512f" in _described(None).get("flags", "").split() else 4
+
+
+def _described(cpuinfo: str | None) -> dict[str, str]:
+    """The description of a processor by words; None: of this one's first core, or nothing."""
     if cpuinfo is None:
         try:
             with open("/proc/cpuinfo", errors="replace") as file:
                 cpuinfo = "".join(itertools.takewhile(str.strip, file))  # the first of its cores
         except OSError:
-            return 4
+            return {}
     parts = (line.partition(":") for line in cpuinfo.splitlines())
-    words = {name.strip(): value.strip() for name, _, value in parts}
-    halved = words.get("vendor_id") == "AuthenticAMD" and int(words.get("cpu family", "0")) <= _AMD_HALVES
-    return 8 if "avx512f" in words.get("flags", "").split() and not halved else 4
+    return {name.strip(): value.strip() for name, _, value in parts}

@@ -19,7 +19,7 @@ TENSOR_TYPES = {
     "double": torch.float64, "float": torch.float32, "int32_t": torch.int32, "int64_t": torch.int64,
     "uint64_t": torch.int64, "uint8_t": torch.bool,
 }  # fmt: skip
-PLAIN_NUMBERS = (int, float, bool)
+PLAIN = (int, float, type(None))  # values that a field has as they are: numbers, and no address
 _set = ctypes.Structure.__setattr__
 _COMMENT, _STRUCTURE = re.compile(r"/\*.*?\*/", re.DOTALL), re.compile(r"typedef struct \{(.*?)\} (\w+);", re.DOTALL)
 _DECLARATION, _NAMED = re.compile(r"(?:const )?(\w+) ([^;]+);"), re.compile(r"(\*?)(\w+)(?:\[(\w+)\])?")
@@ -48,7 +48,8 @@ class Structure(ctypes.Structure):
     def __init__(self, **values: Any) -> None:
         super().__init__()
         _set(self, "kept", [])
-        self.fill(values)
+        if values:
+            self.fill(values)
 
     def fill(self, values: Mapping[str, Any]) -> None:
         """Set fields by name."""
@@ -58,7 +59,7 @@ class Structure(ctypes.Structure):
             if type(value) is Tensor and value.dtype is tensors.get(name) and value.is_contiguous():
                 kept.append(value)
                 _set(self, name, value.data_ptr())
-            elif type(value) in PLAIN_NUMBERS and name in declared:
+            elif isinstance(value, PLAIN) and name in declared:
                 _set(self, name, value)
             else:
                 self.__setattr__(name, value)
@@ -70,16 +71,17 @@ class Structure(ctypes.Structure):
             raise TypeError(f"{cls.__name__} lacks {', '.join(sorted(missing))}")
         return cls(**values)
 
-    def copy(self) -> Self:
+    def copy(self, values: Mapping[str, Any] | None = None) -> Self:
+        """The same, with other values of fields by name."""
         other = type(self).from_buffer_copy(self)
         _set(other, "kept", [self])
+        if values:
+            other.fill(values)
         return other
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self.declared:
             raise AttributeError(f"{type(self).__name__} has no field {name}")
-        if type(value) in PLAIN_NUMBERS:
-            return _set(self, name, value)
         if isinstance(value, list):
             self.kept.append(value)
             of: Any = type(value[0]) if value else None

@@ -133,54 +133,53 @@ class Engine:
 
     def packed(self, problem: Problem, **values: Any) -> c.Problem:
         """A problem without multipliers or a guide, and further fields, in the form that the library reads."""
-        packed = self._fixed(problem).copy()
-        packed.fill(values)
-        return packed
+        if problem.part_of is not None:
+            problem, values["numbers"] = problem.part_of
+        return self._fixed(problem).copy(values)
 
     def placed(self, problem: Problem, **values: Any) -> c.Problem:
         """The same without the cost: what measures read."""
-        packed = self._rows(problem)[0].copy()
-        packed.fill(values)
-        return packed
+        if problem.part_of is not None:
+            problem, values["numbers"] = problem.part_of
+        return self._rows(problem)[0].copy(values)
 
     def rolled(self, problem: Problem, **values: Any) -> c.Problem:
         """The model alone, and further fields: what rollouts read. Many problems are rolled out and not solved."""
-        packed = self._model(problem).copy()
-        packed.fill(values)
-        return packed
+        if problem.part_of is not None:
+            problem, values["numbers"] = problem.part_of
+        return self._model(problem).copy(values)
 
     def terms(self, lagrangian: Lagrangian, best: Multipliers | None = None, **values: Any) -> c.Problem:
         """The same with the terms that the Lagrangian adds to the cost; `best` are those of an outer loop's best."""
         if best is not None:
             packed = self._summed(lagrangian, best)
-        else:  # several calls of an inner solve read the same terms
-            if "packed" not in lagrangian.derived:
-                lagrangian.derived["packed"] = self._summed(lagrangian)
-            packed = lagrangian.derived["packed"].copy()
-        packed.fill(values)
-        return packed
+            packed.fill(values)
+            return packed
+        if "packed" not in lagrangian.derived:  # several calls of an inner solve read the same terms
+            lagrangian.derived["packed"] = self._summed(lagrangian)
+        return lagrangian.derived["packed"].copy(values)
 
     def _summed(self, lagrangian: Lagrangian, best: Multipliers | None = None) -> c.Problem:
         """The problem with multipliers, penalties and guide."""
         multipliers = lagrangian.multipliers
         fields: dict[str, Any] = {"mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
         if best is not None or not multipliers.blank:
-            fields["constraint"] = rows = [constraint.copy() for constraint in self._rows(lagrangian.problem)[1]]
-            for row, lam in zip(rows, () if multipliers.blank else multipliers.lam, strict=not multipliers.blank):
-                row.lam = lam.contiguous()
-            for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
-                row.best = lam
+            none = [None] * len(multipliers.lam)
+            own = none if multipliers.blank else [lam.contiguous() for lam in multipliers.lam]
+            pairs = zip(self.rows(lagrangian.problem), own, none if best is None else best.lam, strict=True)
+            fields["constraint"] = [row.copy({"lam": lam, "best": kept}) for row, lam, kept in pairs]
         return self.packed(lagrangian.problem, **fields, **guide_of(lagrangian.penalty))
+
+    def rows(self, problem: Problem) -> list[c.Constraint]:
+        """Constraints without multipliers."""
+        return self._rows(problem if problem.part_of is None else problem.part_of[0])[1]
 
     def _fixed(self, problem: Problem) -> c.Problem:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
-        return problem.derive("packed", lambda: self._fixed_made(problem))
+        return problem.derived.get("packed") or problem.derive("packed", lambda: self._fixed_made(problem))
 
     def _fixed_made(self, problem: Problem) -> c.Problem:
-        rows, single = self._rows(problem), problem.one
-        if single is not None and rows is self._rows(single):
-            return self._fixed(single)
-        packed = rows[0].copy()
+        packed = self._rows(problem)[0].copy()
         make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
         if problem.B > 0:
             of_each = self.cost is not None
@@ -189,18 +188,10 @@ class Engine:
 
     def _rows(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         """Model and constraints, and the latter alone."""
-        return problem.derive("rows packed", lambda: self._rows_made(problem))
-
-    def _rows_made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
-        made = None if problem.one is None else self._rows(problem.one)
-        if made is None or any(row.map_of for row in made[1]):  # which maps C reads is a number of each problem
-            made = self._made(problem)
-        return made
+        return problem.derived.get("rows packed") or problem.derive("rows packed", lambda: self._made(problem))
 
     def _model(self, problem: Problem) -> c.Problem:
         """The model's part of it."""
-        if problem.one is not None:
-            return self._model(problem.one)
         pack = lambda: c.Problem(N=problem.N, parameters=self.model_numbers(problem), **shared_fields(self.shared))
         return problem.derive("model packed", lambda: _of_last(problem, "dynamics", problem.dynamics, True, pack))
 

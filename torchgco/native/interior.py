@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -90,9 +90,7 @@ class InteriorKernels:
         out = {"status": torch.zeros(problem.B, dtype=torch.int32)}
         out["iterations"] = torch.zeros(problem.B, dtype=torch.int64)
         out["gains"] = X.new_zeros(problem.B, problem.N, problem.m, problem.n + 1)
-        rows = [constraint.copy() for constraint in self._rows(problem)]
-        for row, lam in zip(rows, multipliers, strict=True):
-            row.lam = lam
+        rows = [row.copy({"lam": lam}) for row, lam in zip(self._rows(problem), multipliers, strict=True)]
         return self._with(problem, X=X, U=U, constraint=rows, **out), out
 
     def _rows(self, problem: Problem) -> list[structures.Constraint]:
@@ -122,7 +120,7 @@ class InteriorEngine(InteriorKernels):
         self.library = engine.further(("interior", self.lanes), units)
 
     def _rows(self, problem: Problem) -> list[structures.Constraint]:
-        return self.engine._rows(problem)[1]
+        return self.engine.rows(problem)
 
     def _with(self, problem: Problem, **values: Any) -> structures.Problem:
         return self.engine.packed(problem, **values)
@@ -136,11 +134,16 @@ def interior(
 ) -> tuple[Interior, dict[str, Tensor]]:
     """What C reads of a solve, and the tensors (B,) that it writes error, theta and falls to."""
     ends = {name: barrier.new_zeros(problem.B) for name in ("error", "theta", "falls")}
-    how = Interior.complete(
-        of=packed, barrier=barrier, free_start=free_components(problem), constant=scale.constant,
-        least_cost=scale.size, ask=None, **ends, **vars(options),
-    )  # fmt: skip
-    return how, ends
+    own = {"of": packed, "barrier": barrier, "free_start": free_components(problem)}
+    scales = {"constant": scale.constant, "least_cost": scale.size}
+    return _of_options(options).copy(own | scales | ends), ends
+
+
+@lru_cache(maxsize=64)
+def _of_options(options: BarrierOptions) -> Interior:
+    """What C reads of options, which are many and seldom others."""
+    lost = dict.fromkeys(("of", "barrier", "free_start", "constant", "least_cost", "error", "theta", "falls", "ask"))
+    return Interior.complete(**lost, **vars(options))
 
 
 def free_components(problem: Problem) -> Tensor | None:

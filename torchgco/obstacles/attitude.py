@@ -76,29 +76,29 @@ def rotation(q: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
-def attitude_of(given: str | Callable[[Tensor], Tensor], d: int, dims: Dimensions) -> Attitude:
+def attitude_of(attitude: str | Callable[[Tensor], Tensor], d: int, dims: Dimensions) -> Attitude:
     """The attitude that a body names, in the states of a problem's model.
 
     Raises:
         InputError: the model has no such state, space has another dimension, or the function returns something else
             than rotation matrices of the problem's starts.
     """
-    if isinstance(given, str):
-        names, wanted = list(dims.state_names), ("heading",) if given == "heading" else QUATERNION
-        if d != (2 if given == "heading" else 3):
+    if isinstance(attitude, str):
+        names, wanted = list(dims.state_names), ("heading",) if attitude == "heading" else QUATERNION
+        if d != (2 if attitude == "heading" else 3):
             expected = "'quaternion', or a function, in space" if d == 3 else "'heading', or a function, in the plane"
-            raise InputError("body.attitude", expected, f"{given!r}")
+            raise InputError("body.attitude", expected, f"{attitude!r}")
         first = names.index(wanted[0]) if wanted[0] in names else 0
         if tuple(names[first : first + len(wanted)]) != wanted:
             expected = f"a model with states named {', '.join(wanted)}, or a function of the state"
-            got = f"{given!r} for states {', '.join(names) if names else 'without names'}"
+            got = f"{attitude!r} for states {', '.join(names) if names else 'without names'}"
             raise InputError("body.attitude", expected, got)
         return Attitude(first, d)
     try:
-        R = given(dims.like)
+        R = attitude(dims.like)
     except MISTAKES as error:
         expected = f"a function of states (..., n) that returns rotation matrices (..., {d}, {d})"
-        raise InputError("body.attitude", expected, why(error, given, dims.like)) from theirs(error)
+        raise InputError("body.attitude", expected, why(error, attitude, dims.like)) from theirs(error)
     if not isinstance(R, Tensor) or R.dtype != dims.like.dtype or tuple(R.shape) != (dims.B, d, d):
         got = f"{R.dtype} {tuple(R.shape)}" if isinstance(R, Tensor) else shown(R)
         expected = f"rotation matrices ({dims.B}, {d}, {d}) in {dims.like.dtype} of the starts"
@@ -108,4 +108,4 @@ def attitude_of(given: str | Callable[[Tensor], Tensor], d: int, dims: Dimension
     if bool((away[finite] > ROTATION_WITHIN).any()):
         got = f"matrices that differ from them by {float(away[finite].max()):.3g}"
         raise InputError("body.attitude", "rotation matrices R, with R R' = 1", got)
-    return Attitude(given, d)
+    return Attitude(attitude, d)

@@ -129,9 +129,9 @@ class Obstacles(Distance):
     @property
     def has_chords(self) -> bool:
         """Whether its distances from segments are known, which a user's kind need not define."""
-        own = type(self)
+        kind = type(self)
         return not (
-            own.segment_clearance is Obstacles.segment_clearance and own.chord_clearance is Obstacles.chord_clearance
+            kind.segment_clearance is Obstacles.segment_clearance and kind.chord_clearance is Obstacles.chord_clearance
         )
 
     @property
@@ -186,16 +186,16 @@ class Obstacles(Distance):
     def places(self, X: Tensor) -> Tensor:
         return X[..., self.position].unsqueeze(-2)
 
-    def numbers(self, where: str, place: int) -> list[Number]:
-        return self.numbers_of(where, place, ())
+    def numbers(self, where: str, index: int) -> list[Number]:
+        return self.numbers_of(where, index, ())
 
-    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+    def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         """The same where `others`, the same obstacles of other balls of a body, have the numbers, too; by default none.
 
         Without others by default all of `batched`. Absent obstacles are padding: where there are any, which are there
         isn't a number, and none can be written.
         """
-        return [] if others or bool(self.absent.any()) else numbers_of_fields(self, where, place)
+        return [] if others or bool(self.absent.any()) else numbers_of_fields(self, where, index)
 
     def rows(self, p: Tensor, t: Tensor) -> Tensor:
         """c (B, K, M) at points p (B, K, d), m, at times t (K,) or (1,), s; `ABSENT` of what isn't there."""
@@ -272,8 +272,8 @@ class Obstacles(Distance):
         return replace(self, dt=dt)  # type: ignore[type-var]
 
     def in_pieces(self, count: int) -> Self:
-        part = self if self.stops is None else self.stopping_at(count * self.stops)
-        return part.with_step(part.dt / count) if part.moving else part
+        moving = self if self.stops is None else self.stopping_at(count * self.stops)
+        return moving.with_step(moving.dt / count) if moving.moving else moving
 
     def with_knots(self, knots: slice) -> Self:
         """The same obstacles, which count at other knots."""
@@ -300,7 +300,7 @@ class OwnKind(Obstacles):
     def bind(self, dims: Dimensions) -> Self:
         return self
 
-    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+    def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         return []
 
     def slopes(self, p: Tensor, t: Tensor) -> Tensor:
@@ -311,7 +311,7 @@ class OwnKind(Obstacles):
         return count_of(self.knots, N + 1), self.absent.shape[1]
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        g, h = (self.counted(part, 0.0, X.shape[1]) for part in (g, h))
+        g, h = (self.counted(rows, 0.0, X.shape[1]) for rows in (g, h))
         J = self.slopes(X[:, self.knots, self.position], self.times(X))
         gradient, hessian = (g.unsqueeze(-2) @ J).squeeze(-2), (h.unsqueeze(-1) * J).mT @ J
         add_at(H, self.knots, self.position, X.shape[-1], gradient, hessian)
@@ -341,12 +341,12 @@ def copied(whole: Tensor, others: Sequence[Tensor]) -> Callable[[], None] | None
     return copy if others else None
 
 
-def picked(values: Tensor, at: Tensor) -> Tensor:
+def picked(values: Tensor, columns: Tensor) -> Tensor:
     """Values (B, M, ...) at places (B, M'); where a place is -1 those of the first, or zeros where M = 0."""
     if values.shape[1] == 0:
-        return values.new_zeros(*at.shape, *values.shape[2:])
-    index = at.clamp(min=0).view(*at.shape, *([1] * (values.dim() - 2)))
-    return values.gather(1, index.expand(*at.shape, *values.shape[2:]))
+        return values.new_zeros(*columns.shape, *values.shape[2:])
+    index = columns.clamp(min=0).view(*columns.shape, *([1] * (values.dim() - 2)))
+    return values.gather(1, index.expand(*columns.shape, *values.shape[2:]))
 
 
 def places_of(kept: Tensor) -> Tensor:

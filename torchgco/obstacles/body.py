@@ -94,7 +94,7 @@ class Body:
         Raises:
             InputError: corners or counts of other shapes, a side that isn't above 0, a count below 1.
         """
-        low, high = (numbers(part, f"body.{name}") for part, name in ((lower, "lower"), (upper, "upper")))
+        low, high = (numbers(corner, f"body.{name}") for corner, name in ((lower, "lower"), (upper, "upper")))
         check_shape(high, tuple(low.shape), "body.upper")
         if low.dim() != 1 or len(low) not in (2, 3) or not bool((high > low).all()):
             raise InputError("body.upper", "a corner (2,) or (3,) above `lower`", high.tolist())
@@ -140,8 +140,8 @@ class Body:
         assert dims.position is not None  # as space has d dimensions
         inner = of_ball(obstacles, self.inscribed_radius, dims)
         points = BodyPoints(offsets, attitude, dims.n, dims.position, inner.knots)
-        own = replace(dims, n=d, position=slice(0, d))
-        balls = tuple(of_ball(obstacles, float(radius), own) for radius in self.radii)
+        ball_dims = replace(dims, n=d, position=slice(0, d))
+        balls = tuple(of_ball(obstacles, float(radius), ball_dims) for radius in self.radii)
         return BoundBody(balls, inner, points, self.box)
 
 
@@ -176,7 +176,7 @@ def directions(d: int) -> Tensor:
 
 def check_no_body(problem: Any, field: str, expected: str) -> None:
     """Raise InputError naming `field` where a problem's vehicle is a body of several balls."""
-    if any(part.body for part in problem.obstacles):
+    if any(obstacles.body for obstacles in problem.obstacles):
         raise InputError(field, expected, "a Body of several balls")
 
 
@@ -264,17 +264,17 @@ class BoundBody(Obstacles):
         return torch.cat([ball.at(P, k) for ball, P in self.each(x)], dim=-1)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        n, one, d = self.points.n, X.shape[-1], self.points.offsets.shape[-1]
+        n, last, d = self.points.n, X.shape[-1], self.points.offsets.shape[-1]
         slopes, P = self.points.jacobian(X[..., :n]), len(self.balls)
         parts = zip(self.each(X), g.tensor_split(P, dim=-1), h.tensor_split(P, dim=-1), strict=True)
         for i, ((ball, p), g_i, h_i) in enumerate(parts):
-            own = H.new_zeros(*X.shape[:2], d + 1, d + 1)
-            ball.accumulate(p, U[..., :0], g_i, h_i, own)
+            at_ball = H.new_zeros(*X.shape[:2], d + 1, d + 1)
+            ball.accumulate(p, U[..., :0], g_i, h_i, at_ball)
             J = slopes[:, :, i]
-            gradient = (own[..., d : d + 1, :d] @ J).squeeze(-2)
-            H[..., :n, one] += gradient
-            H[..., one, :n] += gradient
-            H[..., :n, :n] += J.mT @ own[..., :d, :d] @ J
+            gradient = (at_ball[..., d : d + 1, :d] @ J).squeeze(-2)
+            H[..., :n, last] += gradient
+            H[..., last, :n] += gradient
+            H[..., :n, :n] += J.mT @ at_ball[..., :d, :d] @ J
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """Depth beneath the full surfaces, (B, K, P M), m."""
@@ -295,9 +295,9 @@ class BoundBody(Obstacles):
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         """As of all obstacles, of states that change evenly between the knots."""
         near = self._nearest(X, share)
-        part, X = (self if near is None else self.chosen(near)).finer(X)
-        found = [ball.chord_clearance(P, share) for ball, P in part.each(X)]
-        return (torch.stack(found, dim=-1) - part.points.bulge(X).amax(1)).amin(-1)
+        chosen, X = (self if near is None else self.chosen(near)).finer(X)
+        by_ball = [ball.chord_clearance(P, share) for ball, P in chosen.each(X)]
+        return (torch.stack(by_ball, dim=-1) - chosen.points.bulge(X).amax(1)).amin(-1)
 
     def places(self, X: Tensor) -> Tensor:
         return self.points.at(X)
@@ -306,16 +306,16 @@ class BoundBody(Obstacles):
         return self.points.bulge(X)
 
     def measured(self, X: Tensor) -> Distances:
-        at, ways = zip(*(ball.measured(P) for ball, P in self.each(X)), strict=True)
-        return torch.cat(at, dim=-1), torch.cat(ways, dim=-1)
+        at_knots, ways = zip(*(ball.measured(P) for ball, P in self.each(X)), strict=True)
+        return torch.cat(at_knots, dim=-1), torch.cat(ways, dim=-1)
 
     def clearances(self, X: Tensor) -> Distances:
         """As of all obstacles, between the knots from states a part of a step apart, which change evenly."""
         fine, states = self.finer(X)
         bulge = fine.points.bulge(states).amax(1)
-        at = torch.stack([ball.clearances(P)[0] for ball, P in self.each(X)]).amin(0)
+        at_knots = torch.stack([ball.clearances(P)[0] for ball, P in self.each(X)]).amin(0)
         ways = [ball.clearances(P)[1] - bulge[:, i] for i, (ball, P) in enumerate(fine.each(states))]
-        return at, torch.minimum(at, torch.stack(ways).amin(0))
+        return at_knots, torch.minimum(at_knots, torch.stack(ways).amin(0))
 
     def _nearest(self, X: Tensor, share: float | None) -> Tensor | None:
         """Places (B, M') of those that may be the nearest to a ball on its way along X; None of a kind that can't say.
@@ -346,7 +346,7 @@ class BoundBody(Obstacles):
         return self.in_pieces(PIECES), torch.cat((within, X[:, -1:]), dim=1)
 
     def in_pieces(self, count: int) -> Self:
-        return self._of_each(lambda part: part.in_pieces(count))
+        return self._of_each(lambda ball: ball.in_pieces(count))
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         return torch.stack([ball.start_is_clear(P) for ball, P in self.each(x0)]).all(0)
@@ -362,7 +362,7 @@ class BoundBody(Obstacles):
 
     def chosen(self, at: Tensor) -> Self:
         """With the obstacles at places (B, M') alone, of all balls."""
-        return self._of_each(lambda part: part.chosen(at))
+        return self._of_each(lambda ball: ball.chosen(at))
 
     @property
     def kernel(self) -> str:
@@ -371,8 +371,8 @@ class BoundBody(Obstacles):
 
     def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
         first, *more = self.balls
-        own = first.lowered(n, more)
-        return replace(own, plain={**own.plain, "balls": len(self.balls)})
+        of_ball = first.lowered(n, more)
+        return replace(of_ball, plain={**of_ball.plain, "balls": len(self.balls)})
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return "ball {}, obstacle {}".format(*divmod(row, self.inner.absent.shape[1]))
@@ -380,27 +380,27 @@ class BoundBody(Obstacles):
     def by_obstacle(self, rows: Tensor) -> Tensor:
         return rows.unflatten(-1, (len(self.balls), -1)).any(-2)
 
-    def numbers(self, where: str, place: int) -> list[Number]:
-        return self.inner.numbers_of(where, place, self.balls)
+    def numbers(self, where: str, index: int) -> list[Number]:
+        return self.inner.numbers_of(where, index, self.balls)
 
     def remade(self) -> Self:
-        return self._of_each(lambda part: part.remade())
+        return self._of_each(lambda ball: ball.remade())
 
     def grown(self, by: Tensor) -> Self:
-        return self._of_each(lambda part: part.grown(by))
+        return self._of_each(lambda ball: ball.grown(by))
 
     def later(self, t: float) -> Self:
-        return self._of_each(lambda part: part.later(t))
+        return self._of_each(lambda ball: ball.later(t))
 
     def stopping_at(self, knots: Tensor) -> Self:
-        return self._of_each(lambda part: part.stopping_at(knots))
+        return self._of_each(lambda ball: ball.stopping_at(knots))
 
     def with_step(self, dt: float) -> Self:
-        return self._of_each(lambda part: part.with_step(dt))
+        return self._of_each(lambda ball: ball.with_step(dt))
 
     def with_knots(self, knots: slice) -> Self:
         points = replace(self.points, knots=knots)
-        return replace(self._of_each(lambda part: part.with_knots(knots)), points=points)
+        return replace(self._of_each(lambda ball: ball.with_knots(knots)), points=points)
 
     def _of_each(self, change: Callable[[Any], Any]) -> Self:
         return replace(self, balls=tuple(map(change, self.balls)), inner=change(self.inner))

@@ -74,9 +74,9 @@ class Cuboids(Solids):
         i, v, j = near.nonzero(as_tuple=True)
         local = _along(self.axes[i, j], (points[i, v] - self.centers[i, j]).unbind(-1))
         deep = signed_distance(local, self.half_sizes[i, j].unbind(-1)) - self.radii[i, j] < -than[i]
-        found = torch.zeros_like(points[..., 0], dtype=torch.bool)
-        found[i[deep], v[deep]] = True
-        return found
+        is_deeper = torch.zeros_like(points[..., 0], dtype=torch.bool)
+        is_deeper[i[deep], v[deep]] = True
+        return is_deeper
 
     def _reach(self) -> Tensor:
         """Half the side lengths (B, M, d) of boxes along the axes of space that hold the grown ones, m."""
@@ -94,7 +94,7 @@ class Cuboids(Solids):
 
     def segment_distance(self, pairs: tuple[Tensor, Tensor, Tensor], a: Tensor, b: Tensor) -> Tensor:
         """Smallest signed distances (P,), m, of pairs (problem, segment, box) of segments from a to b (B, V, d)."""
-        parts = zip(*(one.split(SEGMENTS_AT_ONCE) for one in pairs), strict=True)
+        parts = zip(*(ends.split(SEGMENTS_AT_ONCE) for ends in pairs), strict=True)
         return torch.cat([self._segment_distance(i, e, j, a, b) for i, e, j in parts])
 
     def _segment_distance(self, i: Tensor, e: Tensor, j: Tensor, a: Tensor, b: Tensor) -> Tensor:
@@ -116,11 +116,11 @@ class Cuboids(Solids):
         away = torch.stack(excess(local, half), dim=-1)
         square = away.square().sum(-1, keepdim=True)
         outside = away / torch.where(square > 0, square, 1.0).sqrt()
-        place = torch.stack(list(local), dim=-1)
-        inner = place.abs() - torch.stack(half, dim=-1)
+        in_box = torch.stack(list(local), dim=-1)
+        inner = in_box.abs() - torch.stack(half, dim=-1)
         # The first of the nearest sides; of two opposite sides at equal distance, the positive one.
-        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(place.dtype)
-        inside = torch.where(place < 0, -side, side)
+        side = torch.nn.functional.one_hot(inner.argmax(-1), in_box.shape[-1]).to(in_box.dtype)
+        inside = torch.where(in_box < 0, -side, side)
         normal = torch.where(square > 0, outside, inside)
         return (self.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)
 
@@ -154,12 +154,12 @@ def nearest(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor
     slope = reduce(torch.add, (x * step for x, step in zip(away, along, strict=True)))
     low, high, *between = share.unbind(0)
     falls, rises, *slopes = slope.unbind(0)
-    for share, found in zip(between, slopes, strict=True):
-        left, right = (found < 0) & (share > low), (found >= 0) & (share < high)
-        low, falls = torch.where(left, share, low), torch.where(left, found, falls)
-        high, rises = torch.where(right, share, high), torch.where(right, found, rises)
-    part = (-falls / (rises - falls).clamp(min=torch.finfo(low.dtype).tiny)).clamp(0.0, 1.0)
-    return torch.where(falls < 0, low + (high - low) * part, low)
+    for share, incline in zip(between, slopes, strict=True):
+        left, right = (incline < 0) & (share > low), (incline >= 0) & (share < high)
+        low, falls = torch.where(left, share, low), torch.where(left, incline, falls)
+        high, rises = torch.where(right, share, high), torch.where(right, incline, rises)
+    fraction = (-falls / (rises - falls).clamp(min=torch.finfo(low.dtype).tiny)).clamp(0.0, 1.0)
+    return torch.where(falls < 0, low + (high - low) * fraction, low)
 
 
 def segment_distance(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor:

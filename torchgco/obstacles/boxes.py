@@ -103,7 +103,7 @@ class BoundBoxes(OwnKind):
     @classmethod
     def prepare(
         cls,
-        given: Any,
+        options: Any,
         name: str,
         dims: Dimensions,
         centers: Tensor,
@@ -112,11 +112,11 @@ class BoundBoxes(OwnKind):
         absent: Tensor,
         radii: Tensor,
     ) -> BoundBoxes:
-        """Boxes of checked numbers (B, ...), whatever those of absent boxes are, with radius and knots as `given`."""
+        """Boxes of checked numbers (B, ...), whatever those of absent boxes are, with radius and knots of `options`."""
         assert dims.position is not None
-        vehicle = vehicle_radii(given.vehicle_radius, f"{name}.vehicle_radius", dims)
-        knots = resolve_knots(given.knots, dims.N, f"{name}.knots", centers.device, dims.obstacles_from)
-        centers, half = (torch.where(absent.unsqueeze(-1), 0.0, part) for part in (centers, half_sizes))
+        vehicle = vehicle_radii(options.vehicle_radius, f"{name}.vehicle_radius", dims)
+        knots = resolve_knots(options.knots, dims.N, f"{name}.knots", centers.device, dims.obstacles_from)
+        centers, half = (torch.where(absent.unsqueeze(-1), 0.0, values) for values in (centers, half_sizes))
         inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
         depths = inflated + half.amin(-1)
         return cls(centers, half, axes, absent, vehicle, inflated, depths, knots, dims.position, dims.dt or 0.0)
@@ -172,11 +172,11 @@ class BoundBoxes(OwnKind):
             parts[name] = parts[name].masked_fill(absent.view(*absent.shape, *([1] * (parts[name].dim() - 2))), 0.0)
         return replace(self, absent=absent, **parts)
 
-    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+    def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         if bool(self.absent.any()):
             return []
         after = copied(self.centers, [other.centers for other in others])
-        return numbers(where, {"centers": (self.centers, present)}, place, after=after)
+        return numbers(where, {"centers": (self.centers, present)}, index, after=after)
 
     def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
         bound = torch.cat([ball._lowered() for ball in (self, *others)], dim=-1)

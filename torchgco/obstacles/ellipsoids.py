@@ -164,16 +164,16 @@ class BoundEllipsoids(OwnKind):
         velocities = None if self.velocities is None else picked(self.velocities, at)
         return replace(self, absent=absent, velocities=velocities, **parts)
 
-    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+    def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         if bool(self.absent.any()):
             return []
-        found = []
+        written = []
         for name, check in {"centers": present, "semi_axes": above_zero, "velocities": present}.items():
             if (whole := getattr(self, name)) is not None:
                 after = copied(whole, [getattr(other, name) for other in others])
-                found += numbers(where, {name: (whole, check)}, place, after=after)
+                written += numbers(where, {name: (whole, check)}, index, after=after)
         radius = {} if others else {"vehicle_radius": (self.vehicle_radius, lengths)}
-        return found + numbers(where, radius, place)
+        return written + numbers(where, radius, index)
 
     def inflated(self) -> Cuboids | None:
         """Boxes that hold them: with the smallest semi-axis m, |a n| <= sum_i (a_i - m) |n_i| + m along any normal n.
@@ -243,9 +243,9 @@ def nearest(q: Tensor, semi: Tensor) -> tuple[Tensor, Tensor]:
     least = torch.maximum((reach - more).amax(-1), reach.square().sum(-1).sqrt() - more.amax(-1)).unsqueeze(-1)
     v = torch.maximum(least, smallest)
     for _ in range(NORMAL_STEPS):
-        part = (reach / (more + v)).square()
-        whole = part.sum(-1, keepdim=True)
-        v = torch.maximum(v + whole * (whole.sqrt() - 1.0) / (part / (more + v)).sum(-1, keepdim=True), least)
+        terms = (reach / (more + v)).square()
+        whole = terms.sum(-1, keepdim=True)
+        v = torch.maximum(v + whole * (whole.sqrt() - 1.0) / (terms / (more + v)).sum(-1, keepdim=True), least)
     normal = torch.where(q < 0, -away, away) / (more + v)
     normal = normal / normal.square().sum(-1, keepdim=True).sqrt()
     return (q * normal).sum(-1) - (semi * normal).square().sum(-1).sqrt(), normal
@@ -276,8 +276,8 @@ def _crossing(left: Sequence[Tensor], right: Sequence[Tensor]) -> tuple[Tensor, 
     (low, begin, falls), (high, end, rises) = left, right
     falls, rises = falls.clamp(max=0.0), rises.clamp(min=0.0)
     step = (begin - end + rises * (high - low)) / (rises - falls).clamp(min=torch.finfo(low.dtype).tiny)
-    place = torch.minimum(torch.maximum(low + step, low), high)
-    return place, begin + falls * (place - low)
+    crossing = torch.minimum(torch.maximum(low + step, low), high)
+    return crossing, begin + falls * (crossing - low)
 
 
 def _bisected(q: Tensor, semi: Tensor) -> tuple[Tensor, Tensor]:

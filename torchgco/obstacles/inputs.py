@@ -38,14 +38,14 @@ def points(value: Any, name: str, d: int, dims: Dimensions) -> tuple[Tensor, Ten
     Raises:
         InputError: not numbers, points of another space, another batch, infinity, NaN among numbers.
     """
-    given = rows(value, name, d, dims)
-    if given.shape[-1] != d:
-        raise InputError(name, f"{d}-D points, as the vehicle's position is {d}-D", f"{given.shape[-1]}-D points")
-    absent = torch.isnan(given).all(-1)
-    wrong = ~torch.isfinite(given).all(-1) & ~absent
+    values = rows(value, name, d, dims)
+    if values.shape[-1] != d:
+        raise InputError(name, f"{d}-D points, as the vehicle's position is {d}-D", f"{values.shape[-1]}-D points")
+    absent = torch.isnan(values).all(-1)
+    wrong = ~torch.isfinite(values).all(-1) & ~absent
     if bool(wrong.any()):
-        raise InputError(name, "finite points, or rows of NaN", given[wrong][0].tolist())
-    return given, absent
+        raise InputError(name, "finite points, or rows of NaN", values[wrong][0].tolist())
+    return values, absent
 
 
 def rows(value: Any, name: str, d: int, dims: Dimensions) -> Tensor:
@@ -54,8 +54,8 @@ def rows(value: Any, name: str, d: int, dims: Dimensions) -> Tensor:
     Raises:
         InputError: as `per_row`.
     """
-    given = tensor(value, name, dims.like)
-    return per_row(given.reshape(0, d) if tuple(given.shape) == (0,) else given, name, dims, "M", "d").contiguous()
+    values = tensor(value, name, dims.like)
+    return per_row(values.reshape(0, d) if tuple(values.shape) == (0,) else values, name, dims, "M", "d").contiguous()
 
 
 def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor:
@@ -64,9 +64,9 @@ def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor
     Raises:
         InputError: another shape, NaN elsewhere or not there, infinite or negative radii.
     """
-    given = tensor(value, name, dims.like)
-    given = torch.where(absent, torch.nan, given) if given.dim() == 0 else given
-    radii = per_row(given, name, dims, absent.shape[1])
+    values = tensor(value, name, dims.like)
+    values = torch.where(absent, torch.nan, values) if values.dim() == 0 else values
+    radii = per_row(values, name, dims, absent.shape[1])
     if bool((torch.isnan(radii) != absent).any()):
         raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")
     wrong = ~absent & ~((radii >= 0) & torch.isfinite(radii))

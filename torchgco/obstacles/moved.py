@@ -90,11 +90,11 @@ class MovedBoxes(MovingBoxes):
 
     def centers_at(self, t: Tensor) -> Tensor:
         last = self.path.shape[1] - 1
-        at = (t / self.step).clamp(0.0, last)
-        near = at.round()
-        at = torch.where((at - near).abs() < NEAR_KNOT, near, at)
-        before = at.floor().clamp(max=last - 1)
-        share, i = (at - before)[..., None, None], before.long()
+        sample = (t / self.step).clamp(0.0, last)
+        near = sample.round()
+        sample = torch.where((sample - near).abs() < NEAR_KNOT, near, sample)
+        before = sample.floor().clamp(max=last - 1)
+        share, i = (sample - before)[..., None, None], before.long()
         each = (slice(None), i) if t.dim() == 1 else (torch.arange(len(self.path), device=t.device).unsqueeze(-1), i)
         return self.path[each] * (1.0 - share) + self.path[each[0], i + 1] * share
 
@@ -107,8 +107,8 @@ class MovedBoxes(MovingBoxes):
         for k in range(X.shape[1]):
             whole = min(k * self.dt / self.step, float(last))
             i = min(int(whole + NEAR_KNOT), last - 1)
-            place = torch.lerp(self.path[:, i], self.path[:, i + 1], whole - i)
-            away.append(X[:, k, None, self.position] - place)
+            start = torch.lerp(self.path[:, i], self.path[:, i + 1], whole - i)
+            away.append(X[:, k, None, self.position] - start)
         return torch.stack(away, dim=1)
 
     def shapes(self, b: int) -> RoundedBoxes:
@@ -122,11 +122,11 @@ class MovedBoxes(MovingBoxes):
         path = picked(self.path.transpose(1, 2), at).transpose(1, 2).contiguous()
         return replace(self, boxes=self.boxes.chosen(at), path=path)
 
-    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+    def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         if bool(self.absent.any()):
             return []
         after = copied(self.path, [other.path for other in others])
-        return numbers(where, {"places": (self.path, present)}, place, after=after)
+        return numbers(where, {"places": (self.path, present)}, index, after=after)
 
 
 @dataclass(frozen=True)

@@ -51,10 +51,10 @@ class OscillatingBoxes(Constraint):
         _, M, d = boxes.centers.shape
         sines: list[Tensor] = []
         for name in ("amplitudes", "rates", "phases"):
-            part = per_row(getattr(self, name), f"boxes.{name}", dims, M, sines[0].shape[2] if sines else "S", d)
-            part = torch.where(boxes.absent[..., None, None], 0.0, part)
-            check_finite(part, f"boxes.{name}", "finite numbers for every box that is there")
-            sines.append(part)
+            sine = per_row(getattr(self, name), f"boxes.{name}", dims, M, sines[0].shape[2] if sines else "S", d)
+            sine = torch.where(boxes.absent[..., None, None], 0.0, sine)
+            check_finite(sine, f"boxes.{name}", "finite numbers for every box that is there")
+            sines.append(sine)
         if M == 0:
             return boxes  # none of them moves: what is asked of moving obstacles alone isn't asked of none
         amplitudes, rates, phases = sines
@@ -84,12 +84,12 @@ class BoundOscillatingBoxes(MovingBoxes):
         t = self.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1)
         away, strongest = [], []
         for i, p in enumerate(X[..., self.position].unbind(-1)):
-            sines = (part[..., i].unbind(-1) for part in (self.amplitudes, self.rates, self.phases))
-            place, most = self.boxes.centers[..., i].unsqueeze(1), torch.zeros_like(self.boxes.centers[..., i])
+            sines = (values[..., i].unbind(-1) for values in (self.amplitudes, self.rates, self.phases))
+            middle, most = self.boxes.centers[..., i].unsqueeze(1), torch.zeros_like(self.boxes.centers[..., i])
             for amplitude, rate, phase in zip(*sines, strict=True):
                 angle = rate.unsqueeze(1) * t + phase.unsqueeze(1)
-                place, most = place + amplitude.unsqueeze(1) * angle.sin(), most + amplitude.abs() * rate**2
-            away.append(p.unsqueeze(2) - place)
+                middle, most = middle + amplitude.unsqueeze(1) * angle.sin(), most + amplitude.abs() * rate**2
+            away.append(p.unsqueeze(2) - middle)
             strongest.append(most)
         # Seen from a box, the way between two knots leaves its chord by dt^2 / 8 of the box's acceleration at most.
         bulge = self.dt**2 / 8.0 * torch.stack(strongest, dim=-1).norm(dim=-1)
@@ -102,7 +102,7 @@ class BoundOscillatingBoxes(MovingBoxes):
         return self.dt**2 / 8.0 * most
 
     def shapes(self, b: int) -> RoundedBoxes:
-        sines = np.stack([array(part[b]) for part in (self.amplitudes, self.rates, self.phases)])
+        sines = np.stack([array(values[b]) for values in (self.amplitudes, self.rates, self.phases)])
         return RoundedBoxes.of(self._solids, self.vehicle_radius, b, sines=sines)
 
     def later(self, t: float) -> Self:

@@ -46,7 +46,7 @@ class RoundedBoxes:
         """Problem b's of `Solids`, those that are there; velocities (M, d), sines (3, M, S, d) and tracks (T, M, d) are
         those of all, and tracks have the centres."""
         here = ~solids.absent[b].cpu().numpy()
-        center, radius = (array(part[b])[here] for part in (solids.centers, solids.radii))
+        center, radius = (array(values[b])[here] for values in (solids.centers, solids.radii))
         M, d = center.shape
         half, sides = np.zeros((M, d)), np.broadcast_to(np.eye(d), (M, d, d))
         if hasattr(solids, "half_sizes"):

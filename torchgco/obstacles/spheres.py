@@ -102,9 +102,9 @@ class BoundSpheres(OwnKind):
         position: slice,
         dt: float,
     ) -> BoundSpheres:
-        o, one = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # absent: left out of sums
-        rows = [2 * o, -one, (inflated_radii.square() - o.square().sum(-1)).unsqueeze(-1)]
-        first, second = [one, o], [_outer(o, o)]
+        o, present = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # absent: left out of sums
+        rows = [2 * o, -present, (inflated_radii.square() - o.square().sum(-1)).unsqueeze(-1)]
+        first, second = [present, o], [_outer(o, o)]
         if velocities is not None:
             v = velocities
             rows += [2 * v, -2 * (o * v).sum(-1, keepdim=True), -v.square().sum(-1, keepdim=True)]
@@ -187,8 +187,8 @@ class BoundSpheres(OwnKind):
     def chosen(self, at: Tensor) -> BoundSpheres:
         absent = (at < 0) | picked(self.absent, at)
         centers, velocities = (
-            None if part is None else torch.where(absent.unsqueeze(-1), 0.0, picked(part, at))
-            for part in (self.centers, self.velocities)
+            None if values is None else torch.where(absent.unsqueeze(-1), 0.0, picked(values, at))
+            for values in (self.centers, self.velocities)
         )
         radii = torch.where(absent, 0.0, picked(self.inflated_radii, at))
         return self.remade(centers=centers, inflated_radii=radii, velocities=velocities, absent=absent)
@@ -199,22 +199,22 @@ class BoundSpheres(OwnKind):
         numbers: dict[str, Any] = {name: getattr(self, name) for name in names} | changes
         return replace(self.prepare(**numbers), stops=self.stops)
 
-    def numbers_of(self, where: str, place: int, others: Sequence[Any]) -> list[Number]:
+    def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         if bool(self.absent.any()):
             return []
-        found = []
+        written = []
         for name in ("centers",) if self.velocities is None else ("centers", "velocities"):
             whole = getattr(self, name)
             after = copied(whole, [getattr(other, name) for other in others])
-            found += numbers(where, {name: (whole, present)}, place, bool(others), after)
+            written += numbers(where, {name: (whole, present)}, index, bool(others), after)
         radii = self.inflated_radii - self.vehicle_radius.unsqueeze(-1)
 
         def inflate() -> None:
-            for part in (self, *others):
-                torch.add(radii, part.vehicle_radius.unsqueeze(-1), out=part.inflated_radii)
+            for group in (self, *others):
+                torch.add(radii, group.vehicle_radius.unsqueeze(-1), out=group.inflated_radii)
 
         sizes = {"radii": (radii, lengths)} | ({} if others else {"vehicle_radius": (self.vehicle_radius, lengths)})
-        return found + numbers(where, sizes, place, after=inflate)
+        return written + numbers(where, sizes, index, after=inflate)
 
     def lowered(self, n: int, others: Sequence[Any] = ()) -> Lowered:
         balls = (self, *others)
@@ -325,24 +325,24 @@ class SpheresInFreeTime(Obstacles):
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """Depth beneath the full surface, (B, K, M), m."""
-        radius, there = (part.unsqueeze(1) for part in self._sizes)
+        radius, there = (size.unsqueeze(1) for size in self._sizes)
         away = self._away(X[:, self.knots], self.times(X))
         return there * (radius - away.norm(dim=-1)).clamp(min=0.0)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        radius, there = (part.unsqueeze(1) for part in self._sizes)
+        radius, there = (size.unsqueeze(1) for size in self._sizes)
         away = self._away(X[:, self.knots], self.times(X))
         by_place = (there / radius).unsqueeze(-1) * away
         velocities = self.spheres.velocities
         assert velocities is not None
         by_factor = (by_place * velocities.unsqueeze(1)).sum(-1) * self.times(X).view(1, -1, 1)
         J = torch.cat((-by_place, by_factor.unsqueeze(-1)), dim=-1)
-        own = torch.tensor([*range(X.shape[-1])[self.position], self.factor], device=X.device)
-        add, one = H.new_zeros(*g.shape[:2], *H.shape[2:]), X.shape[-1]
+        columns = torch.tensor([*range(X.shape[-1])[self.position], self.factor], device=X.device)
+        add, constant = H.new_zeros(*g.shape[:2], *H.shape[2:]), X.shape[-1]
         gradient = (g.unsqueeze(-2) @ J).squeeze(-2)
-        add[..., own, one] = gradient
-        add[..., one, own] = gradient
-        add[..., own.unsqueeze(-1), own] = J.mT @ (h.unsqueeze(-1) * J)
+        add[..., columns, constant] = gradient
+        add[..., constant, columns] = gradient
+        add[..., columns.unsqueeze(-1), columns] = J.mT @ (h.unsqueeze(-1) * J)
         H[:, self.knots] += add
 
     def distances(self, X: Tensor) -> Tensor:
@@ -364,7 +364,7 @@ class SpheresInFreeTime(Obstacles):
         return replace(self, spheres=self.spheres.chosen(at))
 
     def _rows(self, x: Tensor, t: Tensor) -> Tensor:
-        radius, there = (part.unsqueeze(1) for part in self._sizes)
+        radius, there = (size.unsqueeze(1) for size in self._sizes)
         depth = (radius.square() - self._away(x, t).square().sum(-1)) / (2.0 * radius)
         return there * depth + (1.0 - there) * NO_ROW
 

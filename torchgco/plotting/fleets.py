@@ -35,8 +35,8 @@ def fleet_figure(
         raise InputError("b", f"the place of a fleet, 0 to {members[0].B - 1}", b)
     t = float(members[0].dynamics.dt) * np.arange(members[0].N + 1)
     courses = []
-    for v, (one, x, u) in enumerate(zip(members, X, U, strict=True)):
-        path = x[b][:, one.position]
+    for v, (member, x, u) in enumerate(zip(members, X, U, strict=True)):
+        path = x[b][:, member.position]
         courses.append(Course(b, x[b], u[b], t, (path,), _colour(v, len(members)), f"vehicle {v}", True, True))
     planes = (ABOVE, SIDE) if courses[0].paths[0].shape[1] == 3 else (ABOVE,)
     drawn = SceneMap.of(members[0], courses, planes)
@@ -46,11 +46,11 @@ def fleet_figure(
     drawn.draw(upper)
     for ax, plane in zip(upper.axes, planes, strict=True):
         ax.set_title("")
-        for one, course in zip(members, courses, strict=True):
+        for member, course in zip(members, courses, strict=True):
             look: dict[str, Any] = {"linestyle": "none", "markeredgecolor": course.colour, "zorder": 6}
             ax.plot(*course.paths[0][:1, plane].T, marker="s", markersize=5, markerfacecolor="white", **look)
-            if one.goal is not None:
-                ends = one.goal.position[b].cpu().numpy()[list(plane)]
+            if member.goal is not None:
+                ends = member.goal.position[b].cpu().numpy()[list(plane)]
                 ax.plot(*ends, marker="*", markersize=8, markerfacecolor=course.colour, **look)
     _distances(lower.subplots(), t, [course.paths[0] for course in courses], distances)
     return figure

@@ -86,12 +86,12 @@ def _bodies(shapes: RoundedBoxes) -> list[Solid]:
     return bodies
 
 
-def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, at: float) -> tuple[np.ndarray, ...]:
+def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, z: float) -> tuple[np.ndarray, ...]:
     """Grids (V, W) of two coordinates in a plane, m, and the least signed distance there from obstacles at t = 0.
 
     Args:
         low, high: corners (d,), m, of what is seen.
-        at: the hidden coordinate, m.
+        z: the hidden coordinate, m.
     """
     first, second = plane
     like = part.vehicle_radius
@@ -100,7 +100,7 @@ def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, 
         np.linspace(low[first], high[first], GRID_POINTS),
         np.linspace(low[second], high[second], max(2, round(GRID_POINTS * float(high_ / wide)))),
     )
-    points = np.full((x.size, len(low)), at)
+    points = np.full((x.size, len(low)), z)
     points[:, first], points[:, second] = x.ravel(), y.ravel()
     p = torch.as_tensor(points, dtype=like.dtype, device=like.device).unsqueeze(0)
     apart = part.signed_distance(p, p.new_zeros(p.shape[1]))[0]

@@ -7,18 +7,14 @@ nothing proves that it keeps them apart. What it gives for a row alone is what t
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, MutableMapping
-from contextlib import suppress
-from functools import cache, partial
+from collections.abc import Callable, Iterator
 from typing import Any, Self, TypeAlias
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakIdKeyDictionary
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import MISTAKES
-from torchgco.base.tree import Rows, is_users
+from torchgco.base.tree import Rows
 from torchgco.base.values import whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
@@ -27,9 +23,8 @@ from torchgco.problem.border import ONE_KNOT, OWN_ROW, STEP_OF_STAGE, called
 from torchgco.problem.in_time import at_times
 from torchgco.problem.joined import unlike
 from torchgco.problem.problem import Problem
-from torchgco.tracing.recorder import looks_at_values
+from torchgco.problem.refusals import Refusals, sparing_part, with_looking
 
-_looking: MutableMapping[Any, bool] = WeakIdKeyDictionary()  # whether parts do, by identity
 # Values (b, ...) of a problem along X, U, of all knots at once or, where they can be had so, one knot after the other.
 Values: TypeAlias = Callable[[Problem, Tensor, Tensor, bool], Tensor]
 
@@ -37,25 +32,22 @@ Values: TypeAlias = Callable[[Problem, Tensor, Tensor, bool], Tensor]
 def row_by_row(problem: Problem, again: bool = False) -> Problem:
     """The problem, whose parts that look at values are evaluated row by row; itself where none does.
 
+    Rows that a part's code refuses are NaN, of which a RefusalWarning tells where they are finite.
+
     Args:
         again: each part's code is tried, also where it was before.
     """
-    first = problem.take(slice(0, 1))
-    looks = partial(_looks, again)
-    x = torch.where(torch.isfinite(first.x0), first.x0, 0.0)
-    X, U = x.unsqueeze(1).repeat(1, problem.N + 1, 1), x.new_zeros(1, problem.N, problem.m)
-    parts: dict[str, Any] = {}
-    if looks(problem.dynamics, first.along.step, X[:, 1:], U):
-        integrated = type(first.dynamics).step is Dynamics.step
-        parts["dynamics"] = _made(problem.dynamics, _Field if integrated else _Step)
-    if looks(problem.cost, first.cost.total, X, U):
-        parts["cost"] = _made(problem.cost, _Cost if type(problem.cost).total is Cost.total else _Total)
-    rows = list(problem.constraints)
-    for i, constraint in enumerate(first.constraints):
-        if looks(rows[i], constraint.value, X, U):
-            rows[i] = _made(rows[i], _Function if isinstance(constraint, FunctionConstraint) else _Constraint)
-            parts["constraints"] = tuple(rows)
-    return problem._with(parts, problem.known) if parts else problem
+    refusals = Refusals("a state of what is judged")
+
+    def change(part: Any, field: str, shape: tuple[int, int]) -> Any:
+        spared = sparing_part(part, field, shape, refusals)
+        if isinstance(part, Dynamics):
+            return _made(spared, _Field if type(part).step is Dynamics.step else _Step)
+        if isinstance(part, Cost):
+            return _made(spared, _Cost if type(part).total is Cost.total else _Total)
+        return _made(spared, _Function if isinstance(part, FunctionConstraint) else _Constraint)
+
+    return with_looking(problem, change, again)
 
 
 def check_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = None) -> None:
@@ -81,8 +73,17 @@ def check_rows(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = No
             by_row = called(field, wanted, values, alone, x, u, True)
             for at_once in (True, False):
                 together = called(field, wanted, values, whole, x, u, at_once)
-                if together.shape != by_row.shape or bool((wrong := unlike(together, by_row)).any()):
+                wrong = torch.ones_like(by_row, dtype=torch.bool)
+                if together.shape == by_row.shape:
+                    # Of a problem of which some rows are refused, all may count as lost where they are asked together.
+                    lost = ~(_is_finite(together) | _is_finite(by_row))
+                    wrong = unlike(together, by_row) & ~lost.view(-1, *[1] * (by_row.dim() - 1))
+                if bool(wrong.any()):
                     raise InputError(field, wanted, _told(together, by_row, wrong, rows))
+
+
+def _is_finite(values: Tensor) -> Tensor:
+    return torch.isfinite(values).reshape(len(values), -1).all(-1)
 
 
 def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values]]:
@@ -124,47 +125,18 @@ def _told(whole: Tensor, alone: Tensor, wrong: Tensor, rows: Tensor) -> str:
     return f"other values among other knots and problems: {numbers} (problem {int(rows[b])}{knot})"
 
 
-def _looks(again: bool, part: Any, values: Callable[..., Tensor], *arguments: Tensor) -> bool:
-    if not is_users(part):
-        return False
-    looks = None if again else _looking.get(part)
-    if looks is None:
-        looks = looks_at_values(values, *arguments)
-        with suppress(TypeError):  # no weak reference to it
-            _looking[part] = looks
-    return looks
-
-
 def _made(part: Any, mixin: type) -> Any:
     """The same part with methods of `mixin` before its own."""
-    made = copy.copy(part)
-    object.__setattr__(made, "__class__", _kind(mixin, type(part)))
+    made, kind = copy.copy(part), type(part)
+    object.__setattr__(made, "__class__", type(kind.__name__, (mixin, kind), {"__module__": kind.__module__}))
     return made
 
 
-@cache
-def _kind(mixin: type, kind: type) -> type:
-    return type(kind.__name__, (mixin, kind), {"__module__": kind.__module__})
-
-
 def _each(row: Callable[[int, Any], Tensor], *arguments: Tensor) -> Tensor:
-    """row(b, i) (1, ...) of all rows of arguments (B, ...) or (B, K, ...), where it takes those of (b, i) (1, ...).
-
-    NaN for rows that the user's code refuses and that aren't finite.
-    """
-    x, evaluated = arguments[0], dict[tuple[int, Any], Tensor | None]()
+    """row(b, i) (1, ...) of all rows of arguments (B, ...) or (B, K, ...), where it takes those of (b, i) (1, ...)."""
+    x = arguments[0]
     indices = [(b, i) for i in (range(x.shape[1]) if x.dim() == 3 else [None]) for b in range(len(x))]
-    for index in indices:
-        try:
-            evaluated[index] = row(*index)
-        except MISTAKES:
-            if all(bool(torch.isfinite(_at(z, *index)).all()) for z in arguments):
-                raise
-            evaluated[index] = None
-    known = next((value for value in evaluated.values() if value is not None), None)
-    if known is None:
-        return row(*indices[0])  # which raises what it has to say
-    rows = torch.cat([torch.full_like(known, torch.nan) if value is None else value for value in evaluated.values()])
+    rows = torch.cat([row(*index) for index in indices])
     return rows if x.dim() == 2 else rows.unflatten(0, (-1, len(x))).transpose(0, 1)
 
 

@@ -133,9 +133,9 @@ class GoalBall(NormBounds):
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return "its radius"
 
-    def numbers(self, where: str, place: int) -> list[Number]:
+    def numbers(self, where: str, index: int) -> list[Number]:
         centre, radius = self.center[:, 0], self.upper[:, 0]
-        return numbers("goal", {"position": (centre, finite), "radius": (radius, above_zero)}, place)
+        return numbers("goal", {"position": (centre, finite), "radius": (radius, above_zero)}, index)
 
     def goal(self, before: Goal, position: slice) -> Goal:
         """The goal whose numbers lie in the memory of this row's."""
@@ -163,8 +163,8 @@ class GoalState(Constraint):
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return f"state {self.components.tolist()[row]}"  # type: ignore[union-attr]
 
-    def numbers(self, where: str, place: int) -> list[Number]:
-        return numbers("goal", {"state": (self.state, self._check_new)}, place)
+    def numbers(self, where: str, index: int) -> list[Number]:
+        return numbers("goal", {"state": (self.state, self._check_new)}, index)
 
     def _check_new(self, new: Floats) -> Wrong:
         free = np.isnan(self.state.numpy()[0])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
-from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole, take
+from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -27,12 +28,13 @@ from torchgco.problem.given import Given, place, replaced
 from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, reach, savings
+from torchgco.problem.subset import Subset
 from torchgco.problem.summary import summary
 from torchgco.problem.tried import check_code
 
 
 @dataclass(frozen=True)
-class Problem:
+class Problem(Subset):
     """minimise J_var(X, U) subject to x_{k+1} = step(x_k, u_k), x_0 given, and the constraints: B problems at once.
 
     Args:
@@ -66,12 +68,9 @@ class Problem:
     free_start: Any = None
     time: FreeTime | None = None
 
-    # No fields. `known`: what depends on the problems' form alone, shared by all subsets of a batch. `derived`: what
-    # was computed from these very parts, by name; a problem made of others has what its maker hands on, else none.
+    # No fields. `known`: what depends on the problems' form alone, shared by all subsets of a batch.
     known: ClassVar[Known]
-    derived: ClassVar[dict[str, Any]]
     given: ClassVar[Given | None] = None  # its parts as they were given; None of what solvers make of a problem
-    one: ClassVar[Problem | None] = None  # the single problem that all of these are; None: they are no such copies
 
     def __post_init__(self) -> None:
         fields_given = as_given({f.name: getattr(self, f.name) for f in fields(self)})
@@ -111,21 +110,21 @@ class Problem:
         first = 0 if chooses_position(self.free_start, model.position) else 1
         goal, dt = self.goal and self.goal.place, getattr(model, "dt", None)
         names = tuple(getattr(model, "state_names", ()))
-        parts = len(x0), self.N, self.n, self.m, dt, model.position, x0, first, goal, self.horizon, names
+        parts = len(x0), self.N, model.n, model.m, dt, model.position, x0, first, goal, self.horizon, names
         return Dimensions(*parts, free_time=self.time is not None)
 
     def __repr__(self) -> str:
         return summary(self)
 
-    @property
+    @cached_property
     def B(self) -> int:
         return self.x0.shape[0]
 
-    @property
+    @cached_property
     def n(self) -> int:
         return self.dynamics.n
 
-    @property
+    @cached_property
     def m(self) -> int:
         return self.dynamics.m
 
@@ -171,22 +170,16 @@ class Problem:
         """The bounds on controls, those of several parts as one; None where there are none."""
         return joined_bounds(bounds_of(self.constraints, "u"), self.N)
 
-    def derive(self, name: str, make: Callable[[], Any]) -> Any:
-        """What `make` computes from this problem's parts, once; kept in `derived` under the name."""
-        if name not in self.derived:
-            self.derived[name] = make()
-        return self.derived[name]
-
     @property
     def start_is_clear(self) -> Tensor:
         """Whether each problem starts outside its obstacles, (B,) bool; see `free_start.clear_starts`."""
-        parts = self.constraints, self.x0, self.free_start, self.dynamics.position
-        return self.derive("start_is_clear", lambda: clear_starts(*parts))
+        find = lambda p: clear_starts(p.constraints, p.x0, p.free_start, p.dynamics.position)
+        return self.derive_rows("start_is_clear", find)
 
     @property
     def cost_scale(self) -> CostScale:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
-        return self.derive("cost_scale", self._cost_scale)
+        return self.derive_rows("cost_scale", Problem._cost_scale)
 
     def _cost_scale(self) -> CostScale:
         X, U = self.at_rest
@@ -245,6 +238,9 @@ class Problem:
 
         No solver option then depends on the cost's scale or zero.
         """
+        return self.derive_rows("in cost units", Problem._in_cost_units)
+
+    def _in_cost_units(self) -> Self:
         unit, constant, _ = self.cost_scale
         cost = self.cost.scaled(1.0 / unit)
         if bool((constant != 0).any()):
@@ -264,10 +260,7 @@ class Problem:
             index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
         if is_whole(index, self.B):
             return self
-        names = "dynamics", "cost", "constraints", "x0", "goal", "horizon", "free_start", "time"
-        subset = self._with({name: take(getattr(self, name), index) for name in names}, known=self.known)
-        if self.B == 1 or self.one is not None:
-            subset._set(one=self.one or self)
+        subset = self.subset(index)
         if self.given is not None:
             subset._set(given=self.given.followed(self, lambda whole: whole.take(index)))
         return subset
@@ -385,11 +378,9 @@ class Problem:
         self, parts: dict[str, object], known: Known | None = None, derived: dict[str, Any] | None = None
     ) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
-        copy = object.__new__(type(self))
-        for name in field_names(type(self)):
-            object.__setattr__(copy, name, parts[name] if name in parts else getattr(self, name))
-        object.__setattr__(copy, "known", Known() if known is None else known)
-        object.__setattr__(copy, "derived", {} if derived is None else derived)
+        copy, known = object.__new__(type(self)), Known() if known is None else known
+        rest = {name: getattr(self, name) for name in field_names(type(self)) if name not in parts}
+        vars(copy).update(rest, **parts, known=known, derived={} if derived is None else derived)
         return copy
 
     def check_controls(self, U: Tensor, field: str = "U0") -> None:

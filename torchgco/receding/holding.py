@@ -36,24 +36,32 @@ def held(problem: Problem, plan: Plan | None, now: float) -> Held:
         problem: from the states that are measured `now`, s, and with the numbers of now.
         plan: of these problems, or None.
     """
-    whole, before, found = current(for_solvers(problem)), None, None
+    whole, before = current(for_solvers(problem)), None
+    best: Held | None = None
     if plan is not None:
         later = plan.moved_to(now)
         before, K = later.U, later.K
         lifted = rates_of(problem.constraints) is not None  # feedback could break the bounds of rates
         ways = [before] if lifted else [followed(whole, later.X, before, K)[1], before]
-        found = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
-    if found is None:
-        return _best(problem, whole, stopping(problem, None))
-    left = (~found.feasible).nonzero().flatten()
-    if left.numel() > 0:
-        stops = stopping(problem.take(left), None if before is None else before[left])
-        ways = torch.cat((found.U[left].unsqueeze(1), stops), dim=1)
-        other = _best(problem.take(left), whole.take(left), ways, found.K[left], 1)
-        other.is_before.logical_and_(found.is_before[left])
-        for part, new in zip(found, other, strict=True):
-            part[left] = new
-    return found
+        best = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
+    for mixed in (False, True):
+        if best is None:
+            stops = stopping(problem, None)
+            assert stops is not None
+            best = _best(problem, whole, stops)
+            continue
+        left = (~best.feasible).nonzero().flatten()
+        if left.numel() == 0:
+            break
+        stops = stopping(problem.take(left), None if before is None else before[left], mixed)
+        if stops is None:
+            break
+        ways = torch.cat((best.U[left].unsqueeze(1), stops), dim=1)
+        other = _best(problem.take(left), whole.take(left), ways, best.K[left], 1)
+        other.is_before.logical_and_(best.is_before[left])
+        for kept, new in zip(best, other, strict=True):
+            kept[left] = new
+    return best
 
 
 def better(problem: Problem, kept: Held, U: Tensor) -> Held:
@@ -63,8 +71,8 @@ def better(problem: Problem, kept: Held, U: Tensor) -> Held:
     """
     whole = current(for_solvers(problem))
     U = torch.where((kept.is_before & kept.feasible).view(-1, 1, 1), kept.U, U)
-    found = _best(problem, whole, torch.stack((kept.U, U), dim=1), kept.K, 1)
-    return found._replace(is_before=found.is_before & kept.is_before)
+    best = _best(problem, whole, torch.stack((kept.U, U), dim=1), kept.K, 1)
+    return best._replace(is_before=best.is_before & kept.is_before)
 
 
 def within(problem: Problem, U: Tensor) -> Tensor:
@@ -73,9 +81,9 @@ def within(problem: Problem, U: Tensor) -> Tensor:
         bounds = problem.control_bounds
         U = U.nan_to_num() if bounds is None else clamped(U, *bounds.over(problem.N))
     else:
-        U, at, u = U.clone(), limits(problem), U[:, 0]
+        U, limits_at, u = U.clone(), limits(problem), U[:, 0]
         for k in range(problem.N):
-            u = U[:, k] = clamped(U[:, k], *at(torch.full((problem.B,), k), u))
+            u = U[:, k] = clamped(U[:, k], *limits_at(torch.full((problem.B,), k), u))
     return within_norms(U, problem.constraints)
 
 
@@ -87,13 +95,13 @@ def _best(problem: Problem, whole: Problem, U: Tensor, K: Tensor | None = None, 
     """
     B, C = U.shape[:2]
     each = torch.arange(B).repeat_interleave(C)
-    many, own = whole.take(each), problem.take(each)
-    U = within(own, U.flatten(0, 1))
+    many, stated = whole.take(each), problem.take(each)
+    U = within(stated, U.flatten(0, 1))
     X = open_loop(many, U)
     worst, cost = _violation(many, X, U), many.cost.total(X, U).nan_to_num(torch.inf)
     fits = (worst <= ADMITTED) & torch.isfinite(X).flatten(1).all(-1)
     fits &= path_clearance(many, X, U) >= 0  # NaN, of states that aren't finite, isn't
-    arrives = fits & has_arrived(own, X[..., : problem.n]) if ranks_arrival(own) else fits
+    arrives = fits & has_arrived(stated, X[..., : problem.n]) if ranks_arrival(stated) else fits
     near = (worst.view(B, C) <= worst.view(B, C).amin(1, keepdim=True) + ADMITTED).flatten()
     rank = torch.where(arrives, 0, torch.where(fits, 1, torch.where(near, 2, 3))).view(B, C)
     value = cost if bool(fits.view(B, C).any(1).all()) else torch.where(fits, cost, _sum_of_violations(many, X, U))
@@ -116,9 +124,9 @@ def _violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 def _sum_of_violations(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """The sum (B,) over the same constraints and their knots."""
-    rows = [part.violation(X, U) for part in _but_goal(problem)]
-    return sum((one.amax(-1).sum(-1) for one in rows if one.shape[-1] > 0), X.new_zeros(len(X))).nan_to_num(torch.inf)
+    rows = [constraint.violation(X, U) for constraint in _but_goal(problem)]
+    return sum((v.amax(-1).sum(-1) for v in rows if v.shape[-1] > 0), X.new_zeros(len(X))).nan_to_num(torch.inf)
 
 
 def _but_goal(problem: Problem) -> list[Constraint]:
-    return [part for part in problem.constraints if not part.bare.is_goal]
+    return [constraint for constraint in problem.constraints if not constraint.bare.is_goal]

@@ -85,8 +85,8 @@ class Plan:
         X, U, K = self.X.clone(), self.U.clone(), self.K.clone()
         for start in self.start.unique().tolist():
             rows, stages = self.start == start, stages_between((now - start) / self.dt)
-            for part in (X, U, K):
-                part[rows] = shifted(part[rows], stages)
+            for series in (X, U, K):
+                series[rows] = shifted(series[rows], stages)
         return replace(self, X=X, U=U, K=K, start=torch.full_like(self.start, now))
 
     def at(self, t: float, x: Any = None) -> Instant:
@@ -120,7 +120,7 @@ class Plan:
             shares = torch.from_numpy(np.diff(within, axis=1) / seconds)
             return self._at(t, None if x is None else self._states(x), (shares.unsqueeze(1) @ self.U).squeeze(1)).u
 
-    def _at(self, t: float, given: Tensor | None, u: Tensor | None = None) -> Instant:
+    def _at(self, t: float, measured_x: Tensor | None, u: Tensor | None = None) -> Instant:
         """`at`; with other controls u (B, m) than those of the stage, where they are given."""
         B, N, m = self.U.shape
         stages = self._stages(t)
@@ -130,8 +130,8 @@ class Plan:
         rows = torch.arange(B)
         states = self._states_at(k, share)
         u = self.U[rows, k].clone() if u is None else u
-        if given is not None:
-            u += (self.K[rows, k] @ (given - states).unsqueeze(-1)).squeeze(-1)
+        if measured_x is not None:
+            u += (self.K[rows, k] @ (measured_x - states).unsqueeze(-1)).squeeze(-1)
             if self.bounds is not None:
                 lower, upper = (bound.expand(B, N, m)[rows, k] for bound in self.bounds.over(N))
                 u = torch.minimum(torch.maximum(u, lower), upper)
@@ -157,11 +157,11 @@ class Plan:
         rows = torch.arange(len(k))
         states = self.X[rows, k].clone()
         lengths = np.full(len(k), self.dt) if self.knots is None else self.knots.diff(dim=1)[rows, k].numpy()
-        for stage, part, length in sorted(set(zip(k.tolist(), share.tolist(), lengths.tolist(), strict=True))):
-            if part > 0:
-                at = torch.tensor([stage]), self.X.new_tensor([part * length]), self.X.new_tensor([length])
-                some = torch.from_numpy((k == stage) & (share == part) & (lengths == length))
-                states[some] = between(self.dynamics, self.X, self.U, *at)[some, 0]
+        for stage, gone, length in sorted(set(zip(k.tolist(), share.tolist(), lengths.tolist(), strict=True))):
+            if gone > 0:
+                instant = torch.tensor([stage]), self.X.new_tensor([gone * length]), self.X.new_tensor([length])
+                alike = torch.from_numpy((k == stage) & (share == gone) & (lengths == length))
+                states[alike] = between(self.dynamics, self.X, self.U, *instant)[alike, 0]
         return states if self.knots is None else self.dynamics.settled(states)
 
 

@@ -22,26 +22,28 @@ from torchgco.problem.problem import Problem
 
 SHARES = -1.0, -0.5, 0.5, 1.0  # of the way from a control at rest to its lower and its upper bound
 MOST_TOGETHER = 4  # controls, of which all ends of the bounds are combined: 16 candidates
+MOST_MIXED = 2  # controls, of which all other shares are combined, too: 12 candidates
 BRAKES_AFTER = 0.0, 0.125, 0.25  # of the horizon, after which candidates begin to brake
-TILTS_WITHIN = (
-    0.25  # of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these
-)
+# Of the horizon, in which a vehicle that has to tilt first loses most of its speed: it has four of these.
+TILTS_WITHIN = 0.25
 PROBE = 1e-4  # of a control's range: by how much a difference moves it
-SMALLEST_SQUARE = (
-    1e-9  # of the squares' sum: no direction counts in which the speed changes by less than their square root
-)
+# Of the squares' sum: no direction counts in which the speed changes by less than their square root.
+SMALLEST_SQUARE = 1e-9
 Limits = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # of stages, after the controls of those before
 
 
-def stopping(problem: Problem, before: Tensor | None) -> Tensor:
-    """Controls (B, C, N, m) of candidates that come to rest.
+def stopping(problem: Problem, before: Tensor | None, mixed: bool = False) -> Tensor | None:
+    """Controls (B, C, N, m) of candidates that come to rest; None: there are none.
 
     Args:
         problem: as users give it, of a fixed time.
         before: controls (B, N, m) of the plan before, moved on; None: none.
+        mixed: further ones, which have some controls at their bounds beside others half-way, as to speed up in a bend.
     """
     rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-    bases, delays = _candidates(problem, rest, before)
+    if mixed and (problem.control_bounds is None or not 1 < problem.m <= MOST_MIXED):
+        return None
+    bases, delays = _candidates(problem, rest, before, mixed)
     U, rests = _braked(problem, rest, bases, delays, 0.0)
     left = (~rests.any(1)).nonzero().flatten()
     if left.numel() == 0 or not problem.dynamics.is_integrated:
@@ -56,11 +58,11 @@ def limits(problem: Problem) -> Limits:
     """The bounds of controls (B, m) at stages (B,), those of rates among them."""
     B, N, m = problem.B, problem.N, problem.m
     inf, bounds = problem.x0.new_full((1, 1, m), torch.inf), problem.control_bounds
-    low, high = (part.expand(B, N, m) for part in ((-inf, inf) if bounds is None else bounds.over(N)))
+    low, high = (bound.expand(B, N, m) for bound in ((-inf, inf) if bounds is None else bounds.over(N)))
     rows, rates = torch.arange(B), rates_of(problem.constraints)
     if rates is None:
         return lambda k, before: (low[rows, k], high[rows, k])
-    fall, rise = (part.expand(B, N, m) for part in rates.over(N))
+    fall, rise = (bound.expand(B, N, m) for bound in rates.over(N))
     first = torch.full_like(low[:, 0], torch.nan) if rates.previous is None else rates.previous.expand(B, m)
 
     def both(k: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,23 +78,26 @@ def clamped(u: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return torch.minimum(torch.maximum(u.nan_to_num(), low), high)
 
 
-def _candidates(problem: Problem, rest: Tensor, before: Tensor | None) -> tuple[Tensor, Tensor]:
+def _candidates(problem: Problem, rest: Tensor, before: Tensor | None, mixed: bool) -> tuple[Tensor, Tensor]:
     """Controls (B, C, N, m) that candidates have until they brake and beside it, and the stages (C,) at which they do.
 
     Shares of infinite bounds are those of rest.
     """
     bases, bounds, m = [rest] if before is None else [rest, before], problem.control_bounds, problem.m
+    bases = [] if mixed else bases
     if bounds is not None:
         up, down = (
             torch.where(torch.isfinite(bound - rest), bound - rest, 0.0) for bound in bounds.over(problem.N)[::-1]
         )
-        shares = [share * one for one in torch.eye(m, dtype=rest.dtype) for share in SHARES]
-        if m <= MOST_TOGETHER:
+        shares = [share * unit for unit in torch.eye(m, dtype=rest.dtype) for share in SHARES]
+        if mixed:
+            parts = (part for part in product(SHARES, repeat=m) if min(map(abs, part)) < 1.0)
+            shares = [rest.new_tensor(part) for part in parts]
+        elif m <= MOST_TOGETHER:
             shares += [rest.new_tensor(signs) for signs in product((-1.0, 1.0), repeat=m)]
         bases += [rest + share.clamp(min=0.0) * up - share.clamp(max=0.0) * down for share in shares]
-    later = (
-        BRAKES_AFTER if problem.along is problem.dynamics else BRAKES_AFTER[:1]
-    )  # a stage is of one model for all candidates
+    # Where models differ by stage, one stage is of one model for all candidates: they brake at once.
+    later = BRAKES_AFTER if problem.along is problem.dynamics else BRAKES_AFTER[:1]
     delays = torch.tensor([int(share * problem.N) for share in later]).repeat_interleave(len(bases))
     return torch.stack(bases, dim=1).repeat(1, len(later), 1, 1), delays
 
@@ -112,17 +117,17 @@ def _braked(problem: Problem, rest: Tensor, bases: Tensor, delays: Tensor, ahead
     x, u = open_loop(current(for_solvers(many)), U)[rows, first, : problem.n], U[rows, (first - 1).clamp(min=0)]
     rests = torch.zeros(B * C, dtype=torch.bool)
     for k in range(N - int(delays.min())):
-        at = (first + k).clamp(max=N - 1)
-        low, high = bounds(at, u)
-        quiet, own, then = calm[rows, at], U[rows, at], calm[rows, (at + 1).clamp(max=N - 1)]
+        stage = (first + k).clamp(max=N - 1)
+        low, high = bounds(stage, u)
+        quiet, begun, then = calm[rows, stage], U[rows, stage], calm[rows, (stage + 1).clamp(max=N - 1)]
         span = torch.where(torch.isfinite(high - low), high - low, 1.0).clamp(min=torch.finfo(x.dtype).tiny)
         stages = (varied, varied) if steady else (varied.at(k), varied.at(min(k + 1, N - 1)))
-        change, left = _toward_rest(problem, stages, x, own, span, quiet, then, ahead)
+        change, left = _toward_rest(problem, stages, x, begun, span, quiet, then, ahead)
         if ahead == 0.0:  # m until the end of the horizon with controls at rest
-            rests |= left * float(problem.dynamics.dt) * (N - at) <= ADMITTED
-        u = clamped(torch.where(rests.unsqueeze(-1), quiet, own + span * change), low, high)
+            rests |= left * float(problem.dynamics.dt) * (N - stage) <= ADMITTED
+        u = clamped(torch.where(rests.unsqueeze(-1), quiet, begun + span * change), low, high)
         runs = first + k < N
-        U[rows[runs], at[runs]] = u[runs]
+        U[rows[runs], stage[runs]] = u[runs]
         if bool(rests.all()):
             break
         x = (many.dynamics if steady else many.dynamics.at(k)).step(x, u)
@@ -169,22 +174,22 @@ def _toward_rest(
     The speed is that at the next knot, or `ahead` s later with controls `then`.
     """
     R, m = u.shape
-    at = slice(0, problem.n) if problem.dynamics.position is None else problem.position
+    place_states = slice(0, problem.n) if problem.dynamics.position is None else problem.position
     tried = torch.cat((u.unsqueeze(0), u + PROBE * torch.diag_embed(span).transpose(0, 1), quiet.unsqueeze(0)))
     now, later = stages
     x, then = now.step(x.repeat(m + 2, 1), tried.flatten(0, 1)), then.repeat(m + 2, 1)
     if not later.is_integrated:
-        speeds = (later.step(x, then) - x)[..., at] / problem.dynamics.dt
+        speeds = (later.step(x, then) - x)[..., place_states] / problem.dynamics.dt
     else:
         if ahead > 0.0:
             x = INTEGRATORS[later.integrator](lambda z: later.field(z, then), x, ahead)
-        speeds = later.field(x, then)[..., at]
+        speeds = later.field(x, then)[..., place_states]
     v, *others, still = speeds.view(m + 2, R, -1).unbind(0)
     J = (torch.stack(others, dim=-1) - v.unsqueeze(-1)) / PROBE  # (R, d, m), by shares of the ranges
-    squares, one = J.mT @ J, torch.eye(m, dtype=x.dtype)
+    squares, identity = J.mT @ J, torch.eye(m, dtype=x.dtype)
     size = squares.diagonal(dim1=-2, dim2=-1).sum(-1)
     size = torch.where(size > 0, size, 1.0)  # of a speed that no control changes yet
-    squares = squares + SMALLEST_SQUARE * size[:, None, None] * one
-    squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, one)
+    squares = squares + SMALLEST_SQUARE * size[:, None, None] * identity
+    squares = torch.where(torch.isfinite(squares).flatten(1).all(-1)[:, None, None], squares, identity)
     change = -torch.linalg.solve(squares, (J.mT @ v.unsqueeze(-1)).nan_to_num()).squeeze(-1)
     return change, still.square().sum(-1).sqrt()

@@ -33,19 +33,7 @@ SINES = ("box_amplitudes", "box_rates", "box_phases")
 GATES = ("gate_centers", "gate_radii")
 TIME = "free_time"
 BINDS = "goal_required"
-NAMED_ARRAYS = (
-    *SPHERES,
-    *BOXES,
-    *SINES,
-    *GATES,
-    "start",
-    "goal",
-    *checks.SCALARS,
-    *CONTROLS,
-    TIME,
-    BINDS,
-    "best_cost",
-)
+NAMED_ARRAYS = (*SPHERES, *BOXES, *SINES, *GATES, "start", "goal", *checks.SCALARS, *CONTROLS, TIME, BINDS, "best_cost")
 IDS = "layout"
 SHARED = tuple(name for name in checks.SCALARS if name != "stages")  # numbers that all layouts share
 

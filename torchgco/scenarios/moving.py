@@ -223,8 +223,8 @@ class Walkers(AmongMovers):
             new = self._walkers(rng, self.num_obstacles - len(centers))
             away = np.linalg.norm(new[0] + t * new[1] - np.array(self.start), axis=-1).min(axis=0)
             centers, velocities = (
-                np.vstack((held, more[away > self.clearance]))
-                for held, more in ((centers, new[0]), (velocities, new[1]))
+                np.vstack((rows, more[away > self.clearance]))
+                for rows, more in ((centers, new[0]), (velocities, new[1]))
             )
         if len(centers) < self.num_obstacles:
             expected = f"room for {self.num_obstacles} walkers that stay {self.clearance:g} m from the start"

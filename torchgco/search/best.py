@@ -20,12 +20,18 @@ from torchgco.solvers.ending import fails_between
 from torchgco.solvers.history import Recorder
 
 
-def is_sound(problem: Problem, one: Iterate, limit: float) -> Tensor:
-    """Whether trajectories are feasible, between the knots too, (B,) bool; `limit`: violation at the knots."""
+def is_sound(problem: Problem, one: Iterate, limit: float, clearance: Tensor | None = None) -> Tensor:
+    """Whether trajectories are feasible, between the knots too, (B,) bool.
+
+    Args:
+        limit: violation at the knots.
+        clearance: `path_clearance` (B,), where it is known.
+    """
     sound = one.violation <= limit
     rows = sound.nonzero().flatten()
     if rows.numel() > 0:
-        sound[rows] = ~fails_between(problem.take(rows), one.X[rows], one.U[rows])
+        known = None if clearance is None else clearance[rows]
+        sound[rows] = ~fails_between(problem.take(rows), one.X[rows], one.U[rows], known)
     return sound
 
 
@@ -39,8 +45,10 @@ class Best:
         self.end = copied(first)
         self.worked = torch.ones_like(call.ids, dtype=torch.bool)  # (B,): on which problems the present pass has
         self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that one in contact has replaced
+        self.others: dict[int, list[SolveEnd]] = {}  # solved along other ways, in contact between two knots
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
-        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced
+        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced, as what follows
+        self._clearance: Tensor | None = None
 
     def of(self, rows: Tensor) -> SolveEnd:
         """How the best attempts of problems `rows` (b,), ascending, have ended: to be read, not to be kept."""
@@ -53,6 +61,17 @@ class Best:
             fits = best.violation <= self.solver.violation_tolerance
             self._arrived[tolerances] = fits & has_arrived(self.call.problem, best.X, tolerances)
         return self._arrived[tolerances]
+
+    @property
+    def clearance(self) -> Tensor:
+        """`path_clearance` (B,) of the best trajectories."""
+        if self._clearance is None:
+            self._clearance = path_clearance(self.call.problem, self.end.best.X, self.end.best.U)
+        return self._clearance
+
+    def _forget(self) -> None:
+        self._arrived.clear()
+        self._clearance = None
 
     def next_attempt(self) -> None:
         """Count attempts in the trace, also those that no problem of this batch needs."""
@@ -121,7 +140,7 @@ class Best:
     def _take_back(self, row: int) -> None:
         """Put the spare trajectory of a problem in the place of its best one."""
         one = self.spare.pop(row)
-        self._arrived.clear()
+        self._forget()
         put(self.end.best, self.end.status.new_tensor([row]), one.best)
         self.end.status[row] = one.status
 
@@ -130,7 +149,7 @@ class Best:
         self.worked[rows] = True
         chosen = where.nonzero().flatten()
         if chosen.numel() > 0:
-            self._arrived.clear()
+            self._forget()
             put(self.end.best, rows[chosen], take(trajectories, chosen))
             self.end.status[rows[chosen]] = new.status[chosen]
         for name in ("iterations", "outer", "guided"):

@@ -21,6 +21,7 @@ from torchgco.lagrangian.quality import leaves_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_maps
+from torchgco.search.best import is_sound
 from torchgco.search.converge import continued
 from torchgco.search.search import Search
 from torchgco.search.table import Row
@@ -40,7 +41,7 @@ class ClearChords(Row):
     the best trajectory: by AL-iLQR, and where that finds nothing by the interior point alone. A trajectory is replaced
     where the new one is feasible for the obstacles as they are, has arrived if the old one had, and keeps clearer of
     them between the knots. Openings may leave no room for it: there a more expensive trajectory of the passes before
-    that is clear is taken back.
+    that is clear is taken back, or one along another way of a map, where it can be brought clear.
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before; in maps, by the interior point alone,
@@ -77,7 +78,8 @@ class ClearChords(Row):
 
         limit = search.solver.violation_tolerance
         rounds = self.rounds * (IN_MAPS if has_maps(search.call.problem) else 1)
-        best.restore(*cleared(search.call, best.end.best, rounds, limit, once))
+        best.restore(*cleared(search.call, best.end.best, rounds, limit, once, best.clearance))
+        _along_other_ways(search)
 
     def _continued(
         self, search: Search, rows: Tensor, call: Call, old: Iterate, least: Tensor
@@ -113,7 +115,9 @@ class ClearChords(Row):
 Once = Callable[[Tensor, Call, Iterate, Tensor], tuple[Tensor, Tensor]]
 
 
-def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) -> tuple[Tensor, Tensor]:
+def cleared(
+    call: Call, best: Iterate, rounds: int, limit: float, once: Once, clearance: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Solve the feasible problems of a call that touch an obstacle between two knots again, among larger obstacles.
 
     Args:
@@ -122,11 +126,12 @@ def cleared(call: Call, best: Iterate, rounds: int, limit: float, once: Once) ->
         once: solves problems `rows` (b,), by a call with obstacles that have grown for them, from their trajectories,
             where more clearance than `least` (b,) is wanted. Returns where it has put new ones, and the clearances
             (b,) that it has found.
+        clearance: `path_clearance` (B,) of `best`, where it is known.
 
     Returns:
         The problems that touched, and whether they still do.
     """
-    clearance = path_clearance(call.problem, best.X, best.U)
+    clearance = path_clearance(call.problem, best.X, best.U) if clearance is None else clearance.clone()
     by, now = torch.zeros_like(clearance), clearance.clone()
     rows = touching = ((best.violation <= limit) & (clearance < 0)).nonzero().flatten()
     for _ in range(rounds):
@@ -159,6 +164,20 @@ def clear_further(search: Search, call: Call, end: SolveEnd) -> None:
         return serves, clearance
 
     cleared(call, end.best, ClearChords().rounds, limit, once)
+
+
+def _along_other_ways(search: Search) -> None:
+    """Where the best can't be brought clear between the knots, the cheapest candidate of another way that can be."""
+    best, limit = search.best, search.solver.violation_tolerance
+    for row, others in sorted(best.others.items()):
+        at = search.call.ids.new_tensor([row])
+        call = replace(search.call.take(at), callback=None)
+        for other in others:
+            if search.call.late or bool(is_sound(call.problem, best.of(at).best, limit)):
+                break
+            clear_further(search, call, other)
+            serves = is_sound(call.problem, other.best, limit)
+            best.replace(at, serves & ~leaves_goal(call.problem, other.best.X, best.of(at).best.X), other.best, other)
 
 
 def serving(

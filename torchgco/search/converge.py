@@ -55,8 +55,8 @@ class Converge(Row):
             found = search.interior.solved(search.call, guess=guess, escapes=True)
             search.begin(search.interior.no_worse(search.call, guess, found))
             self._from_rest(search)
-            rows = _unsolved(search)
-            search.best.improve(rows, search.call.take(rows))
+            if (rows := _unsolved(search)).numel() > 0:
+                search.best.improve(rows, search.call.take(rows))
 
     @property
     def problems(self) -> str:
@@ -119,7 +119,7 @@ def keep_clear(search: Search, rows: Tensor, end: SolveEnd) -> None:
     arrives = ~leaves_goal(problem, new.X, old.X)
     near = new.cost <= old.cost + WORTH * old.cost.abs()
     serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
-    now, before = (path_clearance(problem, one.X, one.U) for one in (new, old))
+    now, before = path_clearance(problem, new.X, new.U), search.best.clearance[rows]
     clear = ~(now < before.clamp(max=0.0))
     clear |= old.violation > limit
     search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
@@ -143,7 +143,7 @@ def keep_tight(search: Search, rows: Tensor, end: SolveEnd) -> None:
     problem = search.call.problem.take(rows)
     arrives = leaves_goal(problem, old.X, new.X)
     better = is_preferred(problem, new, old, limit) & (lost | arrives | (cheaper & tight))
-    now, before = (path_clearance(problem, one.X, one.U).clamp(max=0.0) for one in (new, old))
+    now, before = path_clearance(problem, new.X, new.U).clamp(max=0.0), search.best.clearance[rows].clamp(max=0.0)
     clearer = (now > before) & (new.violation <= limit) & ~leaves_goal(problem, new.X, old.X)
     search.best.replace(rows, torch.where(lost | (now == before), better, clearer), new, end)
 

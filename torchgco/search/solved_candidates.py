@@ -24,6 +24,7 @@ LAST_DEPTH = 0.8  # depth in an obstacle, in R, of candidates that come after al
 CUT = 0.3  # depth between two knots, in R, of solved ones that don't count: a step through a wall can't be repaired
 # From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
 SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
+SAME = 1e-3  # share of the cost by which solved candidates of one way differ
 BOTH = Refine(top=2)  # marks candidates as solved in the record
 
 
@@ -70,6 +71,8 @@ def solved(search: Search, rows: Tensor, chosen: Candidates, grown: Tensor | Non
     for merit in (clear, cost):  # the cheapest that is clear between knots, too, is remembered by `Best.keep`
         _keep(search, rows, chosen.count, some, end, merit, made)
         made = torch.zeros_like(made)
+    without = ~torch.isfinite(clear.view(problem.B, -1)).any(1, keepdim=True)
+    _remember(search, rows, some, end, torch.where(without, cost.view(problem.B, -1), torch.inf))
     best = cost.view(-1, chosen.count).argmin(1) + torch.arange(problem.B, device=rows.device) * chosen.count
     X, U = chosen.X.clone(), chosen.U.clone()
     X[some], U[some] = end.best.X, end.best.U
@@ -115,3 +118,20 @@ def _keep(search: Search, rows: Tensor, count: int, some: Tensor, end: SolveEnd,
     search.best.keep(rows[found], one)
     lost = (~torch.isfinite(least)).nonzero().flatten()
     search.best.end.iterations[rows[lost]] += made[lost]
+
+
+def _remember(search: Search, rows: Tensor, some: Tensor, end: SolveEnd, touching: Tensor) -> None:
+    """Of each problem in `rows` that has no clear candidate, the cheapest of each other way than the best's.
+
+    Args:
+        some: places of the solved candidates among all, whose costs are `touching` (B, count), infinite where one
+            doesn't count.
+    """
+    place = {at: i for i, at in enumerate(some.tolist())}
+    for b, costs in enumerate(touching.tolist()):
+        others, last = list[SolveEnd](), None
+        for cost, k in sorted((cost, k) for k, cost in enumerate(costs) if cost < torch.inf):
+            if last is not None and cost > last + SAME * abs(last):
+                others.append(take(end, some.new_tensor([place[b * len(costs) + k]])))
+            last = cost
+        search.best.others[int(rows[b])] = others

@@ -12,7 +12,7 @@ from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive
 from torchgco.base.status import STOPPED, UNMOVED, Status, is_over
 from torchgco.base.tree import take
-from torchgco.kernels import measured, open_loop, path_clearance
+from torchgco.kernels import measured, open_loop
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived, outside_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -102,7 +102,7 @@ class Starts(Row):
         """Where the best trajectory is infeasible, between the knots too, or ends outside a stated goal, (B,) bool."""
         best = search.best.end.best
         missed = ~(best.violation <= search.solver.violation_tolerance) | outside_goal(search.call.problem, best.X)
-        return missed | (path_clearance(search.call.problem, best.X, best.U) < 0)
+        return missed | (search.best.clearance < 0)
 
     def _solve(self, search: Search, rows: Tensor, first: int) -> None:
         """All starts of the problems in `rows` as one batch, numbered from `first`."""

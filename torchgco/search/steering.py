@@ -106,6 +106,16 @@ def sampled(problem: Problem) -> Sampled | None:
 
 def steered(problem: Problem) -> Steered | None:
     """The vehicle of a batch of one, by its equations at samples of states and controls; None of another kind."""
+    if problem.part_of is None:
+        return _recognised(problem)
+    whole, rows = problem.part_of
+    known, b = whole.derive("steered", dict), int(rows[0])
+    if b not in known:
+        known[b] = _recognised(problem)
+    return known[b]
+
+
+def _recognised(problem: Problem) -> Steered | None:
     seen = sampled(problem)
     if seen is None:
         return None

@@ -134,14 +134,14 @@ def _live(problem: Problem, points: Points, rows: Tensor) -> Problem:
     return live.grown(points.growth) if bool((points.growth > 0).any()) else live
 
 
-def _are_exact(at: Points, of: Residual) -> Tensor:
+def _are_exact(here: Points, of: Residual) -> Tensor:
     """Whether the step (B,) from the points to where the conditions hold to first order is small, and a number."""
     with not_recording():
-        c = of.rows if at.gap is None else of.rows + at.gap
-        x, u, y, _ = (z[0].abs() for z in _system(at).solve(of.x[None], of.u[None], of.gaps[None], c[None]))
-        size = 1.0 + torch.maximum(at.solution.X.abs().flatten(1).amax(-1), at.solution.U.abs().flatten(1).amax(-1))
+        c = of.rows if here.gap is None else of.rows + here.gap
+        x, u, y, _ = (z[0].abs() for z in _system(here).solve(of.x[None], of.u[None], of.gaps[None], c[None]))
+        size = 1.0 + torch.maximum(here.solution.X.abs().flatten(1).amax(-1), here.solution.U.abs().flatten(1).amax(-1))
         step = torch.maximum(x.flatten(1).amax(-1), u.flatten(1).amax(-1))
-        largest = at.costates.abs().flatten(1).amax(-1)
+        largest = here.costates.abs().flatten(1).amax(-1)
         return (step <= EXACT_STEP * size) & (y.flatten(1).amax(-1) <= EXACT_COSTATES * largest)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Self
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -54,8 +54,6 @@ class AugmentedLagrangian(Solver, named="solver"):
         violation_tolerance: violation (metres for lengths) up to which a trajectory counts as feasible.
         slots: problems that run at the same time; the others wait for a free slot. None: all. No result depends on it.
         record: keep the history of every problem in `solution.trace`.
-        by_kernels: violations of a solution are those that the kernels measure, as in closed loops; else PyTorch
-            evaluates all rows once more.
 
     Raises:
         InputError: a field out of its range.
@@ -69,7 +67,6 @@ class AugmentedLagrangian(Solver, named="solver"):
     violation_tolerance: Positive = ADMITTED
     slots: Count | None = None
     record: bool = False
-    by_kernels: bool = False
 
     def recording(self) -> AugmentedLagrangian:
         """The same solver, which keeps the history of every problem."""
@@ -79,14 +76,9 @@ class AugmentedLagrangian(Solver, named="solver"):
         """The same solver with at most `slots` problems at a time."""
         return replace(self, slots=slots)
 
-    def in_closed_loop(self, rounds: int) -> tuple[Self, Self]:
-        """The same solver twice. A planner flies on what its kernels measure: rows aren't evaluated by PyTorch, too."""
-        other = replace(self, by_kernels=True)
-        return other, other
-
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
-        session = Session(call, self.inner.as_printed, record=self.record, by_kernels=self.by_kernels)
+        session = Session(call, self.inner.as_printed, record=self.record)
         guidance = None if self.guidance is None else self.guidance.suited(session.call.problem)
         end = self.outer_loop(session.call, guidance, recorder=session.recorder)
         return session.finished(end, self.violation_tolerance, self.slots)
@@ -147,13 +139,18 @@ class OuterLoop:
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
         """Rollouts of the initial controls of the problems `rows`, and the statuses of invalid starts."""
         problem, U = self._part(rows), self.call.U0[rows]
-        X = open_loop(problem, U)
         if self.call.warm is None:
             multipliers = Multipliers.zero(problem, self.solver.initial_penalty)
         else:
             multipliers = take(self.call.warm, rows)
-        penalty = take(self.penalty, rows) if self.guidance is None else self.guidance.start(problem, X)
-        cost, merit = value(Lagrangian(problem, multipliers, penalty, not self.as_printed), X, U)
+        if self._guided:
+            X = open_loop(problem, U)
+            penalty = None if self.guidance is None else self.guidance.start(problem, X)
+            cost, merit = value(Lagrangian(problem, multipliers, penalty, not self.as_printed), X, U)
+        else:
+            penalty = take(self.penalty, rows) if self.guidance is None else None
+            lagrangian = Lagrangian(problem, multipliers, penalty, not self.as_printed)
+            X, cost, merit = kernels_of(problem).begun(lagrangian, U)
         none, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         state = State(
             rows=rows.clone(),

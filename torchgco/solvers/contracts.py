@@ -15,12 +15,13 @@ from torch import Tensor
 from torchgco.base import clock
 from torchgco.base.brief import Brief
 from torchgco.base.draws import DrawKey
-from torchgco.base.errors import InputError, StartWarning
+from torchgco.base.errors import NAMED, InputError, StartWarning
 from torchgco.base.options import Checked, Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
+from torchgco.base.status import Status
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
-from torchgco.kernels import cost_unit, current, interior_of, kernels_of, used
+from torchgco.kernels import copied_to, cost_unit, current, interior_of, kernels_of, on_cpu, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.alone import check_rows
@@ -28,6 +29,7 @@ from torchgco.problem.carried import carried_of
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.refusals import spared, warn_of_refusals
 from torchgco.solution import Solution
 from torchgco.solvers.ending import judged_between
 from torchgco.solvers.timing import Chooser, lifted_multipliers, solve_in_time
@@ -150,6 +152,7 @@ def check_states(X0: Any, problem: Problem) -> None:
     check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
 
 
+LEAST_SECONDS = 1e-9  # of a solve for which no time is left
 CHOOSING_TIME = "interior_point, gco, gco_exact, ipopt or fatrop, which choose the time"
 
 
@@ -199,7 +202,32 @@ class Solver(Brief, Checked):
                 mixes knots or problems.
         """
         check_untransformed("solve")
-        problem = current_problem(problem)
+        problem, limit = current_problem(problem), check_value(max_seconds, Seconds | None, "max_seconds")
+        if self.kernels is None and (there := on_cpu(problem)) is not None:
+            U0, ids, warm, X0 = copied_to((U0, ids, warm, X0), there.x0)
+            solution = self.solve(there, U0, seed, ids, warm, callback, max_seconds, X0)
+            account = solution.account and solution.account.asked(problem, None)
+            return replace(copied_to(solution, problem.x0), account=account)
+        ends = None if limit is None else clock.seconds() + limit
+
+        def run(problem: Problem) -> Solution:
+            left = None if ends is None else max(LEAST_SECONDS, ends - clock.seconds())
+            return self._found(problem, U0, seed, ids, warm, callback, left, X0)
+
+        return spared(problem, run)
+
+    def _found(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int,
+        ids: Tensor | None,
+        warm: Multipliers | None,
+        callback: Callback | None,
+        max_seconds: float | None,
+        X0: Tensor | None,
+    ) -> Solution:
+        """`solve`."""
         with computing_on(problem.x0.device):
             if problem.B == 0:  # nothing to trace code with
                 Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
@@ -252,9 +280,11 @@ class Solver(Brief, Checked):
 
     def _check(self, problem: Problem, call: Call, solution: Solution) -> None:
         """Raise InputError where code that branches on values has mixed knots or problems: only PyTorch's kernels call
-        such code."""
+        such code. Warn where it has refused states of problems that are lost."""
         if self.kernels is None and not call.problem.known.in_c:
             check_rows(problem, solution.X, solution.U, solution.times)
+            if lost := (solution.status == Status.NON_FINITE).nonzero().flatten().tolist():
+                warn_of_refusals(problem, f"a state of problem {', '.join(map(str, lost[:NAMED]))}")
 
     def choosing_time(self, problem: Problem) -> Chooser | None:
         """What solves problems with a free time, in the form `in_time`, for this solver; None: it can't."""
@@ -286,7 +316,8 @@ class Solver(Brief, Checked):
 
     def prepare(self, problem: Problem) -> Solver:
         """The solver with everything built that this batch needs, so that nothing is compiled beside the solve."""
-        whole = for_solvers(current_problem(problem), self.joins_knots)
+        problem = current_problem(problem)
+        whole = for_solvers(on_cpu(problem) or problem, self.joins_knots)
         with computing_on(whole.x0.device):
             self.announce(whole)
             if whole.B > 0 and kernels_of(whole) and whole.known.expects_interior:

@@ -41,18 +41,21 @@ def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Ten
 
 
 class Optimality(NamedTuple):
-    K: Tensor  # (B, N, m, n): u = U + K (x - X) + d
-    d: Tensor  # (B, N, m)
+    gains: Tensor  # [K d] (B, N, m, n+1): u = U + K (x - X) + d
     left: Tensor  # (B,): share of the cost that could still be saved; infinite where no backward pass succeeds
+    worst: Tensor  # (B,): the largest violation
+    sensitive: Tensor  # (B,) bool: whether rounding may decide where a rollout by PyTorch ends
 
 
-def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
-    """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers."""
+def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor, cost: Tensor | None = None) -> Optimality:
+    """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers.
+
+    Args:
+        cost: J_var (B,), where it is known.
+    """
     problem = lagrangian.problem
-    kernels = kernels_of(problem)
-    slack, run = kernels.slack(lagrangian, X, U), kernels.optimality_pass(lagrangian, X, U)
+    step, slack, worst, sensitive, run = kernels_of(problem).judged(lagrangian, X, U)
     mu = torch.zeros_like(slack)
-    step = run(mu)
     for i in range(TRIES):
         # Where a control costs nothing, or rounding spoils the Hessian, regularisation still gives gains.
         if not bool(step.failed.any()):
@@ -61,15 +64,15 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
     _, constant, least = cost_scale(problem)
-    cost = least + (problem.cost.total(X, U) - constant).abs()
+    cost = least + ((problem.cost.total(X, U) if cost is None else cost) - constant).abs()
     rounds = _rounds(lagrangian, X, U)
     if bool(((mu > 0) | rounds).any()):
         sizes = _sizes(problem, U)
         resists = 0.5 * mu * U.shape[1] * sizes.square().contiguous().sum(-1)  # what a change as large would cost by mu
         hidden = (resists > STATIONARY * cost) | rounds
         saved = torch.where(hidden, torch.maximum(saved, _by_slopes(problem, run, sizes)), saved)
-    G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
-    return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
+    gains = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
+    return Optimality(gains, torch.where(step.failed, torch.inf, saved / cost), worst, sensitive)
 
 
 def _rounds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
@@ -132,10 +135,15 @@ def judged_between(problem: Problem, X: Tensor, U: Tensor, status: Tensor) -> Te
     return status
 
 
-def fails_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """Whether trajectories touch an obstacle that can be measured between two knots, or miss a gate, (B,) bool."""
-    chords = all(one.has_chords for one in problem.obstacles)
-    bad = path_clearance(problem, X, U) < 0 if chords else torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+def fails_between(problem: Problem, X: Tensor, U: Tensor, clearance: Tensor | None = None) -> Tensor:
+    """Whether trajectories touch an obstacle that can be measured between two knots, or miss a gate, (B,) bool.
+
+    Args:
+        clearance: `path_clearance` (B,), where it is known.
+    """
+    bad = torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    if all(obstacles.has_chords for obstacles in problem.obstacles):
+        bad = (path_clearance(problem, X, U) if clearance is None else clearance) < 0
     for way in passages(problem, X, U).values():
         bad = bad | ~way.passed.all(-1)
     return bad

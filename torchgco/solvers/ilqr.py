@@ -13,9 +13,9 @@ from torchgco.base.status import STALLED, Status
 from torchgco.base.tree import Rows, put, take
 from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.line_search import LineSearch
-from torchgco.kernels import kernels_of, measured, open_loop, value
+from torchgco.kernels import kernels_of, measured
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.lagrangian.state import InnerState, Iterate, SolveEnd
+from torchgco.lagrangian.state import InnerState, Iterate, PassEnd, SolveEnd
 from torchgco.native.kept_descent import KeptDescent
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
@@ -80,25 +80,38 @@ def descend(
     A problem whose L_M isn't finite, or whose `start_is_clear` (B,) is False, stays as it starts. Tolerances are in the
     units of the problem's cost.
     """
-    problem = lagrangian.problem
-    X = open_loop(problem, U)
-    cost, merit = value(lagrangian, X, U)
+    problem, kernels = lagrangian.problem, kernels_of(lagrangian.problem)
     rows = torch.arange(problem.B, device=U.device)
     none = (torch.zeros_like(rows) for _ in range(3))
-    whole = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
-    status = start_status(problem, X, merit, start_is_clear)
+    if kernels.compiled and start_is_clear is None:
+        X, cost, merit = (
+            U.new_empty(problem.B, problem.N + 1, problem.n),
+            U.new_empty(problem.B),
+            U.new_empty(problem.B),
+        )
+        X[:, 0] = problem.x0
+        whole = InnerState(rows, X, U.clone(), cost, merit, torch.zeros_like(cost), *none)
+        status = _status(kernels.descend(lagrangian, whole, inner.descent, inner.max_iterations, begins=True))
+    else:
+        X, cost, merit = kernels.begun(lagrangian, U)
+        whole = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
+        status = start_status(problem, X, merit, start_is_clear)
     running, going = whole, status == Status.RUNNING
     while (stay := going.nonzero().flatten()).numel() > 0:
         if stay.numel() < going.numel():
             running, lagrangian = take(running, stay), lagrangian.take(stay)
         kernels = kernels_of(lagrangian.problem)
-        end = kernels.descend(lagrangian, running, inner.descent, inner.max_iterations)
-        reason = torch.where(end.stuck, int(Status.LINE_SEARCH_FAILED), int(Status.MAX_ITERATIONS))
-        now = torch.where(end.ended, reason, end.status)
+        now = _status(kernels.descend(lagrangian, running, inner.descent, inner.max_iterations))
         status[running.rows], going = now, now == Status.RUNNING
         if running is not whole:
             put(whole, running.rows, running)
     return whole, status
+
+
+def _status(end: PassEnd) -> Tensor:
+    """Why inner solves end, (B,); RUNNING where they don't."""
+    reason = torch.where(end.stuck, int(Status.LINE_SEARCH_FAILED), int(Status.MAX_ITERATIONS))
+    return torch.where(end.ended, reason, end.status)
 
 
 class RepeatedDescent:

@@ -11,8 +11,8 @@ from torchgco.base.options import Count, Positive
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
-from torchgco.kernels import cost_scale, expect_interior, followed, interior_of, measured, open_loop
-from torchgco.lagrangian.barrier import GOLDEN, ROUNDINGS, BarrierOptions, least_violation
+from torchgco.kernels import cost_scale, expect_interior, interior_of, measured, open_loop, rolled_out
+from torchgco.lagrangian.barrier import GOLDEN, BarrierOptions, least_violation
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.lagrangian.state import Iterate, SolveEnd
@@ -222,8 +222,8 @@ class InteriorPoint(Solver, named="solver"):
         scale = cost_scale(problem)
         fitted = Multipliers(multipliers, PENALTY * scale.unit)
         out = kernels.solve(problem, X, U, multipliers, X.new_full((problem.B,), mu), scale, how)
-        X, U = rolled_out(problem, X, U, out["gains"][..., :-1])
-        iterate = Iterate(X, U, fitted, problem.cost.total(X, U), measured(problem, X, U))
+        X, U, worst = rolled_out(problem, X, U, out["gains"])
+        iterate = Iterate(X, U, fitted, problem.cost.total(X, U), worst)
         put(end.best, rows, iterate)
         put(end.last, rows, iterate)
         status = out["status"].long()
@@ -242,31 +242,6 @@ def _beside(problem: Problem, U: Tensor, share: float) -> Tensor:
     """Controls (B, N, m) beside U, by an uneven share of their size or range, the same whatever the batch."""
     count = torch.arange(1, U[0].numel() + 1, dtype=U.dtype, device=U.device).view(U.shape[1:])
     return U + share * half_ranges(problem, U) * (2.0 * torch.frac(GOLDEN * count) - 1.0)
-
-
-def rolled_out(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """The rollout that a solve's states X (B, N+1, n) and controls U (B, N, m) stand for, by its gains K (B, N, m, n).
-
-    `followed`, whose feedback closes gaps; but where U alone leads to X up to rounding, there are none to close. Active
-    rows of a tight solution may be so stiff that rounding decides on the gains, which then make a change that counts of
-    one in the last bit: where they do, U alone.
-    """
-    rollout = followed(problem, X, U, K)
-    rows = (~_is_rounding(X, rollout[0])).nonzero().flatten()
-    if rows.numel() == 0:
-        return rollout
-    states, controls = X[rows], U[rows]
-    alone = followed(problem.take(rows), states, controls, torch.zeros_like(K[rows]))
-    better = _is_rounding(states, alone[0])
-    for whole, single in zip(rollout, alone, strict=True):
-        whole[rows[better]] = single[better]
-    return rollout
-
-
-def _is_rounding(old: Tensor, new: Tensor) -> Tensor:
-    """Whether trajectories (B, N+1, n) are one, up to rounding along the stages, (B,)."""
-    most = ROUNDINGS * torch.finfo(old.dtype).eps * old.abs().amax(1, keepdim=True)
-    return ((new - old).abs() <= most).flatten(1).all(-1)
 
 
 def guessed(call: Call) -> Iterate:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -35,17 +34,12 @@ class Session:
         given: the call in the user's units.
         as_printed: the form of the algorithm, as of `ILQR`.
         own_units: `call` has costs in their own units, as it has as printed; else in units of `Problem.cost_unit`, so
-            that scaling all weights changes no iterate. `unit` (B,) are these.
+            that scaling all weights changes no iterate. `unit` (B,) are these. The costs of ends are then PyTorch's.
         record: keep the history of every problem in `recorder`.
-        by_kernels: violations of what is returned are those that the solver's kernels measure, but for a user's rows;
-            else PyTorch measures them, whatever kernels say.
     """
 
-    def __init__(
-        self, given: Call, as_printed: bool = False, own_units: bool = False, record: bool = False,
-        by_kernels: bool = False,
-    ) -> None:  # fmt: skip
-        self.given, self.as_printed, self.by_kernels = given, as_printed, by_kernels
+    def __init__(self, given: Call, as_printed: bool = False, own_units: bool = False, record: bool = False) -> None:
+        self.given, self.as_printed, self._own_costs = given, as_printed, own_units
         self.call, self.unit = given, torch.ones_like(given.problem.x0[:, 0])
         if not (as_printed or own_units):
             self.call, self.unit = given.in_cost_units()
@@ -68,11 +62,9 @@ class Session:
             tolerance: violation up to which a trajectory is feasible.
             slots: problems whose gains are computed together; None: all.
         """
-        problem, best = self.call.problem, end.best
-        size = slots or max(1, problem.B)
-        parts = [self._optimality(best, slice(i, i + size)) for i in range(0, max(1, problem.B), size)]
-        K, d, left = (torch.cat(column) for column in zip(*parts, strict=True))
-        result, unlike = self._by_users_model(self.trajectories(end, lambda rows: K[rows]))
+        problem, looked = self.call.problem, self._looked_at(end.best, slots)
+        result, unlike = self._by_users_model(self._returned(end.best, looked.gains, looked.worst, looked.sensitive))
+        K, d, left = looked.gains[..., :-1].contiguous(), looked.gains[..., -1].contiguous(), looked.left
         left = torch.where(unlike, left.clamp(min=1.0), left)
         if problem.free_start is not None:  # stationary for this start alone, unless the interior point chose it
             left = torch.where(problem.free_start.any(-1) & ~is_over(end.status), left.clamp(min=1.0), left)
@@ -120,23 +112,35 @@ class Session:
             put(best, rows, new)
         return best, unlike
 
-    def trajectories(self, end: SolveEnd, gains: Callable[[Tensor], Tensor] | None = None) -> Iterate:
-        """The best trajectories in the user's units, as PyTorch's rollouts give them; their own costs and violations.
-
-        Args:
-            gains: those of some rows (b,), (b, N, m, n), where they are known.
-        """
+    def trajectories(self, end: SolveEnd) -> Iterate:
+        """The best trajectories in the user's units, as PyTorch's rollouts give them, with costs and violations."""
         best = end.best
-        known = gains or (lambda rows: self._optimality(best, rows).K)
-        X, U = reproducible(self.call.problem, best.X, best.U, known)
-        user = self.given.problem
-        cost = user.cost.total(X, U)
-        if self.by_kernels and not any(map(is_users, user.constraints)):
-            worst = measured(self.call.problem, X, U)
-        else:
+        seen = kernels_of(self.call.problem).judged(self._lagrangian(best), best.X, best.U)
+        return self._returned(best, seen.step.gains.movedim(0, 1), seen.worst, seen.sensitive)
+
+    def _returned(self, best: Iterate, gains: Tensor, worst: Tensor, sensitive: Tensor) -> Iterate:
+        """The same with gains (B, N, m, n+1), violations (B,) and sensitive ones (B,) that are known."""
+        user, X, U = self.given.problem, best.X, best.U
+        rows = sensitive.nonzero().flatten()
+        if rows.numel() > 0:
+            X, U = reproducible(self.call.problem, X, U, rows, gains[rows, ..., :-1])
+        cost = best.cost if rows.numel() == 0 and self._own_costs else user.cost.total(X, U)
+        if any(map(is_users, user.constraints)):
             worst = violation(user.constraints, X, U)
+        elif rows.numel() > 0:
+            worst = measured(self.call.problem, X, U)
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
+    def _looked_at(self, best: Iterate, slots: int | None = None) -> Optimality:
+        B, cost = self.call.problem.B, best.cost if self._own_costs else None
+        if slots is None or slots >= B:
+            return optimality(self._lagrangian(best), best.X, best.U, cost)
+        parts = [self._optimality(best, slice(i, i + slots)) for i in range(0, B, slots)]
+        return Optimality(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
     def _optimality(self, best: Iterate, rows: Rows) -> Optimality:
-        lagrangian = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, not self.as_printed)
-        return optimality(lagrangian, best.X[rows], best.U[rows])
+        cost = best.cost[rows] if self._own_costs else None
+        return optimality(self._lagrangian(best).take(rows), best.X[rows], best.U[rows], cost)
+
+    def _lagrangian(self, best: Iterate) -> Lagrangian:
+        return Lagrangian(self.call.problem, best.multipliers, None, not self.as_printed)

@@ -31,9 +31,9 @@ class Watcher:
         self.bar = None if verbose is False or not watched() else _bar(name, B)
 
     @property
-    def shows(self) -> bool:
-        """Whether there is anything to show, and so any use as a callback."""
-        return self.verbose or self.bar is not None
+    def callback(self) -> Watcher | None:
+        """Itself, where there is anything to show."""
+        return self if self.verbose or self.bar is not None else None
 
     def __call__(self, now: Progress) -> None:
         """Show a line, and move the bar."""

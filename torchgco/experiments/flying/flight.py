@@ -178,8 +178,8 @@ class SolveBatch(Batch):
         setup, self.shown = self.setup, 0
         task, layouts = self.tasks.of(places), self.tasks.layouts.take(places)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
-        if (told := short_horizons(task.problem)) is not None:
-            self.bar.write(f"{self.name}: {told.replace('problem', 'layout')} (scenario.stages)", sys.stderr)
+        if (warning := short_horizons(task.problem)) is not None:
+            self.bar.write(f"{self.name}: {warning.replace('problem', 'layout')} (scenario.stages)", sys.stderr)
         solution, seconds, together = self._solve(task.problem, task.U0, ids)
         self.show(layouts.count)
         statuses = [status.name for status in solution.statuses]

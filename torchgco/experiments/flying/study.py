@@ -111,8 +111,8 @@ def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
         missing = {name: store.missing(name) for name in study.solvers}
         count, left = study.layouts.count * len(study.solvers), sum(map(len, missing.values()))
         if collect and left:
-            told = f"{left} of {count} trials missing in {folder} (the same command flies them)"
-            raise InputError("study.jobs", "a share from every job", told)
+            state = f"{left} of {count} trials missing in {folder} (the same command flies them)"
+            raise InputError("study.jobs", "a share from every job", state)
         if left < count and not collect:
             say(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
         _fly(study, store, missing, study.setup.solver_name)
@@ -124,8 +124,8 @@ def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
     trials = store.table()
     if study.plan.explain:
         say(explained(study.tasks, trials))
-    elif study.setup.mission is None and (told := advised(study.tasks, trials)):
-        say(told)
+    elif study.setup.mission is None and (state := advised(study.tasks, trials)):
+        say(state)
     say(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
         say(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's

@@ -25,8 +25,8 @@ HEADING_COLUMN = "heading [rad]"
 NANO = 10**9
 
 
-def write_bag(place: Path, columns: Mapping[str, np.ndarray], position: Sequence[str], storage: Storage) -> None:
-    """Write a trajectory as the bag (a folder) `place`, in the place of one that lies there.
+def write_bag(folder: Path, columns: Mapping[str, np.ndarray], position: Sequence[str], storage: Storage) -> None:
+    """Write a trajectory as the bag (a folder) `folder`, in the place of one that lies there.
 
     Topics: /path, nav_msgs/Path; /trajectory, trajectory_msgs/MultiDOFJointTrajectory, with velocities and
     accelerations in the world's axes; /odometry, nav_msgs/Odometry for each sample, with velocities in the body's axes.
@@ -45,14 +45,14 @@ def write_bag(place: Path, columns: Mapping[str, np.ndarray], position: Sequence
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise InputError("--bag", "rosbags (`pip install torchgco[ros]`)", error) from None
-    if place.exists():
-        if not (place / "metadata.yaml").is_file():
-            raise InputError("--output", "a folder whose bags are rosbags", place)
-        shutil.rmtree(place)
-    place.parent.mkdir(parents=True, exist_ok=True)
+    if folder.exists():
+        if not (folder / "metadata.yaml").is_file():
+            raise InputError("--output", "a folder whose bags are rosbags", folder)
+        shutil.rmtree(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
     store = get_typestore(Stores.ROS2_HUMBLE)
     made = _Messages(store.types, columns, position)
-    with Writer(place, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag:
+    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag:
         for topic, messages in (
             ("/path", made.path()),
             ("/trajectory", made.trajectory()),

@@ -69,9 +69,9 @@ def explained(tasks: Tasks, trials: pd.DataFrame) -> str:
     by_layout = dict[int, str]()
     for rows in tasks.layouts.take(shown).alike():
         by_layout |= _told(tasks, np.array(shown)[rows])
-    told = [by_layout[number] for number in shown]
+    texts = [by_layout[number] for number in shown]
     more = f", the first {len(shown)} of them here" if len(failed) > len(shown) else ""
-    return "\n\n".join([f"\n{name} failed on {len(failed)} of {len(flown)} layouts{more}.", *told])
+    return "\n\n".join([f"\n{name} failed on {len(failed)} of {len(flown)} layouts{more}.", *texts])
 
 
 def _told(tasks: Tasks, places: np.ndarray) -> dict[int, str]:

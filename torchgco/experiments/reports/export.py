@@ -1,4 +1,5 @@
-"""`torchgco-export RUN`: the trajectories of a finished study, as CSV with names and units or as bags of ROS 2."""
+"""`torchgco-export RUN`: the trajectories of a finished study, as CSV with names and units or as bags of ROS 2; or the
+controller of one of its problems as C."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Positive, check_value
 from torchgco.dynamics import QuadrotorPlant
 from torchgco.dynamics.names import controls_of, states_of
+from torchgco.experiments.config.build import compose
 from torchgco.experiments.ending import say
 from torchgco.experiments.reports.bags import Storage, write_bag
 from torchgco.experiments.reports.finished import Study
@@ -22,6 +24,7 @@ from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS
+from torchgco.export import export_c
 from torchgco.problem.sampled import TIME_COLUMN, sample_times, sampled
 from torchgco.problem.times import times
 
@@ -139,9 +142,19 @@ def _between(moments: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarr
 
 
 def _parser() -> RunParser:
-    parser = RunParser(prog="torchgco-export", description="The trajectories of a study as CSV, or as bags of ROS 2.")
-    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
-    parser.add_argument("--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN")
+    parser = RunParser(
+        prog="torchgco-export",
+        description="The trajectories of a study as CSV, or as bags of ROS 2; or the controller of a problem as C.",
+    )
+    parser.add_argument(
+        "run",
+        metavar="RUN",
+        nargs="+",
+        help="the folder of a finished study; with --c also KEY=VALUE as torchgco takes them",
+    )
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, help=f"default: {FOLDER} in RUN; of KEY=VALUE a folder NAME"
+    )
     parser.add_argument("--rate", metavar="HZ", type=float, help="samples per second; default: as they were computed")
     parser.add_argument(
         "--layout", metavar="N", type=int, nargs="+", default=[], help="numbers of layouts; default: all"
@@ -149,6 +162,15 @@ def _parser() -> RunParser:
     parser.add_argument("--solver", metavar="NAME", nargs="+", default=[], help="default: all of the study")
     kinds = list(get_args(Storage))
     parser.add_argument("--bag", metavar="KIND", choices=kinds, help=f"bags of ROS 2 instead: {' or '.join(kinds)}")
+    parser.add_argument(
+        "--c", metavar="NAME", help="instead the C of this name that controls the first, or the only --layout"
+    )
+    parser.add_argument(
+        "--changes",
+        metavar="NAME",
+        nargs="*",
+        help="numbers that the C may be given between steps; default: all that can",
+    )
     return parser
 
 
@@ -158,10 +180,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.c is not None:
+        return _write_c(options)
+    if len(options.run) > 1:
+        raise InputError("RUN", "one folder; several words with --c", options.run[1])
+    run = Path(options.run[0])
     files = write_export(
-        options.run, options.output, options.rate, options.layout, options.solver, options.trust, options.bag
+        run, options.output, options.rate, options.layout, options.solver, options.trust, options.bag
     )  # fmt: skip
     parts = [file for path in files for file in ([path] if path.is_file() else path.iterdir())]
     size = sum(file.stat().st_size for file in parts)
-    say(f"{files[0].parent if files else options.run}: {len(files)} files, {size / 1e6:.2f} MB")
+    say(f"{files[0].parent if files else run}: {len(files)} files, {size / 1e6:.2f} MB")
+    return 0
+
+
+def _write_c(options: argparse.Namespace) -> int:
+    """The controller of one problem, of a study or of a configuration."""
+    words, name = options.run, options.c
+    if given := [word for word in ("rate", "solver", "bag") if getattr(options, word)]:
+        raise InputError(f"--{given[0]}", "not with --c", getattr(options, given[0]))
+    if len(words) == 1 and "=" not in words[0]:
+        folder, made = Path(words[0]), Study.read(Path(words[0]), options.trust)
+        missions, layouts, vehicle, output = made.missions, made.layouts, made.vehicle, folder / FOLDER / name
+    else:
+        setup = compose(words)
+        missions, vehicle, output = setup.mission is not None, setup.vehicle, Path(name)
+        layouts = setup.layouts(1 + max(options.layout, default=0))
+    if missions:
+        raise InputError("RUN", "single trajectories: a mission's planner searches, which C doesn't", "missions")
+    ids = layouts.ids.tolist()
+    layout = (options.layout or ids[:1])[0]
+    if len(options.layout) > 1 or layout not in ids:
+        raise InputError("--layout", f"one of {', '.join(map(str, ids[:20]))}", options.layout[-1])
+    problem = vehicle.task(layouts.take(np.array([ids.index(layout)]))).problem
+    written = export_c(problem, options.output or output, name, changes=options.changes)
+    size = sum(path.stat().st_size for path in written.iterdir())
+    say(f"{written}: {name}.c, {size / 1e6:.2f} MB")
     return 0

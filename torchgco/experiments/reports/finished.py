@@ -69,20 +69,20 @@ class Study:
             check_stages(folder, vehicle, layouts, MEASURED_AT_ONCE)
         return cls(folder, manifest, vehicle, layouts, trials, trust)
 
-    def flown(self, name: str, part: str) -> dict[str, np.ndarray]:
+    def flown(self, name: str, array: str) -> dict[str, np.ndarray]:
         """The numbers (L, ...) of each solver in one of its npz files.
 
         Raises:
             InputError: the file is damaged, takes more than it may, or has other solvers or layouts.
         """
-        held = readable(self.folder / name, read_npz, trust=self.trust)
+        arrays = readable(self.folder / name, read_npz, trust=self.trust)
         solvers, ids = list(self.manifest.solvers), self.layouts.ids
-        named = {"solver", "layout", part} <= held.keys() and held["solver"].tolist() == solvers
-        if not named or not np.array_equal(held["layout"], ids):
+        named = {"solver", "layout", array} <= arrays.keys() and arrays["solver"].tolist() == solvers
+        if not named or not np.array_equal(arrays["layout"], ids):
             raise damaged(self.folder / name, "has other layouts")
-        values = held[part]
+        values = arrays[array]
         if values.shape[:2] != (len(solvers), len(ids)) or values.dtype != np.float64:
-            raise damaged(self.folder / name, f"has {part} {values.shape}")
+            raise damaged(self.folder / name, f"has {array} {values.shape}")
         return dict(zip(solvers, values, strict=True))
 
     @property

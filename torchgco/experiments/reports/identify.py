@@ -71,37 +71,38 @@ def _logged(path: Path, trust: bool) -> tuple[Tensor, Tensor, float]:
     return x, u[:, :-1], dt
 
 
-def document(found: Identified, source: str) -> str:
+def document(fit: Identified, source: str) -> str:
     """The file of an airframe, for the group `vehicle`."""
-    met = [name for name, was in zip(("least", "greatest"), found.limits_met, strict=True) if was]
+    met = [name for name, was in zip(("least", "greatest"), fit.limits_met, strict=True) if was]
     lines = [
-        f"# Identified by torchgco {VERSION} from {found.samples} time steps: {source}.",
-        f"# Delay {found.delay:g} s; limits of thrust that were met: {' and '.join(met) or 'none'}; the fits leave",
-        f"# {found.thrust_error:.1%} of the roots of thrusts, {found.force_error:.1%} of forces, "
-        f"{found.torque_error:.1%} of torques.",
+        f"# Identified by torchgco {VERSION} from {fit.samples} time steps: {source}.",
+        f"# Delay {fit.delay:g} s; limits of thrust that were met: {' and '.join(met) or 'none'}; the fits leave",
+        f"# {fit.thrust_error:.1%} of the roots of thrusts, {fit.force_error:.1%} of forces, "
+        f"{fit.torque_error:.1%} of torques.",
         "_target_: torchgco.dynamics.Airframe",
     ]
-    for field in fields(found.airframe):
-        value = getattr(found.airframe, field.name)
+    for field in fields(fit.airframe):
+        value = getattr(fit.airframe, field.name)
         text = f"[{', '.join(str(list(row)) for row in value)}]" if field.name == "inertia" else str(value)
         lines.append(f"{field.name}: {text} # {AIRFRAME_UNITS[field.name]}")
     return "\n".join(lines) + "\n"
 
 
-def table(before: Airframe, found: Identified) -> str:
+def table(before: Airframe, identified: Identified) -> str:
     """What differs from the vehicle that was planned with, a line each."""
     lines = []
     for field in fields(before):
-        old, new = (getattr(frame, field.name) for frame in (before, found.airframe))
+        old, new = (getattr(frame, field.name) for frame in (before, identified.airframe))
         if field.name == "inertia":
             old, new = (tuple(row[i] for i, row in enumerate(J)) for J in (old, new))
         if old != new:
             shown = [", ".join(f"{v:.4g}" for v in (x if isinstance(x, tuple) else (x,))) for x in (old, new)]
             lines.append(f"{field.name:<20} {shown[0]:>24} -> {shown[1]} {AIRFRAME_UNITS[field.name].split(',')[0]}")
-    return "\n".join([*lines, f"{'delay':<20} {'':>24} -> {found.delay:g} s"])
+    return "\n".join([*lines, f"{'delay':<20} {'':>24} -> {identified.delay:g} s"])
 
 
-def _parser() -> RunParser:
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`torchgco-identify`. Returns the exit code, see `ended`."""
     parser = RunParser(
         prog="torchgco-identify",
         description="Identify mass, inertia, rotors, limits, delay and drag of a plant; write them as a vehicle.",
@@ -112,12 +113,7 @@ def _parser() -> RunParser:
     parser.add_argument("--run", metavar="RUN", type=Path, help="of a finished study: its missions, not test flights")
     parser.add_argument("--output", metavar="FILE", type=Path, default=VEHICLE_FILE, help=f"default: {VEHICLE_FILE}")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the test flights; default: 0")
-    return parser
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`torchgco-identify`. Returns the exit code, see `ended`."""
-    return _parser().run(arguments, _run)
+    return parser.run(arguments, _run)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -126,13 +122,13 @@ def _run(options: argparse.Namespace) -> int:
         raise InputError("--output", "FOLDER/vehicle/NAME.yaml, as --config-dir FOLDER vehicle=NAME reads it", path)
     if options.run is not None and options.words:
         raise InputError("command line", "--run RUN or KEY=VALUE, not both", options.words[0])
-    told = str(options.run) if options.run is not None else " ".join(options.words)
+    source = str(options.run) if options.run is not None else " ".join(options.words)
     recorded = flights(options.words, options.seed) if options.run is None else missions(options.run, options.trust)
     identified = identify(*recorded)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("--output", "a folder that can be made", error) from None
-    write(path, lambda file: file.write(document(identified, told or "plant=rotors").encode()))
+    write(path, lambda file: file.write(document(identified, source or "plant=rotors").encode()))
     say(f"{table(recorded[3], identified)}\n{path}: torchgco --config-dir {path.parent.parent} vehicle={path.stem} ...")
     return 0

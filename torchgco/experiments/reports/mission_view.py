@@ -33,11 +33,11 @@ QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # the plant
 SLOW_MAP = 100  # control periods from which on a bar shows how far a map is
 
 
-def missions(study: Study, found: Mapping[int, SearchPart]) -> Document:
+def missions(study: Study, searched: Mapping[int, SearchPart]) -> Document:
     """Flights in closed loop: the track at the control steps and, where few missions were flown, plans and maps.
 
     Args:
-        found: searches of first plans by the numbers of their missions.
+        searched: searches of first plans by the numbers of their missions.
     """
     log, document = _Log.read(study), None
     for places, problem in study.batches():
@@ -46,7 +46,7 @@ def missions(study: Study, found: Mapping[int, SearchPart]) -> Document:
             single = problem.take(torch.tensor([b]))
             flights = [log.flight(study, single, name, number, document.notes) for name in document.solvers]
             flown = [flight for flight in flights if flight is not None]
-            document.add(f"mission {number}", problem, b, flown, found.get(number))
+            document.add(f"mission {number}", problem, b, flown, searched.get(number))
     assert document is not None
     return document
 

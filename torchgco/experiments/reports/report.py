@@ -152,18 +152,14 @@ def _distributions(trials: pd.DataFrame, prefix: str) -> Drawings:
     return to_draw
 
 
-def _parser() -> RunParser:
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`torchgco-report`. Returns the exit code: 1 where rows can't be confirmed, and as `ended`."""
     parser = RunParser("torchgco-report", "One report on many studies.", "DIR")
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
-    return parser
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`torchgco-report`. Returns the exit code: 1 where rows can't be confirmed, and as `ended`."""
-    return _parser().run(arguments, _run)
+    return parser.run(arguments, _run)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -55,7 +55,7 @@ class Watched:
         region = advice.penalty
         if isinstance(region, GuideRegion):
             for row in region.is_active.nonzero().flatten().tolist():
-                center, radius = (part[row].detach().cpu().double().numpy() for part in (region.center, region.radius))
+                center, radius = (z[row].detach().cpu().double().numpy() for z in (region.center, region.radius))
                 here = np.isfinite(radius)
                 balls = np.column_stack((center[here], radius[here]))
                 self.seen.append(Guided(int(key.ids[row]), int(key.outer[row]), balls, center))

@@ -122,29 +122,29 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     manifest = read_manifest(folder / MANIFEST, whole=True)
     missions = manifest.configuration.get("mission") is not None
     layouts = readable(folder / LAYOUTS, read_layouts, trust=trust)
-    held = readable(folder / TRIALS, read_table, trust=trust)
+    kept = readable(folder / TRIALS, read_table, trust=trust)
     rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=TRIAL)
-    if not set(TRIAL) <= set(held.columns) or not held.set_index(TRIAL).index.sort_values().equals(rows.sort_values()):
+    if not set(TRIAL) <= set(kept.columns) or not kept.set_index(TRIAL).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
-    held = held.set_index(TRIAL)
+    kept = kept.set_index(TRIAL)
     vehicle = vehicle_of(manifest.configuration, trust)
     if not trust:
         check_stages(folder, vehicle, layouts, BATCH)
     try:
         judged = partial(_missions if missions else _trajectories, trust)
-        computed = judged(folder, vehicle, manifest, layouts, held).reindex(held.index)
+        computed = judged(folder, vehicle, manifest, layouts, kept).reindex(kept.index)
     except (InputError, KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError) and error.field in ("hydra.run.dir", "RUN"):
             raise
         raise damaged(folder, f"can't be simulated again ({error})") from None
-    computed = computed.join(_identity(manifest, vehicle, layouts, held.index))
-    differences = _differences(held, computed)
+    computed = computed.join(_identity(manifest, vehicle, layouts, kept.index))
+    differences = _differences(kept, computed)
     if differences.empty:  # nothing that can be computed differs: has any other column been changed?
         StudyFolder(folder, manifest).verify()
-    others = tuple(str(name) for name in held.columns if name not in computed.columns)
-    trials = Table(TRIALS, len(held), tuple(computed.columns), others, differences)
+    others = tuple(str(name) for name in kept.columns if name not in computed.columns)
+    trials = Table(TRIALS, len(kept), tuple(computed.columns), others, differences)
     # Of rows that differ, the tables that count them would differ, too.
-    counted, absent = _counted(folder, held.reset_index()) if differences.empty else ([], ())
+    counted, absent = _counted(folder, kept.reset_index()) if differences.empty else ([], ())
     return Verification(folder, (trials, *counted), absent, missions)
 
 
@@ -156,13 +156,13 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
         if not path.is_file():
             absent += [path.name] if len(table) else []
             continue
-        held, computed = readable(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
-        if list(held.columns) != list(computed.columns) or len(held) != len(computed):
-            shapes = (f"{len(frame)} rows, {len(frame.columns)} columns" for frame in (held, computed))
+        stored, computed = readable(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
+        if list(stored.columns) != list(computed.columns) or len(stored) != len(computed):
+            shapes = (f"{len(frame)} rows, {len(frame.columns)} columns" for frame in (stored, computed))
             differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
         else:
             keys = pd.MultiIndex.from_frame(computed[ROW_KEYS.intersection(computed.columns)])
-            differences = _differences(held.set_axis(keys), computed.set_axis(keys))
+            differences = _differences(stored.set_axis(keys), computed.set_axis(keys))
         tables.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
     return tables, tuple(absent)
 
@@ -178,7 +178,7 @@ def _identity(manifest: Manifest, vehicle: Vehicle, layouts: Layouts, index: pd.
 
 
 def _trajectories(
-    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
+    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, stored_rows: pd.DataFrame
 ) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
     arrays = readable(folder / SOLUTIONS, read_npz, trust=trust)
@@ -200,7 +200,7 @@ def _trajectories(
 
 
 def _missions(
-    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
+    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, stored_rows: pd.DataFrame
 ) -> pd.DataFrame:
     """The columns of missions that the log decides, by (solver, layout).
 
@@ -214,7 +214,7 @@ def _missions(
     flights = {key: rows for key, rows in log.groupby(["solver", "mission"], sort=False)}
     nearest = {name: _nearest(log[log["solver"] == name], layouts, contact, period) for name in manifest.solvers}
     rows = []
-    for (solver, layout), outcome in held["outcome"].items():
+    for (solver, layout), outcome in stored_rows["outcome"].items():
         steps = flights.get((solver, layout), log.iloc[:0])
         rows.append(
             {
@@ -237,24 +237,24 @@ def _nearest(log: pd.DataFrame, layouts: Layouts, contact: Contact, period: floa
     return dict(zip(ids, nearest.tolist(), strict=True))
 
 
-def _differences(held: pd.DataFrame, computed: pd.DataFrame) -> pd.DataFrame:
+def _differences(stored: pd.DataFrame, computed: pd.DataFrame) -> pd.DataFrame:
     differing = []
     for name in computed.columns:
-        values = held[name] if name in held.columns else pd.Series(pd.NA, index=held.index)
+        values = stored[name] if name in stored.columns else pd.Series(pd.NA, index=stored.index)
         differ = np.flatnonzero(~_equal(values, computed[name]))
-        differing += [(i, *held.index[i], name, values.iloc[i], computed[name].iloc[i]) for i in differ.tolist()]
-    names = [*held.index.names, "column", "held", "computed"]
+        differing += [(i, *stored.index[i], name, values.iloc[i], computed[name].iloc[i]) for i in differ.tolist()]
+    names = [*stored.index.names, "column", "held", "computed"]
     return pd.DataFrame(sorted(differing, key=lambda row: row[0]), columns=["row", *names])[names]
 
 
-def _equal(held: pd.Series, computed: pd.Series) -> np.ndarray:
+def _equal(stored: pd.Series, computed: pd.Series) -> np.ndarray:
     """Whether values agree: numbers within TOLERANCE, all else exactly; undefined values agree with each other."""
-    if computed.dtype == np.float64 and pd.api.types.is_numeric_dtype(held):
-        a, b = held.to_numpy(dtype=float, na_value=np.nan), computed.to_numpy()
+    if computed.dtype == np.float64 and pd.api.types.is_numeric_dtype(stored):
+        a, b = stored.to_numpy(dtype=float, na_value=np.nan), computed.to_numpy()
         with np.errstate(invalid="ignore"):  # infinite distances
             near = np.abs(a - b) <= TOLERANCE * np.maximum(1.0, np.abs(b))
         return near | (a == b) | (np.isnan(a) & np.isnan(b))
-    a, b = held.astype(object).to_numpy(), computed.astype(object).to_numpy()
+    a, b = stored.astype(object).to_numpy(), computed.astype(object).to_numpy()
     equal, known = pd.isna(a) & pd.isna(b), ~pd.isna(a) & ~pd.isna(b)
     equal[known] = (a[known] == b[known]).astype(bool)
     return equal

@@ -95,15 +95,6 @@ def told(row: Mapping[str, Any]) -> Rows:
     return [*entries, ("iterations", f"{row['iterations']:g}"), ("time", time)]
 
 
-def _parser() -> RunParser:
-    parser = RunParser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
-    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
-    parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {PAGE_NAME} in RUN")
-    words = "solve the layouts of these numbers again, and show the search"
-    parser.add_argument("--search", metavar="N", type=int, nargs="+", default=[], help=words)
-    return parser
-
-
 def write_view(folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False) -> Path:
     """Write the page of a finished study; returns where it lies. Raises InputError as `study_page` does."""
     path = folder / PAGE_NAME if output is None else output
@@ -116,7 +107,12 @@ def write_view(folder: Path, output: Path | None = None, searched: Sequence[int]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-view`. Returns the exit code, see `ended`."""
-    return _parser().run(arguments, _run)
+    parser = RunParser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
+    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
+    parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {PAGE_NAME} in RUN")
+    words = "solve the layouts of these numbers again, and show the search"
+    parser.add_argument("--search", metavar="N", type=int, nargs="+", default=[], help=words)
+    return parser.run(arguments, _run)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -44,13 +44,18 @@ def settings_of(configuration: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a resolved configuration that decides results, with the settings of all solvers that fly."""
+    """The part of a resolved configuration that decides results, with the settings of all solvers that fly.
+
+    The rows of a solver's table work in their order, of which `digest` takes no notice: it stands as a list.
+    """
+    passes = {name: settings.get("passes") for name, settings in solvers.items()}
     return {
         "scenario": configuration["scenario"],
         "model": {"vehicle": configuration["model"]["vehicle"]},
         "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
         "study": {"solvers": list(solvers)},
         "solvers": dict(solvers),
+        "order": {name: list(rows) for name, rows in passes.items() if isinstance(rows, Mapping)},
         **closed_loop(configuration),
     }
 
@@ -218,14 +223,14 @@ def _map_digests(field: DistanceField) -> dict[str, str]:
     return {name: _digest_of_array(value) for name, value in map_arrays(field).items()}
 
 
-def difference(held: Any, new: Any, path: str = "") -> str:
+def difference(stored: Any, new: Any, path: str = "") -> str:
     """The first key in which two identities differ, as 'key is this there, that here'."""
-    old, now = _parts(held), _parts(new)
+    old, now = _parts(stored), _parts(new)
     if old and now:
         for key in dict.fromkeys([*now, *old]):
             if old.get(key) != now.get(key):
                 return difference(old.get(key), now.get(key), f"{path}.{key}" if path else key)
-    return f"{path} is {_short(held)} there, {_short(new)} here"
+    return f"{path} is {_short(stored)} there, {_short(new)} here"
 
 
 def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:

@@ -102,8 +102,8 @@ class _Claim:
             raise InputError("hydra.run.dir", "a study that no other process flies", which)
         if not self.told and Path(f"{path}{HOLDER}").exists():  # not of who takes a share
             self.told = True
-            told = f"torchgco: {_holder(path)} flies this study in {self.folder}; waiting {PATIENCE:g} s for it at most"
-            print(told, file=sys.stderr, flush=True)
+            line = f"torchgco: {_holder(path)} flies this study in {self.folder}; waiting {PATIENCE:g} s for it at most"
+            print(line, file=sys.stderr, flush=True)
         time.sleep(POLL)
 
 
@@ -143,7 +143,7 @@ def _path(lock: BaseFileLock) -> Path:
 
 def _holder(path: Path) -> str:
     try:
-        told = json.loads(Path(f"{path}{HOLDER}").read_bytes())
-        return f"process {told['pid']} on {told['host']} (since {told['since']})"
+        holder = json.loads(Path(f"{path}{HOLDER}").read_bytes())
+        return f"process {holder['pid']} on {holder['host']} (since {holder['since']})"
     except (OSError, ValueError, TypeError, KeyError):
         return "another process"

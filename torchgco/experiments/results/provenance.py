@@ -110,11 +110,11 @@ def _keep(path: Path, entries: list[dict[str, Any]]) -> None:
 def _source() -> dict[str, Any]:
     """Version, and commit of a checkout. An installed package may lie in a checkout of something else: no commit."""
     root = PACKAGE.parent
-    told: dict[str, Any] = {"version": VERSION, "commit": None, "changed": None}
+    source: dict[str, Any] = {"version": VERSION, "commit": None, "changed": None}
     if (root / ".git").exists():
-        told["commit"] = _git(root, "rev-parse", "HEAD").strip()
-        told["changed"] = bool(_git(root, "status", "--porcelain", "--", "torchgco", "conf"))
-    return told
+        source["commit"] = _git(root, "rev-parse", "HEAD").strip()
+        source["changed"] = bool(_git(root, "status", "--porcelain", "--", "torchgco", "conf"))
+    return source
 
 
 def _git(root: Path, *words: str) -> str:

@@ -68,15 +68,15 @@ def _named(name: str) -> tuple[dict[str, Any], tuple[float, float]]:
     """The parameters of one of the package's own vehicles, rotors in our order, and its limits in rpm."""
     models = imported("drone_models.core", "drone-models", "crazyflow")
     try:
-        given = models.load_params("first_principles", name)
+        known = models.load_params("first_principles", name)
     except KeyError:
         from drone_models.drones import available_drones  # pyright: ignore[reportMissingImports]
 
         raise InputError("plant.drone_model", "one of " + ", ".join(available_drones), name) from None
-    made = {key: given[key] for key in parameters_of(Airframe())}
+    made = {key: known[key] for key in parameters_of(Airframe())}
     made["mixing_matrix"] = made["mixing_matrix"][:, FROM_FRONT_LEFT]
     _, b, c = made["rpm2thrust"]
-    low, high = ((math.sqrt(b**2 + 4.0 * c * given[limit]) - b) / (2.0 * c) for limit in ("thrust_min", "thrust_max"))
+    low, high = ((math.sqrt(b**2 + 4.0 * c * known[limit]) - b) / (2.0 * c) for limit in ("thrust_min", "thrust_max"))
     return made, (low, high)
 
 
@@ -89,21 +89,21 @@ def _steps(dt: float) -> Callable[..., list[np.ndarray]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # MuJoCo's, of names in a scene that isn't saved
         sim = lib.Sim(physics="first_principles", control="rotor_vel", integrator="rk4", freq=count / dt, device="cpu")
-    sim.step_pipeline = tuple(part for part in sim.step_pipeline if part is not lib.clip_floor_pos)
+    sim.step_pipeline = tuple(stage for stage in sim.step_pipeline if stage is not lib.clip_floor_pos)
     step, start = sim.build_step_fn(), sim.data
 
     @jax.jit
     def after(state: dict[str, Any], command: Any, parameters: dict[str, Any]) -> list[Any]:
-        one = lambda part: part[None, None]  # a world with a vehicle
+        batched = lambda value: value[None, None]  # a world with a vehicle
         data = start.replace(
-            states=start.states.replace(**{key: one(value) for key, value in state.items()}),
-            controls=start.controls.replace(rotor_vel=one(command)),
+            states=start.states.replace(**{key: batched(value) for key, value in state.items()}),
+            controls=start.controls.replace(rotor_vel=batched(command)),
             params=start.params.replace(**parameters),
         )
         end = step(data, n_steps=count).states
-        return [part[0, 0] for part in (end.pos, end.vel, end.quat, end.ang_vel, end.rotor_vel)]
+        return [array[0, 0] for array in (end.pos, end.vel, end.quat, end.ang_vel, end.rotor_vel)]
 
-    return lambda *given: [np.asarray(part, dtype=np.float64) for part in after(*given)]
+    return lambda *arguments: [np.asarray(array, dtype=np.float64) for array in after(*arguments)]
 
 
 def _package() -> Any:

@@ -26,8 +26,8 @@ class EachPlant(RotorPlant):
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
-        states, speeds, push = (part.detach().cpu().double().numpy() for part in (x, u, force))
-        errors = [column(part, x) for part in (self.mass_error, self.thrust_error, self.drag)]
+        states, speeds, push = (tensor.detach().cpu().double().numpy() for tensor in (x, u, force))
+        errors = [column(tensor, x) for tensor in (self.mass_error, self.thrust_error, self.drag)]
         deviations = torch.cat([error.expand(len(x), 1) for error in errors], dim=1).tolist()
         after = np.full(states.shape, np.nan)
         for i, state in enumerate(states):

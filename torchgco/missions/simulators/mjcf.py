@@ -42,10 +42,10 @@ def mjcf(airframe: Airframe, timestep: float = 0.005, mass: float | None = None)
     actuators = _add(root, "actuator")
     drawn = {"contype": 0, "conaffinity": 0, "group": 2}
     for i, (x, y) in enumerate(ROTOR_CORNERS, 1):
-        place, spin = (x * h, y * h, 0), k if i % 2 else -k
-        _add(body, "site", name=f"rotor{i}", pos=place)
-        _add(body, "geom", type="capsule", fromto=(0, 0, 0, *place), size=THIN * airframe.arm, **drawn)
-        _add(body, "geom", type="cylinder", pos=place, size=(0.4 * airframe.arm, THIN**2 * airframe.arm), **drawn)
+        corner, spin = (x * h, y * h, 0), k if i % 2 else -k
+        _add(body, "site", name=f"rotor{i}", pos=corner)
+        _add(body, "geom", type="capsule", fromto=(0, 0, 0, *corner), size=THIN * airframe.arm, **drawn)
+        _add(body, "geom", type="cylinder", pos=corner, size=(0.4 * airframe.arm, THIN**2 * airframe.arm), **drawn)
         _add(
             actuators, "general", name=f"thrust{i}", site=f"rotor{i}", gear=(0, 0, 1, 0, 0, spin), ctrllimited="true",
             ctrlrange=(airframe.thrust_min, airframe.thrust_max), dyntype="filter",
@@ -57,7 +57,7 @@ def mjcf(airframe: Airframe, timestep: float = 0.005, mass: float | None = None)
 
 def files_named(path: Path) -> list[Path]:
     """The files that a file of MJCF names, and those that these name: includes, meshes, textures; that are there."""
-    found, left = list[Path](), [path]
+    files, left = list[Path](), [path]
     while left:
         file = left.pop()
         try:
@@ -65,12 +65,12 @@ def files_named(path: Path) -> list[Path]:
         except (OSError, ElementTree.ParseError):  # no XML: a mesh, say
             continue
         compilers = [dict(compiler.attrib) for compiler in root.iter("compiler")]
-        folders = ["", *(held[name] for held in compilers for name in FOLDERS if name in held)]
-        for name in dict.fromkeys(named for part in root.iter() if (named := part.attrib.get("file"))):
+        folders = ["", *(attributes[name] for attributes in compilers for name in FOLDERS if name in attributes)]
+        for name in dict.fromkeys(named for element in root.iter() if (named := element.attrib.get("file"))):
             places = (file.parent / folder / name for folder in folders)
-            new = [place for place in places if place.is_file() and place not in (path, *found)]
-            found, left = [*found, *new], [*left, *new]
-    return found
+            new = [candidate for candidate in places if candidate.is_file() and candidate not in (path, *files)]
+            files, left = [*files, *new], [*left, *new]
+    return files
 
 
 def _add(parent: ElementTree.Element, tag: str, /, **values: object) -> ElementTree.Element:

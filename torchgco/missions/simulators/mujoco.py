@@ -134,10 +134,10 @@ class _Quadrotor:
         q, w = data.qpos[3:] / np.linalg.norm(data.qpos[3:]), data.qvel[3:].copy()
         R = rotation(q)
         p, v = data.qpos[:3] + R @ self.center, data.qvel[:3] + R @ np.cross(w, self.center)
-        held = data.act if self.model.na else np.clip(data.ctrl, self.low, self.high)
+        controls = data.act if self.model.na else np.clip(data.ctrl, self.low, self.high)
         if self.turned:
             q, w = _product(q, QUARTER_ROUND), np.array((w[1], -w[0], w[2]))
-        return np.concatenate((p, v, q, w, self.gains * held[self.order]))
+        return np.concatenate((p, v, q, w, self.gains * controls[self.order]))
 
 
 def _rotors(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -156,11 +156,11 @@ def _rotors(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
             "plant.model", "actuators that push along the body's z axis", f"forces {forces.round(6).tolist()}"
         )
     x, y, yaw = -torques[:, 1] / lift, torques[:, 0] / lift, torques[:, 2] / lift
-    found = [np.flatnonzero((x * a > 0) & (y * b > 0)) for a, b in ROTOR_CORNERS]
-    if any(len(one) != 1 for one in found):
+    by_corner = [np.flatnonzero((x * a > 0) & (y * b > 0)) for a, b in ROTOR_CORNERS]
+    if any(len(actuators) != 1 for actuators in by_corner):
         places = list(zip(x.round(3).tolist(), y.round(3).tolist(), strict=True))
         raise InputError("plant.model", "one rotor in each quadrant around the centre of mass", f"rotors at {places} m")
-    order = np.concatenate(found)
+    order = np.concatenate(by_corner)
     signs = np.sign(yaw[order])
     turned = bool(signs[0] < 0)
     if not np.array_equal(signs, np.array((1, -1, 1, -1)) * (-1 if turned else 1)):

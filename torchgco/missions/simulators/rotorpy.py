@@ -87,8 +87,8 @@ def _named(name: str) -> tuple[Any, np.ndarray]:
     last: Exception | None = None
     for path in (f"rotorpy.vehicles.{name}_params", name):
         try:
-            given = import_module(path).quad_params
-            vehicle = _multirotor()(given, integrator_kwargs=ODE_SOLVER)
+            parameters = import_module(path).quad_params
+            vehicle = _multirotor()(parameters, integrator_kwargs=ODE_SOLVER)
         except (ImportError, AttributeError, KeyError, ValueError, TypeError) as error:
             last = last or error
             continue

@@ -14,7 +14,7 @@
 static inline void along_sides(const V *box, const V *v, V *local) {
     const V *axes = box + DIM;
     for (int i = 0; i < DIM; i++) {
-        local[i] = (V){0};
+        local[i] = SET(0.0);
         for (int j = 0; j < DIM; j++) local[i] += axes[i * DIM + j] * v[j];
     }
 }

@@ -28,7 +28,7 @@ static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_
         ADD(square, away[i], away[i]);
         nearest[i] = i == 0 ? zero == zero : depth > deepest; /* the first of equals */
         deepest = tgco_choose(nearest[i], depth, deepest);
-        for (int a = 0; a < i; a++) nearest[a] &= ~nearest[i];
+        for (int a = 0; a < i; a++) nearest[a] &= NOT(nearest[i]);
     }
     I outside = square > zero, here = is_here(con, rows, radius, k);
     V distance = tgco_sqrt(tgco_choose(outside, square, SET(1.0)));
@@ -52,7 +52,7 @@ static inline I is_near(const Constraint *con, const Rows *rows, int64_t j, cons
         const V *bounds = rows->bound + (a * con->rows + j) * 2;
         far |= tgco_fabs(x[POSITION + a] - bounds[0]) > bounds[1];
     }
-    return ~far;
+    return NOT(far);
 }
 
 /* Whether one of the boxes first, ..., last - 1 may add anything in a lane: the knot is near it, or it has a multiplier
@@ -82,7 +82,7 @@ TGCO_APART V boxes_terms(
         for (int64_t j = first; j < last; j++) {
             if (!may_matter(con, rows, lam, pushed, j, x)) continue;
             V slopes[DIM], c = solid(con, rows, j, k, x, g ? slopes : 0);
-            if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
+            if (!any(NOT(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
             if (g) add_slopes(s, c, lam[j], slopes, g, H);
             else total += worth(s, 0, c, lam[j]);
         }

@@ -5,8 +5,6 @@
        of rows, w[0] of them    their values, their slopes (w[0], S), and the curvature of lam' c (S, S) */
 #include "dense.h"
 
-const int tgco_nx = NX, tgco_nu = NU, tgco_np = NP, tgco_nj = NJ, tgco_max_rows = MAX_ROWS;
-
 void model_step(const V *x, const V *u, const V *p, const double *w, V *next) { memcpy(next, p, NX * sizeof(V)); }
 
 void model_jacobian(const V *x, const V *u, const V *p, const double *w, V *f) { memcpy(f, p + NX, NJ * sizeof(V)); }

@@ -62,8 +62,8 @@ static inline V node(const Constraint *con, const Rows *rows, const V *const *at
     V distance;
     for (int l = 0; l < LANES; l++) {
         int64_t index = 0;
-        for (int a = 0; a < DIM; a++) index = index * lattice_size(con, a) + (int64_t)at[a][0][l];
-        distance[l] = rows->map[l][index];
+        for (int a = 0; a < DIM; a++) index = index * lattice_size(con, a) + (int64_t)LANE(at[a][0], l);
+        LANE(distance, l) = rows->map[l][index];
     }
     return distance;
 }
@@ -150,7 +150,7 @@ static inline int is_far_from_map(const Constraint *con, const Rows *rows, const
         at[a] = place + a;
         if (any(u != u)) return 0;
     }
-    return !any(~(node(con, rows, at) > rows->bound[REACH]));
+    return !any(NOT(node(con, rows, at) > rows->bound[REACH]));
 }
 
 /* The distance whose square, or the tangent to it nearer than the core, is `square`. */

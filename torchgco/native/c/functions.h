@@ -6,8 +6,6 @@
 #if TGCO_IS_DOUBLE
 #define TGCO_LN2_1 0x1.62e42fefa38p-1 /* short enough for its products with exponents to be exact */
 #define TGCO_LN2_2 0x1.ef35793c7673p-45
-#define TGCO_EXPONENT 52
-#define TGCO_BIAS 1023
 #define TGCO_FARTHEST 700.0 /* exp of it, and of its negative, are normal numbers */
 #define TGCO_NORMAL 0x1p-1022
 #define TGCO_LARGEST 0x1.fffffffffffffp+1023
@@ -15,8 +13,6 @@
 #else
 #define TGCO_LN2_1 0x1.62e4p-1
 #define TGCO_LN2_2 0x1.7f7d1cf7ap-20
-#define TGCO_EXPONENT 23
-#define TGCO_BIAS 127
 #define TGCO_FARTHEST 80.0
 #define TGCO_NORMAL 0x1p-126
 #define TGCO_LARGEST 0x1.fffffep+127
@@ -26,7 +22,7 @@
 /* `near`, and where `far` is true what the C library makes of x. */
 #define TGCO_FROM_LIBRARY(name) \
     TGCO_APART V tgco_distant_##name(V x, V near, I far) { \
-        for (int i = 0; i < LANES; i++) if (far[i]) near[i] = TGCO_MATH(name)(x[i]); \
+        for (int i = 0; i < LANES; i++) if (LANE(far, i)) LANE(near, i) = TGCO_MATH(name)(LANE(x, i)); \
         return near; \
     }
 
@@ -45,20 +41,20 @@ static inline V tgco_split(V x, V *rest) {
     p = tgco_fused(p, r, SET(1.0 / 720.0)); p = tgco_fused(p, r, SET(1.0 / 120.0)); p = tgco_fused(p, r, SET(1.0 / 24.0));
     p = tgco_fused(p, r, SET(1.0 / 6.0)); p = tgco_fused(p, r, SET(0.5));
     *rest = tgco_fused(p * r, r, r);
-    return (V)(((I)t + TGCO_BIAS) << TGCO_EXPONENT); /* the lowest bits of t are those of k */
+    return tgco_power_of_two(t); /* the lowest bits of t are those of k */
 }
 
 TGCO_FROM_LIBRARY(exp)
 static inline V tgco_exp(V x) {
     V rest, power = tgco_split(x, &rest), value = tgco_fused(power, rest, power);
-    I far = ~(tgco_fabs(x) <= SET(TGCO_FARTHEST));
+    I far = NOT(tgco_fabs(x) <= SET(TGCO_FARTHEST));
     return tgco_any(far) ? tgco_distant_exp(x, value, far) : value;
 }
 
 TGCO_FROM_LIBRARY(expm1)
 static inline V tgco_expm1(V x) {
     V rest, power = tgco_split(x, &rest), value = tgco_fused(power, rest, power - SET(1.0));
-    I far = ~(tgco_fabs(x) <= SET(TGCO_FARTHEST));
+    I far = NOT(tgco_fabs(x) <= SET(TGCO_FARTHEST));
     return tgco_any(far) ? tgco_distant_expm1(x, value, far) : value;
 }
 
@@ -73,9 +69,7 @@ static inline V tgco_tanh(V x) {
 /* The logarithm of a normal number and a small `more`: with m 2^e = x, m about 1, f = m - 1 and s = f / (2 + f), it is
    e ln 2 + f - s (f - 2 s^2/3 - 2 s^4/5 - ...) + more. */
 static inline V tgco_logarithm(V x, V more) {
-    I bits = (I)x, e = (bits - (I)SET(0x1.6a09e667f3bcdp-1)) >> TGCO_EXPONENT; /* m begins at the root of a half */
-    V f = (V)(bits - (e << TGCO_EXPONENT)) - SET(1.0), s = f / (SET(2.0) + f), z = s * s;
-    V power = (V)(e + (I)SET(TGCO_WHOLE)) - SET(TGCO_WHOLE);
+    V power, f = tgco_middle(x, &power) - SET(1.0), s = f / (SET(2.0) + f), z = s * s;
 #if TGCO_IS_DOUBLE
     V p = SET(2.0 / 21.0);
     p = tgco_fused(p, z, SET(2.0 / 19.0)); p = tgco_fused(p, z, SET(2.0 / 17.0)); p = tgco_fused(p, z, SET(2.0 / 15.0));
@@ -89,17 +83,10 @@ static inline V tgco_logarithm(V x, V more) {
     return tgco_fused(power, SET(TGCO_LN2_1), f + tgco_fused(-s, bend, low));
 }
 
-/* m in [1, 2) and e of a normal number m 2^e. */
-static inline V tgco_mantissa(V x) { return (V)(((I)x & ~(I)SET(-INFINITY)) | (I)SET(1.0)); }
-static inline V tgco_exponent(V x) {
-    I e = (((I)x >> TGCO_EXPONENT) & (2 * TGCO_BIAS + 1)) - TGCO_BIAS;
-    return (V)(e + (I)SET(TGCO_WHOLE)) - SET(TGCO_WHOLE);
-}
-
 TGCO_FROM_LIBRARY(log)
 static inline V tgco_log(V x) {
     V value = tgco_logarithm(x, SET(0.0));
-    I far = ~((x >= SET(TGCO_NORMAL)) & (x <= SET(TGCO_LARGEST)));
+    I far = NOT((x >= SET(TGCO_NORMAL)) & (x <= SET(TGCO_LARGEST)));
     return tgco_any(far) ? tgco_distant_log(x, value, far) : value;
 }
 
@@ -108,7 +95,7 @@ TGCO_FROM_LIBRARY(log1p)
 static inline V tgco_log1p(V x) {
     V one = SET(1.0), u = one + x, lost = tgco_choose(x > one, one - (u - x), x - (u - one));
     V value = tgco_logarithm(u, lost / u);
-    I far = ~((x > -one) & (x <= SET(TGCO_LARGEST)));
+    I far = NOT((x > -one) & (x <= SET(TGCO_LARGEST)));
     return tgco_any(far) ? tgco_distant_log1p(x, value, far) : value;
 }
 
@@ -117,6 +104,6 @@ static inline V tgco_tan(V x) {
     V sine, cosine;
     I quarter = tgco_series(x, &sine, &cosine), odd = (quarter & 1) != 0;
     V value = tgco_choose(odd, -cosine, sine) / tgco_choose(odd, sine, cosine);
-    I far = ~(tgco_fabs(x) <= SET(TGCO_FAR));
+    I far = NOT(tgco_fabs(x) <= SET(TGCO_FAR));
     return tgco_any(far) ? tgco_distant_tan(x, value, far) : value;
 }

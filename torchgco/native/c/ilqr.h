@@ -5,13 +5,20 @@
 #include "memory.h"
 #include "passes.h"
 
+/* The numbers first, ..., last - 1 of problems, to be freed; NULL without memory. */
+static int64_t *in_order(int64_t first, int64_t last) {
+    int64_t *number = malloc((last - first + 1) * sizeof *number);
+    for (int64_t i = 0; number && first + i < last; i++) number[i] = first + i;
+    return number;
+}
+
 #define ROUNDED 1e-6 /* share of a sum that rounding can't reach */
 
 /* Commit the trial of lane from[l] to lane l where `won`. */
 static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
     int64_t N = s->of->N;
     I index;
-    for (int l = 0; l < LANES; l++) index[l] = from[l];
+    for (int l = 0; l < LANES; l++) LANE(index, l) = from[l];
     for (int64_t i = 0; i < (N + 1) * NX; i++) s->X[i] = tgco_choose(won, tgco_permuted(s->Xn[i], index), s->X[i]);
     for (int64_t i = 0; i < N * NU; i++) s->U[i] = tgco_choose(won, tgco_permuted(s->Un[i], index), s->U[i]);
     s->cost = tgco_choose(won, tgco_permuted(cost, index), s->cost);
@@ -24,7 +31,7 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
     const Options *o = &s->of->options;
     int replicas = s->of->replicas;
     int64_t landed[LANES];
-    I open = moving, done = moving & ~moving;
+    I open = moving, done = moving & NOT(moving);
     /* No trial is accepted that doesn't lower L_M, which terms that are left lower by at most `floor`, and rounding. */
     V size = tgco_fabs(s->merit) + s->floor, most = s->merit + s->floor + SET(ROUNDED) * size;
     *shortest = SET(0.0);
@@ -33,8 +40,8 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
         for (int l = 0; l < LANES; l++) {
             int64_t rung = s->rung[l] + tried + l % replicas;
             int last = rung + 1 >= o->rungs; /* its L_M counts, whatever it is */
-            alpha[l] = o->ladder[last ? o->rungs - 1 : rung];
-            enough[l] = !open[l] ? -INFINITY : last || !s->of->bounded ? INFINITY : most[l];
+            LANE(alpha, l) = o->ladder[last ? o->rungs - 1 : rung];
+            LANE(enough, l) = !LANE(open, l) ? -INFINITY : last || !s->of->bounded ? INFINITY : LANE(most, l);
         }
         roll(s, knot_value, alpha, enough, &cost, &merit);
         V ratio = (merit - s->merit) / (alpha * linear + SET(0.5) * alpha * alpha * quadratic);
@@ -46,25 +53,25 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
         I won;
         for (int e = 0; e < LANES; e += replicas) {
             int winner = -1;
-            for (int l = e; l < e + replicas && winner < 0; l++) if (good[l]) winner = l;
+            for (int l = e; l < e + replicas && winner < 0; l++) if (LANE(good, l)) winner = l;
             for (int l = e; l < e + replicas; l++) {
                 from[l] = winner < 0 ? l : winner;
-                won[l] = winner < 0 ? 0 : -1;
+                LANE(won, l) = winner < 0 ? 0 : -1;
             }
             /* Where a problem refuses all rungs, its last lane holds the last rung. */
-            for (int l = e; l < e + replicas; l++) (*shortest)[l] = (*shortest)[e + replicas - 1];
+            for (int l = e; l < e + replicas; l++) LANE(*shortest, l) = LANE(*shortest, e + replicas - 1);
         }
         if (any(won)) commit(s, won, from, alpha, cost, merit);
-        open &= ~won;
+        open &= NOT(won);
         done |= won;
         for (int l = 0; l < LANES; l++) {
-            if (won[l]) landed[l] = s->rung[l] + tried + from[l] % replicas;
-            else if (s->rung[l] + tried + replicas >= o->rungs) open[l] = 0;
+            if (LANE(won, l)) landed[l] = s->rung[l] + tried + from[l] % replicas;
+            else if (s->rung[l] + tried + replicas >= o->rungs) LANE(open, l) = 0;
         }
     }
     /* The next search begins a little above where this one ended; after one that found nothing, at a full step. */
     for (int l = 0; l < LANES; l++)
-        if (moving[l]) s->rung[l] = done[l] && o->back >= 0 && landed[l] > o->back ? landed[l] - o->back : 0;
+        if (LANE(moving, l)) s->rung[l] = LANE(done, l) && o->back >= 0 && landed[l] > o->back ? landed[l] - o->back : 0;
     return done;
 }
 
@@ -76,25 +83,25 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     s->used = s->mu_r;
     backward(s, knot_expand, NULL, &linear, &squares, &lowest);
     V quadratic = -linear - s->mu_r * squares, before = s->mu_r;
-    I failed = ~(lowest > zero) & running;
+    I failed = NOT(lowest > zero) & running;
     V expected = tgco_fabs(linear + SET(0.5) * quadratic);
     I settled = expected <= SET(o->rounding) * tgco_fabs(old);
-    I moving = running & ~failed & ~settled;
+    I moving = running & NOT(failed) & NOT(settled);
     for (int l = 0; l < LANES; l++) status[l] = RUNNING;
     if (any(failed)) {
         V higher = s->mu_r * SET(o->regularisation_growth);
         higher = tgco_choose(higher < SET(o->regularisation_first), SET(o->regularisation_first), higher);
         s->mu_r = tgco_choose(failed, higher, s->mu_r);
         I sound = is_finite(s, knot_expand);
-        for (int l = 0; l < LANES; l++) if (failed[l]) {
-            if (s->mu_r[l] > o->regularisation_max) status[l] = NOT_POSITIVE_DEFINITE;
-            if (!sound[l]) status[l] = NON_FINITE;
+        for (int l = 0; l < LANES; l++) if (LANE(failed, l)) {
+            if (LANE(s->mu_r, l) > o->regularisation_max) status[l] = NOT_POSITIVE_DEFINITE;
+            if (!LANE(sound, l)) status[l] = NON_FINITE;
         }
     }
     I accepted = search(s, moving, linear, quadratic, &shortest);
-    *refused = moving & ~accepted;
-    s->inner += tgco_truth(running & ~failed);
-    s->made += tgco_truth(running & ~failed);
+    *refused = moving & NOT(accepted);
+    s->inner += tgco_truth(running & NOT(failed));
+    s->made += tgco_truth(running & NOT(failed));
     /* mu_r of the next iteration */
     V next = zero;
     if (o->damping > 0) {
@@ -103,20 +110,20 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
         up = tgco_choose(up > SET(o->regularisation_max), zero, up);
         next = tgco_choose(*refused, up, tgco_choose(down < SET(o->damping), zero, down));
     }
-    s->mu_r = tgco_choose(failed | ~running, s->mu_r, next);
+    s->mu_r = tgco_choose(failed | NOT(running), s->mu_r, next);
     I stuck = *refused & (s->mu_r == zero);
     V change = tgco_fabs(s->merit - old);
     V larger = tgco_choose(change > expected, change, expected);
-    I flat = (larger <= SET(o->tolerance) * tgco_fabs(s->merit)) & ~(before > SET(o->damping));
-    *converged = running & ~failed & (settled | (moving & ~*refused & (flat | (change < SET(o->absolute_tolerance)))));
-    *lost = *refused & ~(shortest <= SET(o->lost) * tgco_fabs(old));
+    I flat = (larger <= SET(o->tolerance) * tgco_fabs(s->merit)) & NOT(before > SET(o->damping));
+    *converged = running & NOT(failed) & (settled | (moving & NOT(*refused) & (flat | (change < SET(o->absolute_tolerance)))));
+    *lost = *refused & NOT(shortest <= SET(o->lost) * tgco_fabs(old));
     *lost &= s->inner <= SET(1.0);
-    if (o->damping == 0) *lost = *lost & ~*lost;
-    I over = running & ~failed & (*converged | stuck | (s->inner >= SET((double)o->max_iterations)));
+    if (o->damping == 0) *lost = *lost & NOT(*lost);
+    I over = running & NOT(failed) & (*converged | stuck | (s->inner >= SET((double)o->max_iterations)));
     *refused = stuck;
-    for (int l = 0; l < LANES; l++) if (over[l]) status[l] = ENDED;
+    for (int l = 0; l < LANES; l++) if (LANE(over, l)) status[l] = ENDED;
     I limit = running & (*lost | (s->made >= SET((double)s->of->limit)));
-    for (int l = 0; l < LANES; l++) if (status[l] != RUNNING) limit[l] = -1;
+    for (int l = 0; l < LANES; l++) if (status[l] != RUNNING) LANE(limit, l) = -1;
     return limit & running;
 }
 
@@ -130,7 +137,7 @@ static void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
         int64_t element = number[next < count ? next : 0];
         for (int l = e; l < e + replicas; l++) {
             enter(s, l, element);
-            running[l] = next < count ? -1 : 0;
+            LANE(running, l) = next < count ? -1 : 0;
         }
         if (next < count) next++;
     }
@@ -143,7 +150,7 @@ static void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
             leave(s, e, status[e], converged[e] != 0, refused[e] != 0, lost[e] != 0);
             for (int l = e; l < e + replicas; l++) {
                 if (next < count) enter(s, l, number[next]);
-                else running[l] = 0;
+                else LANE(running, l) = 0;
             }
             if (next < count) next++;
         }

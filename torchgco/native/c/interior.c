@@ -1,8 +1,7 @@
 /* A primal-dual interior point with a filter (Waechter and Biegler 2006) for problems side by side: states, controls
    and slacks move together, and the lanes are kept filled. solvers/interior says what it does. */
 
-#define _POSIX_C_SOURCE 199309L /* a clock that nobody sets */
-#include <time.h>
+#include "clock.h"
 #include "interior_fixed.h"
 #include "interior_search.h"
 
@@ -26,7 +25,7 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     V one = SET(1.0), base = most(theta, one);
     k->highest = tgco_choose(of, SET(how->theta_max_fact) * base, k->highest);
     k->lowest = tgco_choose(of, SET(how->theta_min_fact) * base, k->lowest);
-    for (int l = 0; l < LANES; l++) if (of[l]) k->pairs[l] = 0;
+    for (int l = 0; l < LANES; l++) if (LANE(of, l)) k->pairs[l] = 0;
 }
 
 /* Sizes of bounds join those of their variables. */
@@ -34,7 +33,7 @@ static void measure_bounds(const Barrier *t, V *size) {
     const Lanes *s = &t->lanes;
     for (int64_t i = 0; i < s->of->constraints; i++) {
         const Constraint *con = s->of->constraint + i;
-        if (con->kind != BOUNDS) continue;
+        if (!is_kind(con, BOUNDS)) continue;
         for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
             V limit = tgco_fabs(at(s->rows[i].bound, &con->bound, con->place[k])[j]);
             int v = con->variable[j];
@@ -98,7 +97,7 @@ static V steepest(const Barrier *t, V *plain) {
 
 /* The barrier parameter at which lane l begins: at least that at which it ends, where the barrier stays. */
 static double first_barrier(const Barrier *t, int l) {
-    double own = t->how->barrier[t->lanes.element[l]], end = t->how->smoothing * t->scale[l];
+    double own = t->how->barrier[t->lanes.element[l]], end = t->how->smoothing * LANE(t->scale, l);
     return own > end ? own : end;
 }
 
@@ -108,17 +107,17 @@ static double first_barrier(const Barrier *t, int l) {
    leads to counts, too, and a slack as 1 at least: at a bound nearby small slacks hold a step. */
 static void hold_loose(Barrier *t, I of) {
     const Lanes *s = &t->lanes;
-    I some = of & ~of;
+    I some = of & NOT(of);
     measure_costs(t);
     for (int64_t i = 0; i < s->of->constraints; i++) {
         const Constraint *con = s->of->constraint + i;
-        if (con->kind != BOUNDS) continue;
+        if (!is_kind(con, BOUNDS)) continue;
         for (int64_t k = 0; k <= s->of->N; k++) for (int j = 0; con->place[k] != NOWHERE && j < con->rows; j++) {
             int v = con->variable[j];
             int64_t q = row_of(t, i, k) + j;
             V costs = v < NX ? t->dx[k * NX + v] : t->du[k * NU + v - NX];
-            I loose = of & ~t->out[q] & (costs * most(t->s[q], SET(1.0)) <= SET(t->how->held));
-            if (k == 0 && v < NX) loose &= t->is_free ? tgco_is(t->is_free[v]) : of & ~of; /* nothing moves a given one */
+            I loose = of & NOT(t->out[q]) & (costs * most(t->s[q], SET(1.0)) <= SET(t->how->held));
+            if (k == 0 && v < NX) loose &= t->is_free ? tgco_is(t->is_free[v]) : of & NOT(of); /* nothing moves a given one */
             t->z[q] = tgco_choose(loose, SET(1.0), t->z[q]);
             some |= loose;
         }
@@ -140,16 +139,16 @@ static void begin(Barrier *t, Track *k, I of) {
     k->least = tgco_choose(of, SET(INFINITY), k->least);
     k->left = tgco_choose(of, SET(INFINITY), k->left);
     t->shift = tgco_choose(of, zero, t->shift); /* gains of a problem that ends at once don't know the lane's last one */
-    k->restoring &= ~of; k->watching &= ~of;
-    k->relaxed &= ~of; k->presses &= ~of;
+    k->restoring &= NOT(of); k->watching &= NOT(of);
+    k->relaxed &= NOT(of); k->presses &= NOT(of);
     if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
     t->soft = tgco_choose(of, SET(how->jacobian_regularization_value), t->soft);
-    for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
+    for (int l = 0; l < LANES; l++) if (LANE(of, l)) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         for (int64_t j = 0; j < con->knots * con->rows; j++)
             for (int l = 0; l < LANES; l++)
-                if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
+                if (LANE(of, l)) LANE(t->z[t->first[i] + j], l) = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
     ask(t, DERIVATIVES, t->live, t->lanes.X, t->lanes.U);
     largest = steepest(t, &plain);
@@ -157,7 +156,7 @@ static void begin(Barrier *t, Track *k, I of) {
     I scaled = of & tgco_finite(scale) & (largest > zero);
     t->scale = tgco_choose(scaled, scale, t->scale);
     t->raised = tgco_choose(scaled, plain / largest, t->raised);
-    for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = first_barrier(t, l);
+    for (int l = 0; l < LANES; l++) if (LANE(of, l)) LANE(t->mu, l) = first_barrier(t, l);
     settle(t, k, of, 1);
     if (how->warm) {
         if (t->some_out) join_multipliers(t, of);
@@ -181,11 +180,11 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
     V base = most(dual, primal), usual = SET(how->tol * how->mu_floor);
     V smallest = tgco_choose(k->presses, SET(how->mu_min), usual);
     if (how->smoothing > 0) smallest = SET(how->smoothing) * t->scale;
-    I lowered = running & ~running;
+    I lowered = running & NOT(running);
     for (int tries = 0; tries < LONGEST_FALL; tries++) {
         V error = most(base, complementarity(t, t->mu) * scale_z);
         I low = (error <= SET(how->barrier_tol_factor) * t->mu) & (t->mu > smallest);
-        low &= running & ~k->restoring & ~k->watching;
+        low &= running & NOT(k->restoring) & NOT(k->watching);
         if (!any(low)) break;
         V slow = SET(how->mu_linear_decrease_factor) * t->mu, fast = t->mu * tgco_sqrt(t->mu);
         V next = most(smallest, least(slow, fast));
@@ -195,7 +194,7 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
     if (!any(lowered)) return;
     V cost = values(t, lowered, t->lanes.X, t->lanes.U, t->cn, t->gapn);
     k->phi = tgco_choose(lowered, cost - t->mu * logarithms(t, t->s), k->phi);
-    for (int l = 0; l < LANES; l++) if (lowered[l]) k->pairs[l] = 0;
+    for (int l = 0; l < LANES; l++) if (LANE(lowered, l)) k->pairs[l] = 0;
 }
 
 /* Factors of all lanes, their curvature shifted where it must be, those of the lanes `anew` from the least shift on;
@@ -203,9 +202,9 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
 static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
     const Interior *how = t->how;
     t->shift = tgco_choose(anew, k->forced, t->shift);
-    I lost = running & ~running, open = running & anew; /* others had this shift before */
+    I lost = running & NOT(running), open = running & anew; /* others had this shift before */
     for (;;) {
-        I bad = open & ~factor(t, open);
+        I bad = open & NOT(factor(t, open));
         if (!any(bad)) break;
         V before = k->last, first = SET(how->first_hessian_perturbation), floor = SET(how->min_hessian_perturbation);
         V start = tgco_choose(before == SET(0.0), first, most(floor, before * SET(how->perturb_dec_fact)));
@@ -213,9 +212,9 @@ static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
         V next = tgco_choose(t->shift == SET(0.0), start, growth * t->shift);
         t->shift = tgco_choose(bad, next, t->shift);
         lost |= bad & (t->shift > SET(how->max_hessian_perturbation));
-        open = bad & ~lost;
+        open = bad & NOT(lost);
     }
-    return running & ~lost;
+    return running & NOT(lost);
 }
 
 /* Where equalities contradict each other to first order, their multipliers explode: a softer step is taken there. */
@@ -239,16 +238,16 @@ static I soften(Barrier *t, const Track *k, I moving) {
    nothing to close, they start anew with new multipliers and a shift. Returns the lanes that give up. */
 static I recover(Barrier *t, Track *k, I failed) {
     const Interior *how = t->how;
-    I renewed = failed & ~failed, lost = renewed;
+    I renewed = failed & NOT(failed), lost = renewed;
     for (int l = 0; l < LANES; l++) {
-        if (!failed[l]) continue;
-        if (++k->failures[l] > how->failures) { lost[l] = -1; continue; }
-        int seeks = k->theta[l] > how->constr_viol_tol && !k->restoring[l];
-        double harder = how->forced_growth * k->forced[l];
-        k->forced[l] = harder < how->shift_recovery ? how->shift_recovery : harder;
-        if (seeks) { k->restoring[l] = -1; k->entered[l] = k->theta[l]; t->objective[l] = 0; }
-        else { k->restoring[l] = 0; t->objective[l] = 1; }
-        renewed[l] = -1;
+        if (!LANE(failed, l)) continue;
+        if (++k->failures[l] > how->failures) { LANE(lost, l) = -1; continue; }
+        int seeks = LANE(k->theta, l) > how->constr_viol_tol && !LANE(k->restoring, l);
+        double harder = how->forced_growth * LANE(k->forced, l);
+        LANE(k->forced, l) = harder < how->shift_recovery ? how->shift_recovery : harder;
+        if (seeks) { LANE(k->restoring, l) = -1; LANE(k->entered, l) = LANE(k->theta, l); LANE(t->objective, l) = 0; }
+        else { LANE(k->restoring, l) = 0; LANE(t->objective, l) = 1; }
+        LANE(renewed, l) = -1;
     }
     if (any(renewed)) { renew(t, renewed); settle(t, k, renewed, 0); }
     return lost;
@@ -260,7 +259,7 @@ static void resume(Barrier *t, Track *k) {
     I less = k->theta <= SET(how->required_infeasibility_reduction) * k->entered;
     I done = k->restoring & (less | (k->theta <= SET(how->constr_viol_tol)));
     if (!any(done)) return;
-    k->restoring &= ~done;
+    k->restoring &= NOT(done);
     t->objective = tgco_choose(done, SET(1.0), t->objective);
     renew(t, done);
     settle(t, k, done, 0);
@@ -270,14 +269,14 @@ static void resume(Barrier *t, Track *k) {
    are small, a complementarity or a residual within its tolerance, in all `left`, isn't small beside it. */
 static I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
-    if (t->how->smoothing > 0) return of & ~of; /* it is to stay */
+    if (t->how->smoothing > 0) return of & NOT(of); /* it is to stay */
     if (!any(of)) return of;
     V cost = values(t, of, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
     EACH_ROW(t, 0, q) *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]);
     EACH_ROW(t, 1, q) *left += tgco_fabs(t->z[q] * t->r[q]);
     for (int l = 0; l < LANES; l++) {
         int64_t e = t->lanes.element[l];
-        size[l] = fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
+        LANE(size, l) = fabs(LANE(cost, l) - LANE(t->scale, l) * t->how->constant[e]) + LANE(t->scale, l) * t->how->least_cost[e];
     }
     return of & (*left > SET(t->how->counts) * size);
 }
@@ -291,14 +290,14 @@ static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
     V idle = tgco_choose(error <= SET(0.5) * k->least, zero, k->idle + one);
     k->idle = tgco_choose(running, idle, k->idle);
     k->least = tgco_choose(running & (error < k->least), error, k->least);
-    I feasible = running & ~k->restoring & (primal <= SET(how->constr_viol_tol));
+    I feasible = running & NOT(k->restoring) & (primal <= SET(how->constr_viol_tol));
     I met = feasible & (error <= SET(how->tol)), counts = barrier_counts(t, met, &left);
     k->idle = tgco_choose(counts & (left <= SET(0.5) * k->left), zero, k->idle);
     k->left = tgco_choose(counts, least(left, k->left), k->left);
     k->presses |= counts;
     I rests = k->idle >= SET((double)how->acceptable_iter);
-    met &= ~counts | rests;
-    met &= ((SET(how->tol) >= SET(how->rounding)) & ~k->presses) | (error <= SET(2.0) * t->mu) | (k->idle >= one);
+    met &= NOT(counts) | rests;
+    met &= ((SET(how->tol) >= SET(how->rounding)) & NOT(k->presses)) | (error <= SET(2.0) * t->mu) | (k->idle >= one);
     return met | (feasible & rests & (error <= SET(how->acceptable_tol)));
 }
 
@@ -306,7 +305,7 @@ static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
 static void relax(Barrier *t, Track *k, I running) {
     V largest = SET(0.0);
     EACH_ROW(t, 0, q) largest = most(t->z[q], largest);
-    I lacks = running & (largest > SET(t->how->explodes) * t->raised) & ~k->relaxed & ~k->watching;
+    I lacks = running & (largest > SET(t->how->explodes) * t->raised) & NOT(k->relaxed) & NOT(k->watching);
     if (!any(lacks)) return;
     k->relaxed |= lacks;
     visit_rows(t, lacks, 1, loosen);
@@ -317,7 +316,7 @@ static void relax(Barrier *t, Track *k, I running) {
 /* Rows that were left out of the lanes `of` come in where they are broken by more than `admitted` and something moves
    them now; returns the lanes with such rows. */
 static I readmit(Barrier *t, Track *k, I of, double admitted) {
-    I broken = of & ~of, changed = broken;
+    I broken = of & NOT(of), changed = broken;
     t->admitted = admitted;
     EACH_ROW(t, 0, q) broken |= of & is_broken(t, q);
     if (!any(broken)) return changed;
@@ -325,9 +324,9 @@ static I readmit(Barrier *t, Track *k, I of, double admitted) {
     visit_rows(t, broken, 0, come_in);
     EACH_ROW(t, 0, q) changed |= t->dz[q] != tgco_truth(t->out[q]);
     if (!any(changed)) return changed;
-    for (int l = 0; l < LANES; l++) if (changed[l]) {
-        t->mu[l] = first_barrier(t, l);
-        k->watching[l] = k->shortened[l] = 0;
+    for (int l = 0; l < LANES; l++) if (LANE(changed, l)) {
+        LANE(t->mu, l) = first_barrier(t, l);
+        LANE(k->watching, l) = k->shortened[l] = 0;
     }
     k->least = tgco_choose(changed, SET(INFINITY), k->least);
     k->left = tgco_choose(changed, SET(INFINITY), k->left);
@@ -347,25 +346,25 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     expand(t);
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(how->smoothing) * t->scale) * scale_z);
-    I ended = running & ~running, astray = running & k->watching & ~tgco_finite(*error);
+    I ended = running & NOT(running), astray = running & k->watching & NOT(tgco_finite(*error));
     I small = (*error <= most(SET(how->tol), SET(how->acceptable_tol))) & (primal <= SET(how->constr_viol_tol));
-    small &= ~k->restoring; /* no step that can't be taken matters there */
+    small &= NOT(k->restoring); /* no step that can't be taken matters there */
     if (any(astray)) go_back(t, k, astray);
-    I solved = find_solved(t, k, running & ~astray, *error, primal);
+    I solved = find_solved(t, k, running & NOT(astray), *error, primal);
     for (int l = 0; l < LANES; l++) {
-        if (!running[l] || astray[l]) continue;
-        if (solved[l]) {
-            I one = running & ~running;
-            one[l] = -1;
+        if (!LANE(running, l) || LANE(astray, l)) continue;
+        if (LANE(solved, l)) {
+            I one = running & NOT(running);
+            LANE(one, l) = -1;
             if (t->some_out && any(readmit(t, k, one, how->constr_viol_tol))) continue;
             status[l] = CONVERGED;
         }
-        else if (!((*error)[l] - (*error)[l] == 0)) status[l] = NON_FINITE;
-        else if (k->made[l] >= how->max_iter) status[l] = small[l] ? CONVERGED : MAX_ITERATIONS;
+        else if (!(LANE(*error, l) - LANE(*error, l) == 0)) status[l] = NON_FINITE;
+        else if (LANE(k->made, l) >= how->max_iter) status[l] = LANE(small, l) ? CONVERGED : MAX_ITERATIONS;
         else continue;
-        ended[l] = -1;
+        LANE(ended, l) = -1;
     }
-    running &= ~ended & ~astray;
+    running &= NOT(ended) & NOT(astray);
     if (!any(running)) return ended;
     lower_barrier(t, k, running, dual, primal, scale_z);
     I moving = factor_shifted(t, k, running, running);
@@ -373,12 +372,12 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     solve_rows(t);
     moving = soften(t, k, moving);
     k->last = tgco_choose(moving & (t->shift > SET(0.0)), t->shift, k->last);
-    astray = running & ~moving & k->watching;
+    astray = running & NOT(moving) & k->watching;
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++)
-        if (running[l] && !moving[l] && !astray[l]) {
-            status[l] = small[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
-            ended[l] = -1;
+        if (LANE(running, l) && !LANE(moving, l) && !LANE(astray, l)) {
+            status[l] = LANE(small, l) ? CONVERGED : NOT_POSITIVE_DEFINITE;
+            LANE(ended, l) = -1;
         }
     V tau = least(most(SET(how->tau_min), SET(1.0) - t->mu), SET(how->tau_max));
     I won = search(t, k, moving, tau);
@@ -387,13 +386,13 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     V floor = SET(how->shift_crawl), lower = k->forced * SET(how->recovery_decay);
     V higher = tgco_choose(t->shift > floor, SET(how->recovery_growth) * t->shift, most(floor, k->last));
     lower = tgco_if(lower >= floor, lower);
-    k->forced = tgco_choose(won & ~k->restoring, tgco_choose(k->crawls, higher, lower), k->forced);
+    k->forced = tgco_choose(won & NOT(k->restoring), tgco_choose(k->crawls, higher, lower), k->forced);
     t->soft = tgco_choose(won, most(SET(how->jacobian_regularization_value), SET(how->soft_decay) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
-    for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l] && k->forced[l] == 0) k->failures[l] = 0;
-    for (int l = 0; l < LANES; l++) if (moving[l] && !won[l] && small[l]) { status[l] = CONVERGED; ended[l] = -1; }
-    I lost = recover(t, k, moving & ~won & ~small);
-    for (int l = 0; l < LANES; l++) if (lost[l]) { status[l] = LINE_SEARCH_FAILED; ended[l] = -1; }
+    for (int l = 0; l < LANES; l++) if (LANE(won, l) && !LANE(k->restoring, l) && LANE(k->forced, l) == 0) k->failures[l] = 0;
+    for (int l = 0; l < LANES; l++) if (LANE(moving, l) && !LANE(won, l) && LANE(small, l)) { status[l] = CONVERGED; LANE(ended, l) = -1; }
+    I lost = recover(t, k, moving & NOT(won) & NOT(small));
+    for (int l = 0; l < LANES; l++) if (LANE(lost, l)) { status[l] = LINE_SEARCH_FAILED; LANE(ended, l) = -1; }
     resume(t, k);
     return ended;
 }
@@ -414,35 +413,38 @@ static I find_falls(Barrier *t, I ended) {
     t->shift = tgco_choose(ended, SET(0.0), shift);
     I sound = factor(t, ended);
     t->shift = shift;
-    return ended & ~sound;
+    return ended & NOT(sound);
 }
 
 static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, double error) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N, e = t->lanes.element[lane];
-    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = t->lanes.X[i][lane];
-    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = t->lanes.U[i][lane];
-    for (int64_t i = 0; i < N * NU * NZ; i++) p->gains[e * N * NU * NZ + i] = t->lanes.G[i][lane];
+    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = LANE(t->lanes.X[i], lane);
+    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = LANE(t->lanes.U[i], lane);
+    for (int64_t i = 0; i < N * NU * NZ; i++) p->gains[e * N * NU * NZ + i] = LANE(t->lanes.G[i], lane);
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         for (int64_t j = 0; j < con->knots * con->rows; j++)
-            con->lam[e * con->knots * con->rows + j] = t->z[t->first[i] + j][lane] / t->scale[lane];
-        if (t->some_out && con->kind == BOUNDS) split_multipliers(t, i, lane);
+            con->lam[e * con->knots * con->rows + j] = LANE(t->z[t->first[i] + j], lane) / LANE(t->scale, lane);
+        if (t->some_out && is_kind(con, BOUNDS)) split_multipliers(t, i, lane);
     }
-    t->how->barrier[e] = t->mu[lane];
+    t->how->barrier[e] = LANE(t->mu, lane);
     t->how->error[e] = error;
-    t->how->theta[e] = k->theta[lane];
-    p->iterations[e] += (int64_t)k->made[lane];
+    t->how->theta[e] = LANE(k->theta, lane);
+    p->iterations[e] += (int64_t)LANE(k->made, lane);
     if (status == CONVERGED && breaks_rows_left_out(t, lane)) status = INFEASIBLE;
     /* The slack of a violated row without slope falls to 0, and its multiplier has no end. */
     int fails = status == NON_FINITE || status == NOT_POSITIVE_DEFINITE;
-    p->status[e] = fails && stiffest(t)[lane] == INFINITY ? LINE_SEARCH_FAILED : status;
+    p->status[e] = fails && LANE(stiffest(t), lane) == INFINITY ? LINE_SEARCH_FAILED : status;
 }
 
-static double seconds_now(void) {
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+/* How many numbers of a lane a solve has room for. */
+int64_t tgco_room(const Interior *how) {
+    Barrier barrier, *t = &barrier;
+    if (!start_barrier(t, how)) return 0;
+    int64_t count = lay_out(&t->lanes, 0) + shape(t, 0);
+    finish_barrier(t);
+    return count;
 }
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
@@ -453,12 +455,12 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
     memset(k, 0, sizeof *k);
     I running = SET(0.0) == SET(0.0), fresh = running;
     int64_t next = first;
-    double begun = seconds_now();
+    double begun = SECONDS_NOW(how);
     int64_t own = last - first < LANES ? last - first : LANES;
     for (int l = 0; l < LANES; l++) { /* lanes without a problem repeat the first problem: its networks are computed once */
         enter_barrier(t, l, l < own ? first + l : first);
         if (l < own) next++;
-        else if (how->ask) running[l] = 0;
+        else if (how->ask) LANE(running, l) = 0;
     }
     t->live = running;
     begin(t, k, fresh);
@@ -466,20 +468,20 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         int32_t status[LANES];
         V error;
         I ended = iterate(t, k, running, status, &error);
-        int late = seconds_now() - begun > how->seconds; /* which Python makes shorter where a function has failed */
-        if (late) for (int l = 0; l < LANES; l++) if (running[l] && !ended[l]) { status[l] = TIME_LIMIT; ended[l] = -1; }
-        fresh &= ~fresh;
-        I falls = how->minimum && any(ended) ? find_falls(t, ended) : fresh & ~fresh;
+        int late = SECONDS_NOW(how) - begun > how->seconds; /* which Python makes shorter where a function has failed */
+        if (late) for (int l = 0; l < LANES; l++) if (LANE(running, l) && !LANE(ended, l)) { status[l] = TIME_LIMIT; LANE(ended, l) = -1; }
+        fresh &= NOT(fresh);
+        I falls = how->minimum && any(ended) ? find_falls(t, ended) : fresh & NOT(fresh);
         if (any(ended)) { /* gains along the trajectories that leave, whatever the other lanes do */
             expand(t);
             factor(t, fresh);
         }
         for (int l = 0; l < LANES; l++) {
-            if (!ended[l]) continue;
-            if (l < own) leave_barrier(t, k, l, status[l], error[l]);
-            if (l < own) how->falls[t->lanes.element[l]] = falls[l] ? 1.0 : 0.0;
-            if (next < last && !late) { enter_barrier(t, l, next++); fresh[l] = -1; }
-            else running[l] = 0;
+            if (!LANE(ended, l)) continue;
+            if (l < own) leave_barrier(t, k, l, status[l], LANE(error, l));
+            if (l < own) how->falls[t->lanes.element[l]] = LANE(falls, l) ? 1.0 : 0.0;
+            if (next < last && !late) { enter_barrier(t, l, next++); LANE(fresh, l) = -1; }
+            else LANE(running, l) = 0;
         }
         t->live = running;
         if (any(fresh)) begin(t, k, fresh);

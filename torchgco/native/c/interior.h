@@ -34,7 +34,5 @@ typedef struct {
 } Barrier;
 
 /* In riccati.c. */
-#pragma GCC visibility push(hidden)
-I factor(Barrier *t, I open);
-void solve(Barrier *t);
-#pragma GCC visibility pop
+TGCO_BETWEEN_UNITS I factor(Barrier *t, I open);
+TGCO_BETWEEN_UNITS void solve(Barrier *t);

@@ -22,7 +22,7 @@ static inline int are_a_pair(const Constraint *con, int j, int l) {
 static void measure_room(Barrier *t, I of, int64_t i, int64_t k) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    if (con->kind != BOUNDS) return;
+    if (!is_kind(con, BOUNDS)) return;
     for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++) {
         if (!are_a_pair(con, j, l)) continue;
         V half = SET(-0.5) * (t->c[q + j] + t->c[q + l]);
@@ -41,10 +41,10 @@ static void vary_controls(const Barrier *t, int64_t k, V *du) {
     for (int j = 0; j < NU; j++) du[j] = SET(uneven(k * NU + j));
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
-        if (con->kind != BOUNDS || con->place[k] == NOWHERE) continue;
+        if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
         for (int j = 0; j < con->rows; j++) if (con->variable[j] >= NX) {
             V *own = du + con->variable[j] - NX;
-            *own = tgco_if(~t->fixes[row_of(t, i, k) + j], *own);
+            *own = tgco_if(NOT(t->fixes[row_of(t, i, k) + j]), *own);
         }
     }
 }
@@ -63,7 +63,7 @@ static void find_moved(const Barrier *t, int64_t i, int64_t k, const V *x, const
         for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
     }
     V rounding = SET(ROUNDINGS * t->how->last_bit);
-    for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= rounding * terms[j]);
+    for (int j = 0; j < rows; j++) moves[j] |= NOT(tgco_fabs(change[j]) <= rounding * terms[j]);
 }
 
 /* Rows j of constraint i at knot k, in the lanes `of`, with less room than a slack is given at first, or than a guess is
@@ -71,7 +71,7 @@ static void find_moved(const Barrier *t, int64_t i, int64_t k, const V *x, const
 static I is_tight(const Barrier *t, I of, int64_t i, int64_t k, int j) {
     const Constraint *con = t->lanes.of->constraint + i;
     V room = SET(t->how->bound_push);
-    if (con->kind == BOUNDS) {
+    if (is_kind(con, BOUNDS)) {
         int v = con->variable[j];
         V at = v < NX ? t->lanes.X[k * NX + v] : t->lanes.U[k * NU + v - NX];
         room *= SET(2.0) * most(tgco_fabs(at), SET(1.0));
@@ -81,7 +81,7 @@ static I is_tight(const Barrier *t, I of, int64_t i, int64_t k, int j) {
 
 /* Whether any row of constraint i at knot k is tight in a lane of `of`. */
 static int has_tight(const Barrier *t, I of, int64_t i, int64_t k) {
-    I tight = of & ~of;
+    I tight = of & NOT(of);
     for (int j = 0; j < t->lanes.of->constraint[i].rows; j++) tight |= is_tight(t, of, i, k, j);
     return any(tight);
 }
@@ -158,10 +158,10 @@ static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     int64_t q = row_of(t, i, k);
     const I *moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
-        I tight = is_tight(t, of, i, k, j), is_state = of & ~of;
-        if (con->kind == BOUNDS && con->variable[j] < NX) is_state = ~is_state;
-        t->out[q + j] |= tight & ~moves[j];
-        t->fixes[q + j] &= ~of | moves[j] | ~is_state; /* controls that are fixed weren't varied */
+        I tight = is_tight(t, of, i, k, j), is_state = of & NOT(of);
+        if (is_kind(con, BOUNDS) && con->variable[j] < NX) is_state = NOT(is_state);
+        t->out[q + j] |= tight & NOT(moves[j]);
+        t->fixes[q + j] &= NOT(of) | moves[j] | NOT(is_state); /* controls that are fixed weren't varied */
     }
 }
 
@@ -178,7 +178,7 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const I *moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I in = of & is_broken(t, q + j) & moves[j];
-        t->out[q + j] &= ~in;
+        t->out[q + j] &= NOT(in);
         t->s[q + j] = tgco_choose(in, SET(t->how->bound_push), t->s[q + j]);
     }
 }
@@ -193,7 +193,7 @@ static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     along(t, i, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, z, change);
     for (int j = 0; j < con->rows; j++, q++) {
         V room = most_room * least(tgco_fabs(change[j]), t->room[q]);
-        room = tgco_if(of & ~t->out[q] & tgco_finite(room), room);
+        room = tgco_if(of & NOT(t->out[q]) & tgco_finite(room), room);
         t->relaxed[q] = tgco_choose(of, room, t->relaxed[q]);
         t->s[q] += room;
     }
@@ -204,14 +204,14 @@ static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
 static void sort_rows(Barrier *t, I of) {
     const Problem *p = t->lanes.of;
     for (int64_t q = 0; q < t->rows; q++) {
-        t->out[q] &= ~of; t->fixes[q] &= ~of;
+        t->out[q] &= NOT(of); t->fixes[q] &= NOT(of);
         t->room[q] = tgco_choose(of, SET(1.0), t->room[q]);
     }
     for (int64_t k = 0; k <= p->N; k++)
         for (int64_t i = 0; i < p->constraints; i++)
             if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) measure_room(t, of, i, k);
     visit_rows(t, of, 0, leave_out);
-    I some = of & ~of;
+    I some = of & NOT(of);
     for (int64_t q = 0; q < t->rows; q++) some |= t->out[q];
     t->some_out = any(some);
 }
@@ -252,7 +252,7 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
     int64_t q = row_of(t, i, k);
     int first = 0, end = u ? S : NX;
 #if DIM > 0
-    if (con->kind != BOUNDS && con->kind != FUNCTION && con->kind != BODY) { first = POSITION; end = POSITION + DIM; }
+    if (is_solid(con)) { first = POSITION; end = POSITION + DIM; }
 #endif
     V own[S], *change = t->across[0], *least_of = t->across[1];
     for (int j = 0; j < con->rows; j++) least_of[j] = SET(INFINITY);
@@ -323,7 +323,7 @@ static void soften_rows(Barrier *t, I of, V share, const V *active) {
 static int breaks_rows_left_out(const Barrier *t, int l) {
     int breaks = 0;
     if (t->some_out) EACH_ROW(t, 0, q) {
-        breaks |= t->out[q][l] && !t->fixes[q][l] && !(t->c[q][l] <= t->how->constr_viol_tol);
+        breaks |= LANE(t->out[q], l) && !LANE(t->fixes[q], l) && !(LANE(t->c[q], l) <= t->how->constr_viol_tol);
     }
     return breaks;
 }
@@ -334,7 +334,7 @@ static void split_multipliers(const Barrier *t, int64_t i, int l) {
     for (int64_t first = 0; first < con->knots * con->rows; first += con->rows) {
         double *lam = con->lam + t->lanes.element[l] * con->knots * con->rows + first;
         for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
-            if (!are_a_pair(con, j, m) || !t->fixes[t->first[i] + first + j][l] || !(lam[j] < 0)) continue;
+            if (!are_a_pair(con, j, m) || !LANE(t->fixes[t->first[i] + first + j], l) || !(lam[j] < 0)) continue;
             lam[m] = -lam[j];
             lam[j] = 0;
         }
@@ -346,7 +346,7 @@ static void join_multipliers(Barrier *t, I of) {
     const Problem *p = t->lanes.of;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
-        if (con->kind != BOUNDS) continue;
+        if (!is_kind(con, BOUNDS)) continue;
         for (int64_t first = t->first[i]; first < t->first[i] + con->knots * con->rows; first += con->rows)
             for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
                 if (!are_a_pair(con, j, m)) continue;

@@ -68,7 +68,7 @@ static I factor_kkt(Barrier *t, System *of, const Kkt *how) {
     soften_rows(t, all, SET(how->slight) * largest, of->active);
     stiffen(t, of);
     add_all_rows(t);
-    return factor(t, ~all);
+    return factor(t, NOT(all));
 }
 
 /* A z of every row into ds, of z as dx and du. */
@@ -140,18 +140,18 @@ static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
 
 static void enter_column(Barrier *t, System *of, const Kkt *how, int64_t column, int lane, int64_t e) {
     int64_t N = t->lanes.of->N;
-    for (int64_t i = 0; i < (N + 1) * S; i++) of->a[i][lane] = COLUMN(how, a, column, e, (N + 1) * S)[i];
-    for (int64_t i = 0; i < N * NX; i++) of->b[i][lane] = COLUMN(how, b, column, e, N * NX)[i];
+    for (int64_t i = 0; i < (N + 1) * S; i++) LANE(of->a[i], lane) = COLUMN(how, a, column, e, (N + 1) * S)[i];
+    for (int64_t i = 0; i < N * NX; i++) LANE(of->b[i], lane) = COLUMN(how, b, column, e, N * NX)[i];
     for (int64_t q = 0; q < t->rows; q++)
-        of->c[q][lane] = of->active[q][lane] > 0 ? COLUMN(how, c, column, e, t->rows)[q] : 0;
+        LANE(of->c[q], lane) = LANE(of->active[q], lane) > 0 ? COLUMN(how, c, column, e, t->rows)[q] : 0;
 }
 
 static void leave_column(Barrier *t, const System *of, const Kkt *how, int64_t column, int lane, int64_t e, V left) {
     int64_t N = t->lanes.of->N;
-    for (int64_t i = 0; i < (N + 1) * S; i++) COLUMN(how, a, column, e, (N + 1) * S)[i] = of->z[i][lane];
-    for (int64_t i = 0; i < N * NX; i++) COLUMN(how, b, column, e, N * NX)[i] = of->y[i][lane];
-    for (int64_t q = 0; q < t->rows; q++) COLUMN(how, c, column, e, t->rows)[q] = of->v[q][lane];
-    how->left[column * how->problems + e] = left[lane];
+    for (int64_t i = 0; i < (N + 1) * S; i++) COLUMN(how, a, column, e, (N + 1) * S)[i] = LANE(of->z[i], lane);
+    for (int64_t i = 0; i < N * NX; i++) COLUMN(how, b, column, e, N * NX)[i] = LANE(of->y[i], lane);
+    for (int64_t q = 0; q < t->rows; q++) COLUMN(how, c, column, e, t->rows)[q] = LANE(of->v[q], lane);
+    how->left[column * how->problems + e] = LANE(left, lane);
 }
 
 /* A problem's point, its gains, its multipliers, 0 of rows that aren't active, and which these are. */
@@ -159,22 +159,23 @@ static void enter_system(Barrier *t, System *of, const Kkt *how, int lane, int64
     const Problem *p = t->lanes.of;
     enter_barrier(t, lane, e);
     for (int64_t i = 0; how->K && i < p->N * NU; i++)
-        for (int j = 0; j < NX; j++) t->lanes.G[i * NZ + j][lane] = how->K[(e * p->N * NU + i) * NX + j];
+        for (int j = 0; j < NX; j++) LANE(t->lanes.G[i * NZ + j], lane) = how->K[(e * p->N * NU + i) * NX + j];
     for (int64_t i = 0, q = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         int64_t count = con->knots * con->rows;
         for (int64_t j = 0; j < count; j++, q++) {
             double lam = con->lam[e * count + j], held = how->active[e * t->rows + q];
-            of->active[q][lane] = held;
-            of->give[q][lane] = how->give && held > 0 ? how->give[e * t->rows + q] : 0;
-            t->z[q][lane] = held <= 0 ? 0 : con->equality || lam > LEAST ? lam : LEAST;
+            LANE(of->active[q], lane) = held;
+            LANE(of->give[q], lane) = how->give && held > 0 ? how->give[e * t->rows + q] : 0;
+            LANE(t->z[q], lane) = held <= 0 ? 0 : con->equality || lam > LEAST ? lam : LEAST;
         }
     }
 }
 
-static V *start_system(System *of, int64_t N, int64_t rows) {
-    int64_t point = (N + 1) * S, gaps = N * NX;
-    V *memory = aligned_alloc(sizeof(V), ((N + 1) * S * S + 2 * (point + gaps + rows) + 2 * rows + 1) * sizeof(V)), *m = memory;
+static V *start_system(System *of, const Problem *p, int64_t rows) {
+    int64_t N = p->N, point = (N + 1) * S, gaps = N * NX;
+    V *memory = take(p, ((N + 1) * S * S + 2 * (point + gaps + rows) + 2 * rows + 1) * sizeof(V));
+    Cut m = {memory, 0};
     if (!memory) return 0;
     of->H = cut(&m, (N + 1) * S * S); of->active = cut(&m, rows); of->give = cut(&m, rows);
     of->a = cut(&m, point); of->b = cut(&m, gaps); of->c = cut(&m, rows);
@@ -191,18 +192,18 @@ int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
     System system, *of = &system;
     if (!start_barrier(t, &options)) return 0;
     const Problem *p = t->lanes.of;
-    V *memory = start_system(of, p->N, t->rows);
+    V *memory = start_system(of, p, t->rows);
     if (!memory) { finish_barrier(t); return 0; }
     for (int64_t at = first; at < last; at += LANES) {
         int own = last - at < LANES ? last - at : LANES; /* lanes without a problem repeat the first one */
         for (int l = 0; l < LANES; l++) {
             enter_system(t, of, how, l, l < own ? at + l : at);
-            t->live[l] = l < own ? -1 : 0;
+            LANE(t->live, l) = l < own ? -1 : 0;
         }
         I good = factor_kkt(t, of, how);
         for (int l = 0; l < own; l++) {
-            p->status[at + l] = good[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
-            for (int64_t i = 0; i < (p->N + 1) * NX; i++) how->y[(at + l) * (p->N + 1) * NX + i] = t->y[i][l];
+            p->status[at + l] = LANE(good, l) ? CONVERGED : NOT_POSITIVE_DEFINITE;
+            for (int64_t i = 0; i < (p->N + 1) * NX; i++) how->y[(at + l) * (p->N + 1) * NX + i] = LANE(t->y[i], l);
         }
         for (int64_t column = 0; column < how->count; column++) {
             for (int l = 0; l < LANES; l++) enter_column(t, of, how, column, l, l < own ? at + l : at);
@@ -210,7 +211,7 @@ int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
             for (int l = 0; l < own; l++) leave_column(t, of, how, column, l, at + l, left);
         }
     }
-    free(memory);
+    give(p, memory);
     finish_barrier(t);
     return 1;
 }

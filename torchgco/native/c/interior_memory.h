@@ -22,7 +22,7 @@ typedef struct {
 static int64_t shape(Barrier *t, V *memory) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N, rows = t->rows;
-    V *m = memory;
+    Cut m = {memory, 0};
     t->y = cut(&m, (N + 1) * NX); t->yn = cut(&m, (N + 1) * NX);
     t->gap = cut(&m, N * NX); t->gapn = cut(&m, N * NX); t->aim = cut(&m, N * NX);
     t->H = cut(&m, (N + 1) * S * S); t->f = cut(&m, N * NJ + 1);
@@ -38,11 +38,12 @@ static int64_t shape(Barrier *t, V *memory) {
     t->room = cut(&m, rows); t->relaxed = cut(&m, rows); t->gives = cut(&m, rows);
     t->out = (I *)cut(&m, rows); t->fixes = (I *)cut(&m, rows);
     t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
-    return m - memory;
+    return m.used;
 }
 
 static void finish_barrier(Barrier *t) {
-    free(t->memory); free(t->first); free(t->rows_asked);
+    const Problem *p = t->how->of;
+    give(p, t->memory); give(p, t->rows_asked); give(p, t->first);
     finish(&t->lanes);
 }
 
@@ -51,8 +52,8 @@ static int start_barrier(Barrier *t, const Interior *how) {
     memset(t, 0, sizeof *t);
     t->how = how;
     if (!start(&t->lanes, p)) return 0;
-    t->first = calloc(p->constraints + 1, sizeof *t->first);
-    t->rows_asked = calloc(p->constraints + 1, sizeof *t->rows_asked);
+    t->first = take(p, (p->constraints + 1) * sizeof *t->first);
+    t->rows_asked = take(p, (p->constraints + 1) * sizeof *t->rows_asked);
     if (!t->first || !t->rows_asked) { finish_barrier(t); return 0; }
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
@@ -61,9 +62,8 @@ static int start_barrier(Barrier *t, const Interior *how) {
         t->rows_asked[i] = (double *)t->lanes.rows[i].bound;
     }
     int64_t count = shape(t, 0);
-    t->memory = aligned_alloc(sizeof(V), (count + 1) * sizeof(V));
+    t->memory = take(p, (count + 1) * sizeof(V));
     if (!t->memory) { finish_barrier(t); return 0; }
-    memset(t->memory, 0, (count + 1) * sizeof(V));
     shape(t, t->memory);
     for (int64_t q = 0; q < t->rows; q++) t->gives[q] = SET(1.0);
     return 1;
@@ -71,7 +71,7 @@ static int start_barrier(Barrier *t, const Interior *how) {
 
 static void enter_barrier(Barrier *t, int lane, int64_t e) {
     enter_iterate(&t->lanes, lane, e);
-    if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
+    if (t->is_free) for (int i = 0; i < NX; i++) LANE(t->is_free[i], lane) = t->how->free_start[e * NX + i];
 }
 
 static inline V most(V a, V b) { return tgco_choose((a > b) | (a != a), a, b); } /* NaN stays */

@@ -13,9 +13,9 @@ static inline int64_t row_of(const Barrier *t, int64_t i, int64_t k) {
 /* Values c of obstacles at knot k. */
 static inline void solids_at(const Constraint *con, const Rows *rows, int64_t k, const V *x, V *c) {
     V away[DIM];
-    if (con->kind == SPHERES) for (int j = 0; j < con->rows; j++) c[j] = sphere(con, rows, j, k, x, away);
-    else if (con->kind == BOXES) for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
-    else c[0] = field_row(con, rows, k, x, 0, 0);
+    if (is_kind(con, SPHERES)) for (int j = 0; j < con->rows; j++) c[j] = sphere(con, rows, j, k, x, away);
+    else if (is_kind(con, BOXES)) for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
+    else if (is_kind(con, FIELD)) c[0] = field_row(con, rows, k, x, 0, 0);
 }
 
 static void body_at(const Lanes *s, int64_t i, int64_t k, const V *x, V *c) {
@@ -34,12 +34,12 @@ static void body_at(const Lanes *s, int64_t i, int64_t k, const V *x, V *c) {
 static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *c) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
-    if (con->kind == BOUNDS) {
+    if (is_kind(con, BOUNDS)) {
         for (int j = 0; j < con->rows; j++) c[j] = bound(con, rows, j, k, x, u);
 #if DIM > 0
-    } else if (con->kind != FUNCTION && con->kind != BODY) {
+    } else if (is_solid(con)) {
         solids_at(con, rows, k, x, c);
-    } else if (con->kind == BODY) {
+    } else if (is_kind(con, BODY)) {
         body_at(s, i, k, x, c);
 #endif
     } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
@@ -140,9 +140,9 @@ static inline void add_field(
 /* The same of any kind. */
 static inline void add_solids(
     const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
-    if (con->kind == SPHERES) add_spheres(t, to, con, rows, q, k, x);
-    else if (con->kind == BOXES) add_boxes(t, to, con, rows, q, k, x);
-    else add_field(t, to, con, rows, q, k, x);
+    if (is_kind(con, SPHERES)) add_spheres(t, to, con, rows, q, k, x);
+    else if (is_kind(con, BOXES)) add_boxes(t, to, con, rows, q, k, x);
+    else if (is_kind(con, FIELD)) add_field(t, to, con, rows, q, k, x);
 }
 
 /* Rows of a body: each ball's by its center, then by the state, with the curvature of its way. */
@@ -195,16 +195,17 @@ static inline void add_bounds(Barrier *t, int64_t i, int64_t k) {
 static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const V *u) {
     const Constraint *con = t->lanes.of->constraint + i;
     const Rows *rows = t->lanes.rows + i;
-    if (con->kind == BOUNDS) { add_bounds(t, i, k); return; }
+    if (is_kind(con, BOUNDS)) { add_bounds(t, i, k); return; }
 #if DIM > 0
-    if (con->kind == BODY) { add_body(t, i, k, x); return; }
-    if (con->kind != FUNCTION) {
+    if (is_kind(con, BODY)) { add_body(t, i, k, x); return; }
+    if (is_solid(con)) {
         Into to = {.H = t->H + k * S * S};
         for (int part = 0; part < PARTS; part++) to.g[part] = t->g[part] + k * S;
         add_solids(t, to, con, rows, row_of(t, i, k), k, x);
         return;
     }
 #endif
+    if (!is_kind(con, FUNCTION)) return;
     V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], own[PARTS];
     int64_t q = row_of(t, i, k);
     for (int j = 0; j < con->rows; j++) {
@@ -225,13 +226,13 @@ static inline void solids_along(
     V slopes[DIM];
     for (int j = 0; j < con->rows; j++) {
         out[j] = SET(0.0);
-        if (con->kind == SPHERES) {
+        if (is_kind(con, SPHERES)) {
             sphere(con, rows, j, k, x, slopes);
             for (int a = 0; a < DIM; a++) SUBTRACT(out[j], SET(2.0) * slopes[a], step[a]);
             continue;
         }
-        if (con->kind == BOXES) solid(con, rows, j, k, x, slopes);
-        else field_row(con, rows, k, x, slopes, 0);
+        if (is_kind(con, BOXES)) solid(con, rows, j, k, x, slopes);
+        else if (is_kind(con, FIELD)) field_row(con, rows, k, x, slopes, 0);
         for (int a = 0; a < DIM; a++) ADD(out[j], slopes[a], step[a]);
     }
 }
@@ -253,12 +254,12 @@ static void body_along(const Lanes *s, int64_t i, int64_t k, const V *x, const V
 static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z, V *out) {
     const Constraint *con = t->lanes.of->constraint + i;
     const Rows *rows = t->lanes.rows + i;
-    if (con->kind == BOUNDS) {
+    if (is_kind(con, BOUNDS)) {
         for (int j = 0; j < con->rows; j++) out[j] = SET(con->sign[j]) * z[con->variable[j]];
 #if DIM > 0
-    } else if (con->kind != FUNCTION && con->kind != BODY) {
+    } else if (is_solid(con)) {
         solids_along(con, rows, k, x, z + POSITION, out);
-    } else if (con->kind == BODY) {
+    } else if (is_kind(con, BODY)) {
         body_along(&t->lanes, i, k, x, u, z, out);
 #endif
     } else model_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, z, out);

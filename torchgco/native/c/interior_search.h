@@ -6,7 +6,7 @@
 /* The filter ------------------------------------------------------------------------------------------------------ */
 
 static int is_refused(const Track *k, int l, double theta, double phi) {
-    if (!(theta <= k->highest[l])) return 1;
+    if (!(theta <= LANE(k->highest, l))) return 1;
     for (int i = 0; i < k->pairs[l]; i++)
         if (theta >= k->filter[l][i].theta && phi >= k->filter[l][i].phi) return 1;
     return 0;
@@ -14,7 +14,7 @@ static int is_refused(const Track *k, int l, double theta, double phi) {
 
 static void remember(const Barrier *t, Track *k, int l) {
     const Interior *how = t->how;
-    Pair pair = {(1 - how->gamma_theta) * k->theta[l], k->phi[l] - how->gamma_phi * k->theta[l]};
+    Pair pair = {(1 - how->gamma_theta) * LANE(k->theta, l), LANE(k->phi, l) - how->gamma_phi * LANE(k->theta, l)};
     int count = 0;
     for (int i = 0; i < k->pairs[l]; i++) {
         Pair old = k->filter[l][i];
@@ -32,18 +32,18 @@ static void remember(const Barrier *t, Track *k, int l) {
 static int is_good(
     const Barrier *t, const Track *k, int l, double alpha, double slope, double theta, double phi, int *descends) {
     const Interior *how = t->how;
-    double old = k->theta[l], noise = how->noise * how->last_bit * fabs(k->phi[l]);
+    double old = LANE(k->theta, l), noise = how->noise * how->last_bit * fabs(LANE(k->phi, l));
     *descends = 0;
     if (!(theta - theta == 0) || !(phi - phi == 0)) return 0;
-    if (k->restoring[l]) return theta <= (1 - how->eta_phi * alpha) * old;
+    if (LANE(k->restoring, l)) return theta <= (1 - how->eta_phi * alpha) * old;
     if (is_refused(k, l, theta, phi)) return 0;
     double gain = slope < 0 ? alpha * pow(-slope, how->s_phi) : 0;
     int switches = gain > how->delta * pow(old, how->s_theta);
-    if (old <= k->lowest[l] && switches) {
+    if (old <= LANE(k->lowest, l) && switches) {
         *descends = 1;
-        return phi - k->phi[l] - noise <= how->eta_phi * alpha * slope;
+        return phi - LANE(k->phi, l) - noise <= how->eta_phi * alpha * slope;
     }
-    return theta <= (1 - how->gamma_theta) * old || phi - noise <= k->phi[l] - how->gamma_phi * old;
+    return theta <= (1 - how->gamma_theta) * old || phi - noise <= LANE(k->phi, l) - how->gamma_phi * old;
 }
 
 /* The line search ------------------------------------------------------------------------------------------------- */
@@ -55,7 +55,7 @@ static void longest(const Barrier *t, V tau, V *primal, V *dual) {
         V a = -tau * t->s[q] / t->ds[q], b = -tau * t->z[q] / t->dz[q];
         *primal = tgco_choose((t->ds[q] < SET(0.0)) & (a < *primal), a, *primal);
         I falls = t->dz[q] < SET(0.0);
-        if (t->some_out) falls &= ~t->out[q];
+        if (t->some_out) falls &= NOT(t->out[q]);
         *dual = tgco_choose(falls & (b < *dual), b, *dual);
     }
 }
@@ -153,12 +153,12 @@ static void keep(Barrier *t, I of, int back) {
 
 /* Lanes whose steps have been short for long take some full ones on trial (the paper's watchdog). */
 static void watch(Barrier *t, Track *k, I moving, V slope, V full) {
-    I begins = moving & ~moving;
+    I begins = moving & NOT(moving);
     for (int l = 0; l < LANES; l++) {
         int rarely = k->shortened[l] < t->how->watchdog_shortened_iter_trigger;
-        if (!moving[l] || k->watching[l] || k->restoring[l] || rarely) continue;
-        begins[l] = k->watching[l] = -1;
-        k->slope[l] = slope[l]; k->alpha[l] = full[l];
+        if (!LANE(moving, l) || LANE(k->watching, l) || LANE(k->restoring, l) || rarely) continue;
+        LANE(begins, l) = LANE(k->watching, l) = -1;
+        LANE(k->slope, l) = LANE(slope, l); LANE(k->alpha, l) = LANE(full, l);
         k->ahead[l] = 0;
     }
     if (any(begins)) keep(t, begins, 0);
@@ -166,7 +166,7 @@ static void watch(Barrier *t, Track *k, I moving, V slope, V full) {
 
 static void go_back(Barrier *t, Track *k, I of) {
     keep(t, of, 1);
-    for (int l = 0; l < LANES; l++) if (of[l]) k->watching[l] = k->shortened[l] = 0;
+    for (int l = 0; l < LANES; l++) if (LANE(of, l)) LANE(k->watching, l) = k->shortened[l] = 0;
 }
 
 /* Moves the lanes `moving` along their steps; returns those that found a step length. A lane moves as soon as it has
@@ -175,42 +175,42 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
     const Interior *how = t->how;
     V full, alpha, dual, theta, phi, slope = descent(t);
     longest(t, tau, &full, &dual);
-    I none = moving & ~moving, open = moving, won = none, corrected = none;
+    I none = moving & NOT(moving), open = moving, won = none, corrected = none;
     alpha = full;
     watch(t, k, moving, slope, full);
     for (int tries = 0; any(open); tries++) {
         attempt(t, open, alpha, &theta, &phi);
         I good = none, again = none, undo = none, back = none;
         for (int l = 0; l < LANES; l++) {
-            int descends, watching = k->watching[l] != 0;
-            if (!open[l]) continue;
-            double from = watching ? k->slope[l] : slope[l], length = watching ? k->alpha[l] : alpha[l];
-            int accepted = is_good(t, k, l, length, from, theta[l], phi[l], &descends);
+            int descends, watching = LANE(k->watching, l) != 0;
+            if (!LANE(open, l)) continue;
+            double from = watching ? LANE(k->slope, l) : LANE(slope, l), length = watching ? LANE(k->alpha, l) : LANE(alpha, l);
+            int accepted = is_good(t, k, l, length, from, LANE(theta, l), LANE(phi, l), &descends);
             if (watching && !accepted) {
-                int sound = theta[l] <= k->highest[l] && phi[l] - phi[l] == 0;
+                int sound = LANE(theta, l) <= LANE(k->highest, l) && LANE(phi, l) - LANE(phi, l) == 0;
                 int goes_on = sound && k->ahead[l]++ < how->watchdog_trial_iter_max;
-                if (goes_on) { good[l] = -1; k->crawls[l] = 0; } else back[l] = -1;
+                if (goes_on) { LANE(good, l) = -1; LANE(k->crawls, l) = 0; } else LANE(back, l) = -1;
                 continue;
             }
             if (accepted) {
-                if (watching) k->watching[l] = 0;
-                if (!descends && !k->restoring[l]) remember(t, k, l);
-                k->theta[l] = theta[l]; k->phi[l] = phi[l];
-                good[l] = -1;
-                k->crawls[l] = alpha[l] < how->crawl * full[l] && !watching ? -1 : 0;
-                k->shortened[l] = alpha[l] < full[l] && !watching ? k->shortened[l] + 1 : 0;
-            } else if (tries == 0 && how->max_soc && !k->restoring[l] && theta[l] >= k->theta[l]) {
-                again[l] = -1;
+                if (watching) LANE(k->watching, l) = 0;
+                if (!descends && !LANE(k->restoring, l)) remember(t, k, l);
+                LANE(k->theta, l) = LANE(theta, l); LANE(k->phi, l) = LANE(phi, l);
+                LANE(good, l) = -1;
+                LANE(k->crawls, l) = LANE(alpha, l) < how->crawl * LANE(full, l) && !watching ? -1 : 0;
+                k->shortened[l] = LANE(alpha, l) < LANE(full, l) && !watching ? k->shortened[l] + 1 : 0;
+            } else if (tries == 0 && how->max_soc && !LANE(k->restoring, l) && LANE(theta, l) >= LANE(k->theta, l)) {
+                LANE(again, l) = -1;
             } else {
-                undo[l] = corrected[l];
-                alpha[l] = 0.5 * (corrected[l] ? full[l] : alpha[l]);
-                if (alpha[l] < how->alpha_min) open[l] = 0;
+                LANE(undo, l) = LANE(corrected, l);
+                LANE(alpha, l) = 0.5 * (LANE(corrected, l) ? LANE(full, l) : LANE(alpha, l));
+                if (LANE(alpha, l) < how->alpha_min) LANE(open, l) = 0;
             }
         }
         if (any(good)) accept(t, good, alpha, dual);
         if (any(back)) go_back(t, k, back);
         won |= good | back;
-        open &= ~won;
+        open &= NOT(won);
         if (!any(again) && !any(undo)) continue;
         V p, d;
         if (any(again)) correct(t, again, alpha); else uncorrect(t);

@@ -12,7 +12,7 @@ static void ask(const Barrier *t, int asked, I of, const V *X, const V *U) {
         .Un = (double *)s->Un, .y = (double *)t->y, .z = (double *)t->z, .objective = (double *)&t->objective,
         .step = (double *)s->parameters, .stage = (double *)s->cost_data[STAGE],
         .last = (double *)s->cost_data[LAST], .rows = t->rows_asked};
-    for (int l = 0; l < LANES; l++) if (of[l]) request.lanes |= (int64_t)1 << l;
+    for (int l = 0; l < LANES; l++) if (LANE(of, l)) request.lanes |= (int64_t)1 << l;
     if (request.lanes) t->how->ask(&request);
 }
 

@@ -14,7 +14,7 @@ static inline V sphere_terms(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V c, V lam, V total,
     V *g, V *H) {
     if (!g) return total + worth(s, 0, c, lam);
-    if (!any(~(c <= SET(0.0)) | (lam != SET(0.0)))) return total;
+    if (!any(NOT(c <= SET(0.0)) | (lam != SET(0.0)))) return total;
     V away[DIM], rho, slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam, &rho);
     for (int a = 0; a < DIM; a++) {
         SUBTRACT(g[POSITION + a], SET(2.0) * slope, away[a]);
@@ -64,7 +64,7 @@ static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V
             if (con->velocities.data) SUBTRACT(away, SET(k * con->dt), rows->velocities[j * DIM + a]);
             ADD(square, away, away);
         }
-        int adds = any((rows->widest[j] >= SET(0.0)) & ~(square >= limit * limit)); /* NaN may touch */
+        int adds = any((rows->widest[j] >= SET(0.0)) & NOT(square >= limit * limit)); /* NaN may touch */
         for (int64_t b = 0; pushed && !adds && b < P; b++) adds = any(lam[b * each + j] != SET(0.0));
         if (adds) near[count++] = j;
     }
@@ -98,8 +98,8 @@ TGCO_APART V body_terms(const Lanes *s, int64_t i, int64_t k, const V *x, V tota
             own[a] = SET(0.0);
             for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
         }
-        if (ball.con.kind == SPHERES) total = near_terms(s, &ball, k, near, some, total, own, square);
-        else if (ball.con.kind == BOXES) total = boxes_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
+        if (is_kind(&ball.con, SPHERES)) total = near_terms(s, &ball, k, near, some, total, own, square);
+        else if (is_kind(&ball.con, BOXES)) total = boxes_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
         else total = field_terms(s, &ball.con, &ball.rows, k, ball.x, total, own, square);
         if (!g || adds_nothing(own + POSITION, square + POSITION * S)) continue;
         if (count < 0)
@@ -131,7 +131,7 @@ TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, const V *x, const
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     const V *lam = rows->lam + con->place[k] * con->rows;
-    if (con->kind == BOUNDS) {
+    if (is_kind(con, BOUNDS)) {
         for (int j = 0; j < con->rows; j++) {
             int v = con->variable[j];
             V c = bound(con, rows, j, k, x, u), rho;
@@ -142,10 +142,10 @@ TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, const V *x, const
         return total;
     }
 #if DIM > 0
-    if (con->kind == SPHERES) return spheres_terms(s, con, rows, k, x, total, g, H);
-    if (con->kind == BOXES) return boxes_terms(s, con, rows, k, x, total, g, H);
-    if (con->kind == FIELD) return field_terms(s, con, rows, k, x, total, g, H);
-    if (con->kind == BODY) return body_terms(s, i, k, x, total, g, H);
+    if (is_kind(con, SPHERES)) return spheres_terms(s, con, rows, k, x, total, g, H);
+    if (is_kind(con, BOXES)) return boxes_terms(s, con, rows, k, x, total, g, H);
+    if (is_kind(con, FIELD)) return field_terms(s, con, rows, k, x, total, g, H);
+    if (is_kind(con, BODY)) return body_terms(s, i, k, x, total, g, H);
 #endif
     return traced_terms(s, i, k, x, u, lam, total, g, H);
 }

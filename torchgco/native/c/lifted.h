@@ -21,13 +21,13 @@ static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, 
             if (round > 0) { /* the first gains are those that failed */
                 roll(s, knot_value, SET(1.0), SET(INFINITY), &cost, &merit);
                 I low = open & tgco_finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
-                for (int l = 0; l < used; l++) if (low[l]) {
+                for (int l = 0; l < used; l++) if (LANE(low, l)) {
                     int64_t e = s->element[l];
-                    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->Xn[i][l];
-                    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = s->Un[i][l];
-                    p->cost[e] = cost[l]; p->merit[e] = merit[l]; p->converged[e] = 1;
+                    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = LANE(s->Xn[i], l);
+                    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = LANE(s->Un[i], l);
+                    p->cost[e] = LANE(cost, l); p->merit[e] = LANE(merit, l); p->converged[e] = 1;
                 }
-                open &= ~low;
+                open &= NOT(low);
             }
             linear_step(s, gap);
             for (int64_t i = 0; i < (N + 1) * NX; i++) sum += SET(0.0) * s->X[i];

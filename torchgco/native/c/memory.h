@@ -1,6 +1,6 @@
 /* Lanes: their memory, and problems that enter and leave them. */
 #pragma once
-#include "model.h"
+#include "allocation.h"
 
 static int64_t length(const Array *a, int64_t knots) { return a->data ? (a->knot ? knots : 1) * a->size : 0; }
 
@@ -9,20 +9,29 @@ static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t elem
     const double *source = from->data + element * from->element;
     int64_t count = from->knot ? knots : 1;
     for (int64_t k = 0; k < count; k++)
-        for (int64_t i = 0; i < from->size; i++) to[k * from->size + i][lane] = source[k * from->knot + i];
+        for (int64_t i = 0; i < from->size; i++) LANE(to[k * from->size + i], lane) = source[k * from->knot + i];
 }
+
+/* Where the numbers of problem e are. */
+static inline int64_t numbers_of(const Problem *p, int64_t e) { return p->numbers ? p->numbers[e] : e; }
 
 /* The same of one knot. */
 static void fill_stage(V *to, const Array *from, int64_t k, int lane, int64_t element) {
-    for (int64_t i = 0; i < from->size; i++) to[i][lane] = from->data[element * from->element + k * from->knot + i];
+    for (int64_t i = 0; i < from->size; i++) LANE(to[i], lane) = from->data[element * from->element + k * from->knot + i];
 }
 
-static V *cut(V **memory, int64_t count) { V *part = *memory; *memory += count; return part; }
+/* Memory that is laid out; without any, it is counted how much that takes. */
+typedef struct { V *memory; int64_t used; } Cut;
+static V *cut(Cut *from, int64_t count) {
+    V *part = from->memory ? from->memory + from->used : 0;
+    from->used += count;
+    return part;
+}
 
 static int64_t lay_out(Lanes *s, V *memory) {
     const Problem *p = s->of;
     int64_t N = p->N;
-    V *m = memory;
+    Cut m = {memory, 0};
     s->X = cut(&m, (N + 1) * NX); s->U = cut(&m, N * NU); s->Xn = cut(&m, (N + 1) * NX); s->Un = cut(&m, N * NU);
     s->G = cut(&m, N * NU * NZ);
     s->parameters = cut(&m, length(&p->parameters, N));
@@ -43,29 +52,21 @@ static int64_t lay_out(Lanes *s, V *memory) {
         for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;
     }
-    return m - memory;
+    return m.used;
 }
+
+static void finish(Lanes *s) { give(s->of, s->rows); give(s->of, s->memory); }
 
 static int start(Lanes *s, const Problem *p) {
     memset(s, 0, sizeof *s);
     s->of = p;
     int64_t count = lay_out(s, 0);
-    s->memory = aligned_alloc(sizeof(V), (count + 1) * sizeof(V));
-    s->rows = calloc(p->constraints + 1, sizeof(Rows));
-    if (!s->memory || !s->rows) { free(s->memory); free(s->rows); return 0; }
-    memset(s->memory, 0, (count + 1) * sizeof(V));
+    s->memory = take(p, (count + 1) * sizeof(V));
+    s->rows = take(p, (p->constraints + 1) * sizeof(Rows));
+    if (!s->memory || !s->rows) { finish(s); return 0; }
     lay_out(s, s->memory);
     return 1;
 }
-
-/* The numbers first, ..., last - 1 of problems, to be freed; NULL without memory. */
-static int64_t *in_order(int64_t first, int64_t last) {
-    int64_t *number = malloc((last - first + 1) * sizeof *number);
-    for (int64_t i = 0; number && first + i < last; i++) number[i] = first + i;
-    return number;
-}
-
-static void finish(Lanes *s) { free(s->memory); free(s->rows); }
 
 /* Find the largest radii of a body's spheres in a lane. */
 static void widen(const Rows *rows, const Constraint *c, int lane) {
@@ -73,8 +74,8 @@ static void widen(const Rows *rows, const Constraint *c, int lane) {
     for (int64_t j = 0; j < each; j++) {
         double square = ABSENT;
         for (int64_t b = 0; b < c->balls; b++)
-            if (rows->squares[b * each + j][lane] > square) square = rows->squares[b * each + j][lane];
-        rows->widest[j][lane] = square < 0 ? ABSENT : sqrt(square);
+            if (LANE(rows->squares[b * each + j], lane) > square) square = LANE(rows->squares[b * each + j], lane);
+        LANE(rows->widest[j], lane) = square < 0 ? ABSENT : sqrt(square);
     }
 }
 
@@ -83,7 +84,8 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
     s->element[lane] = e;
-    for (int i = 0; i < NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
+    for (int i = 0; i < NX; i++) LANE(s->X[i], lane) = p->X[e * (N + 1) * NX + i];
+    e = numbers_of(p, e);
     fill(s->parameters, &p->parameters, N, lane, e);
     for (int i = 0; i < COST_ARRAYS; i++) fill(s->cost_data[i], p->cost_data + i, N, lane, e);
     for (int64_t i = 0; i < p->constraints; i++) {
@@ -104,8 +106,8 @@ static void enter_iterate(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
     enter_problem(s, lane, e);
-    for (int64_t i = 0; i < (N + 1) * NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
-    for (int64_t i = 0; i < N * NU; i++) s->U[i][lane] = p->U[e * N * NU + i];
+    for (int64_t i = 0; i < (N + 1) * NX; i++) LANE(s->X[i], lane) = p->X[e * (N + 1) * NX + i];
+    for (int64_t i = 0; i < N * NU; i++) LANE(s->U[i], lane) = p->U[e * N * NU + i];
 }
 
 /* Load problem e with its iterate, multipliers and guide. */
@@ -114,7 +116,7 @@ static void enter(Lanes *s, int lane, int64_t e) {
     int64_t N = p->N;
     enter_iterate(s, lane, e);
     fill(s->center, &p->center, N + 1, lane, e); fill(s->radius, &p->radius, N + 1, lane, e);
-    if (p->guide != NO_GUIDE) s->weight[lane] = p->weight.data[e * p->weight.element];
+    if (p->guide != NO_GUIDE) LANE(s->weight, lane) = p->weight.data[e * p->weight.element];
     double squares = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
@@ -123,29 +125,29 @@ static void enter(Lanes *s, int lane, int64_t e) {
         for (int64_t k = 0; k < c->knots; k++, lam += c->rows) {
             int pushed = 0;
             for (int j = 0; j < c->rows; j++) pushed |= lam[j] != 0;
-            if (!pushed && !s->rows[i].pushed[k][lane]) continue; /* as at most knots, where the lane's are 0, too */
+            if (!pushed && !LANE(s->rows[i].pushed[k], lane)) continue; /* as at most knots, where the lane's are 0, too */
             for (int j = 0; j < c->rows; j++) {
-                s->rows[i].lam[k * c->rows + j][lane] = lam[j];
+                LANE(s->rows[i].lam[k * c->rows + j], lane) = lam[j];
                 if (lam[j] != 0) squares += lam[j] * lam[j];
             }
-            s->rows[i].pushed[k][lane] = -pushed;
+            LANE(s->rows[i].pushed[k], lane) = -pushed;
         }
     }
-    s->mu[lane] = p->mu[e]; s->inverse_mu[lane] = 1 / p->mu[e];
-    s->floor[lane] = squares > 0 ? 0.5 * squares / p->mu[e] : 0;
-    s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
-    s->merit[lane] = p->merit[e]; s->cost[lane] = p->cost[e];
-    s->inner[lane] = p->inner ? p->inner[e] : 0; s->made[lane] = 0; s->rung[lane] = p->rung ? p->rung[e] : 0;
+    LANE(s->mu, lane) = p->mu[e]; LANE(s->inverse_mu, lane) = 1 / p->mu[e];
+    LANE(s->floor, lane) = squares > 0 ? 0.5 * squares / p->mu[e] : 0;
+    LANE(s->mu_r, lane) = p->regularisation ? p->regularisation[e] : 0;
+    LANE(s->merit, lane) = p->merit[e]; LANE(s->cost, lane) = p->cost[e];
+    LANE(s->inner, lane) = p->inner ? p->inner[e] : 0; LANE(s->made, lane) = 0; s->rung[lane] = p->rung ? p->rung[e] : 0;
 }
 
 static void leave(const Lanes *s, int lane, int32_t status, int32_t converged, int32_t refused, int32_t lost) {
     const Problem *p = s->of;
     int64_t N = p->N, e = s->element[lane];
-    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->X[i][lane];
-    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = s->U[i][lane];
-    p->cost[e] = s->cost[lane]; p->merit[e] = s->merit[lane]; p->regularisation[e] = s->mu_r[lane];
-    p->iterations[e] += (int64_t)s->made[lane]; p->inner[e] = (int64_t)s->inner[lane]; p->rung[e] = s->rung[lane];
-    p->alpha[e] = s->alpha[lane]; p->used[e] = s->used[lane];
+    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = LANE(s->X[i], lane);
+    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = LANE(s->U[i], lane);
+    p->cost[e] = LANE(s->cost, lane); p->merit[e] = LANE(s->merit, lane); p->regularisation[e] = LANE(s->mu_r, lane);
+    p->iterations[e] += (int64_t)LANE(s->made, lane); p->inner[e] = (int64_t)LANE(s->inner, lane); p->rung[e] = s->rung[lane];
+    p->alpha[e] = LANE(s->alpha, lane); p->used[e] = LANE(s->used, lane);
     p->status[e] = status; p->converged[e] = converged; p->refused[e] = refused; p->lost[e] = lost;
 }
 

@@ -2,8 +2,6 @@
 #include "model.h"
 #include "code.h"
 
-const int tgco_nx = NX, tgco_nu = NU, tgco_np = NP, tgco_nj = NJ, tgco_max_rows = MAX_ROWS;
-
 void model_step(const V *x, const V *u, const V *parameters, const double *w, V *next) {
     tgco_step(x, u, parameters, w, next);
 }

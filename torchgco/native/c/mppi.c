@@ -34,12 +34,12 @@ static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
 /* How many obstacles of a kind each sample touches at knot k. */
 static inline V touched_solids(const Constraint *con, const Rows *rows, int64_t k, const V *x) {
     V count = SET(0.0);
-    if (con->kind == SPHERES) {
+    if (is_kind(con, SPHERES)) {
         for (int j = 0; j < con->rows; j++) {
             V away[DIM], c = sphere(con, rows, j, k, x, away);
             count += tgco_truth(c >= SET(0.0));
         }
-    } else if (con->kind == BOXES) {
+    } else if (is_kind(con, BOXES)) {
         for (int j = 0; j < con->rows; j++)
             if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
     } else if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, 0, 0) >= SET(0.0));
@@ -55,7 +55,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
         const Constraint *con = p->constraint + i;
         if (!q->of->geometric[i] || con->place[k] == NOWHERE) continue;
 #if DIM > 0
-        if (con->kind == BODY) {
+        if (is_kind(con, BODY)) {
             V centers[MAX_ROWS];
             Ball ball;
             ball_centers(&q->s, i, k, x, centers);
@@ -65,7 +65,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
             }
             continue;
         }
-        if (con->kind != FUNCTION) {
+        if (!is_kind(con, FUNCTION)) {
             count += touched_solids(con, q->s.rows + i, k, x);
             continue;
         }
@@ -98,7 +98,7 @@ static void fly(Samples *q, int64_t first) {
     if (o->dwell_cost > 0) cost += SET(o->dwell_cost * p->N) * cost_value(&q->s, p->N - 1, x, u);
     cost += SET(o->temperature) * likelihood;
     for (int l = 0; l < LANES && first + l < o->samples; l++) {
-        double score = (double)cost[l] + o->collision_penalty * (double)touched[l];
+        double score = (double)LANE(cost, l) + o->collision_penalty * (double)LANE(touched, l);
         /* A sample that isn't finite must not spoil the others. */
         q->score[first + l] = score - score == 0 ? score : DBL_MAX;
     }
@@ -133,7 +133,7 @@ static void average(Samples *q, uint64_t key, int64_t rows) {
     for (int64_t first = 0; first < o->samples; first += LANES) {
         V *sum = q->sum + first / LANES % BUNDLES;
         V weight = SET(0.0), eps[NU], u[NU];
-        for (int l = 0; l < LANES && first + l < o->samples; l++) weight[l] = (REAL)q->score[first + l];
+        for (int l = 0; l < LANES && first + l < o->samples; l++) LANE(weight, l) = (REAL)q->score[first + l];
         if (!any(weight > SET(0.0))) continue;
         normal(key, first, rows, q->z);
         for (int64_t k = 0; k < N; k++) {
@@ -143,7 +143,7 @@ static void average(Samples *q, uint64_t key, int64_t rows) {
     }
     for (int64_t i = 0; i < N * NU; i++) {
         double total = 0;
-        for (int l = 0; l < SUMS; l++) total += (double)q->sum[i * BUNDLES + l / LANES][l % LANES];
+        for (int l = 0; l < SUMS; l++) total += (double)LANE(q->sum[i * BUNDLES + l / LANES], l % LANES);
         q->mean[i] = SET(total);
     }
 }

@@ -7,55 +7,10 @@
 #include <stdint.h>
 #include <string.h>
 #include "functions.h"
+#include "wide.h" /* or export/c/wide_scalar.h */
 
-#ifdef __AVX512F__
-#define NET_WIDTH 8
-#else
-#define NET_WIDTH 4
-#endif
 #define NET_SIZE(h) (((h) + 15) / 16 * 16) /* whole vectors of neurons or lanes, in single precision, too */
-typedef REAL Wide __attribute__((vector_size(NET_WIDTH * sizeof(REAL))));
 
-/* a b + c, rounded once where the processor can, whatever the compiler makes of sums and products. */
-#if defined(__FMA__) && !defined(__clang__)
-#if defined(__AVX512F__)
-#define NET_FMA_double(a, b, c) __builtin_ia32_vfmaddpd512_mask(a, b, c, -1, 4)
-#define NET_FMA_float(a, b, c) __builtin_ia32_vfmaddps256(a, b, c)
-#else
-#define NET_FMA_double(a, b, c) __builtin_ia32_vfmaddpd256(a, b, c)
-#define NET_FMA_float(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
-#endif
-#endif
-TGCO_INLINE REAL net_fused_1(REAL a, REAL b, REAL c) {
-#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
-    return TGCO_MATH(fma)(a, b, c);
-#else
-    return a * b + c;
-#endif
-}
-TGCO_INLINE Wide net_fused(Wide a, Wide b, Wide c) {
-#ifdef NET_FMA_double
-    return TGCO_JOIN(NET_FMA_, REAL)(a, b, c);
-#else
-    for (int i = 0; i < NET_WIDTH; i++) c[i] = net_fused_1(a[i], b[i], c[i]);
-    return c;
-#endif
-}
-/* Over the columns and vectors of a block, whose sums are in registers only where the loop is unrolled. */
-#define NET_EACH(i, n) _Pragma("GCC unroll 8") for (int i = 0; i < n; i++)
-
-TGCO_INLINE Wide net_set(REAL a) { return a - (Wide){0}; }
-
-static inline Wide net_load(const double *from) {
-    Wide r;
-#if TGCO_IS_DOUBLE
-    memcpy(&r, from, sizeof r);
-#else
-    for (int i = 0; i < NET_WIDTH; i++) r[i] = (REAL)from[i];
-#endif
-    return r;
-}
-static inline Wide net_wide(const REAL *from) { Wide r; memcpy(&r, from, sizeof r); return r; }
 static inline V net_lanes(const REAL *from) { V r; memcpy(&r, from, sizeof r); return r; }
 static inline void net_store(REAL *to, V a) { memcpy(to, &a, sizeof a); }
 
@@ -65,16 +20,14 @@ static inline void net_weights(const double *from, int h, REAL *to) {
     for (int i = 0; i < h; i++) to[i] = (REAL)from[i];
 }
 
-/* Lanes whose numbers have the same bits as those of lane l. */
-static inline I net_alike(V a, int l) { return (I)a == ((I)a)[l]; }
-static inline int net_first(I left) { int l = 0; while (!left[l]) l++; return l; }
+static inline int net_first(I left) { int l = 0; while (!LANE(left, l)) l++; return l; }
 
 /* R vectors of y. */
 #define NET_AFFINE(R) \
     TGCO_INLINE void net_affine_##R( \
         const double *M, const double *b, int k, int h, const REAL *a, REAL *y) { \
         Wide s[R]; \
-        NET_EACH(r, R) s[r] = b ? net_load(b + r * NET_WIDTH) : (Wide){0}; \
+        NET_EACH(r, R) s[r] = b ? net_load(b + r * NET_WIDTH) : NET_ZERO; \
         for (int j = 0; j < k; j++) { \
             Wide z = net_set(a[j]); \
             NET_EACH(r, R) s[r] = net_fused(z, net_load(M + (int64_t)j * h + r * NET_WIDTH), s[r]); \
@@ -88,11 +41,11 @@ NET_AFFINE(1)
 
 /* The sum of w a over n neurons. */
 static inline REAL net_dot(const double *w, const REAL *a, int n) {
-    Wide s = {0};
+    Wide s = NET_ZERO;
     int i = 0;
     for (; i + NET_WIDTH <= n; i += NET_WIDTH) s = net_fused(net_load(w + i), net_wide(a + i), s);
     REAL total = 0;
-    for (int l = 0; l < NET_WIDTH; l++) total += s[l];
+    for (int l = 0; l < NET_WIDTH; l++) total += NET_ENTRY(s, l);
     for (; i < n; i++) total = net_fused_1((REAL)w[i], a[i], total);
     return total;
 }
@@ -120,7 +73,7 @@ TGCO_APART void net_affine(
     TGCO_INLINE void net_columns_##R##_##C( \
         const double *M, int k, int h, const REAL *G, REAL *sums) { \
         Wide s[R][C]; \
-        NET_EACH(r, R) NET_EACH(c, C) s[r][c] = (Wide){0}; \
+        NET_EACH(r, R) NET_EACH(c, C) s[r][c] = NET_ZERO; \
         for (int j = 0; j < k; j++) { \
             Wide m[R]; \
             NET_EACH(r, R) m[r] = net_load(M + (int64_t)j * h + r * NET_WIDTH); \
@@ -186,10 +139,10 @@ TGCO_APART REAL net_sum_of_counted(int h, const REAL *w, const REAL *s, const RE
 #define NET_PAIRS(C) \
     static void net_pairs_##C(int h, int d, const REAL *w, const REAL *s, const REAL *t, REAL *H) { \
         Wide sum[2][C]; \
-        NET_EACH(a, 2) NET_EACH(b, C) sum[a][b] = (Wide){0}; \
+        NET_EACH(a, 2) NET_EACH(b, C) sum[a][b] = NET_ZERO; \
         int i = 0, size = NET_SIZE(h); \
         for (; i + NET_WIDTH <= h; i += NET_WIDTH) { \
-            Wide by = net_wide(w + i), first = by * net_wide(s + i), second = by * net_wide(s + size + i); \
+            Wide by = net_wide(w + i), first = net_times(by, net_wide(s + i)), second = net_times(by, net_wide(s + size + i)); \
             NET_EACH(b, C) { \
                 Wide other = net_wide(t + b * size + i); \
                 sum[0][b] = net_fused(first, other, sum[0][b]); \
@@ -198,7 +151,7 @@ TGCO_APART REAL net_sum_of_counted(int h, const REAL *w, const REAL *s, const RE
         } \
         for (int a = 0; a < 2; a++) NET_EACH(b, C) { \
             REAL total = 0; \
-            for (int l = 0; l < NET_WIDTH; l++) total += sum[a][b][l]; \
+            for (int l = 0; l < NET_WIDTH; l++) total += NET_ENTRY(sum[a][b], l); \
             for (int j = i; j < h; j++) total = net_fused_1(w[j] * s[a * size + j], t[b * size + j], total); \
             H[a * d + b] += total == total ? total : net_sum_of_counted(h, w, s + a * size, t + b * size); \
         } \

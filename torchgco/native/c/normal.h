@@ -4,6 +4,12 @@
 #include "constants.h"
 #include "lanes.h"
 
+/* As many numbers of 32 bits, and numbers of other types that have the same values. */
+typedef uint32_t W __attribute__((vector_size(LANES * 4)));
+typedef int32_t Z __attribute__((vector_size(LANES * 4)));
+typedef float F __attribute__((vector_size(LANES * 4)));
+#define TGCO_CONVERTED(a, type) __builtin_convertvector(a, type)
+
 static inline F single(float c) { return c - (F){0}; }
 
 static inline W mixed(W z) {

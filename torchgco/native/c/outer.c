@@ -2,124 +2,7 @@
    and the tests of the end, until each has ended. solvers/augmented_lagrangian.py does the same in PyTorch. */
 #include <float.h>
 #include "lifted.h"
-
-/* What a sweep over an iterate finds. */
-typedef struct {
-    V violation, touched; /* touched: rows in contact at a knot */
-    V slack;              /* sum of |lam c| over inequalities with c < 0 */
-    int update;           /* whether multipliers change */
-} Sweep;
-
-/* One row: its value c, by how much it is violated, and its multiplier. */
-static inline void note(const Lanes *s, const Constraint *con, V c, V violated, V *lam, I *pushed, Sweep *sweep) {
-    V zero = SET(0.0), worst = sweep->violation;
-    sweep->violation = tgco_choose((violated > worst) | (violated != violated), violated, worst); /* NaN stays */
-    sweep->touched += tgco_truth(c > zero);
-    if (!con->equality) SUBTRACT(sweep->slack, *lam, tgco_choose(c > zero, zero, c));
-    if (!sweep->update) return;
-    V next = *lam + s->mu * c;
-    *lam = con->equality ? next : tgco_choose(next < zero, zero, next);
-    *pushed |= *lam != zero;
-}
-
-/* By how much |v| is beyond r, where c = s (|v|^2 - r^2) / (2 r) is at least 0; `radius` is s r. */
-static inline V past_radius(V c, V radius) {
-    V square = SET(1.0) + (c + c) / radius; /* (|v| / r)^2 */
-    return (c + c) / (SET(1.0) + tgco_sqrt(tgco_choose(square < SET(0.0), SET(0.0), square)));
-}
-
-#if DIM > 0
-/* Rows of obstacles at one knot. */
-static inline void note_solids(
-    Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, I *pushed, Sweep *sweep) {
-    int64_t place = con->place[k];
-    V *lam = rows->lam + place * con->rows, zero = SET(0.0);
-    if (con->kind == SPHERES) {
-        V c[BLOCK];
-        for (int64_t first = 0; first < con->rows; first += BLOCK) {
-            int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
-            if (!spheres(con, rows, first, last, k, x, c)) continue; /* no multiplier, and none to come */
-            for (int64_t j = first; j < last; j++) {
-                V value = c[j - first], square = square_at(con, rows, j, k);
-                V depth = tgco_sqrt(square) - tgco_sqrt(square - value);
-                note(s, con, value, tgco_choose(value <= zero, zero, depth), lam + j, pushed, sweep);
-            }
-        }
-    } else if (con->kind == BOXES) {
-        const V *factors = rows->bound + con->rows * 2 * DIM;
-        int known = any(rows->pushed[place]);
-        for (int64_t first = 0, last; first < con->rows; first = last) {
-            last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
-            if (!some_matter(con, rows, lam, known, first, last, x)) continue;
-            for (int64_t j = first; j < last; j++) {
-                if (!may_matter(con, rows, lam, known, j, x)) continue;
-                V c = solid(con, rows, j, k, x, 0);
-                note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, pushed, sweep);
-            }
-        }
-    } else if (any(rows->pushed[place]) || !is_far_from_map(con, rows, x)) {
-        V c = field_row(con, rows, k, x, 0, 0);
-        note(s, con, c, tgco_choose(c <= zero, zero, depth_of(rows, c)), lam, pushed, sweep);
-    }
-}
-#endif
-
-/* Rows of one knot of a constraint. */
-static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sweep *sweep) {
-    const Constraint *con = s->of->constraint + i;
-    const Rows *rows = s->rows + i;
-    int64_t place = con->place[k];
-    V *lam = rows->lam + place * con->rows, zero = SET(0.0);
-    I none = zero != zero, pushed = none;
-    if (con->kind == BOUNDS) {
-        for (int j = 0; j < con->rows; j++) {
-            V c = bound(con, rows, j, k, x, u);
-            note(s, con, c, tgco_choose(c < zero, zero, c), lam + j, &pushed, sweep);
-        }
-#if DIM > 0
-    } else if (con->kind != FUNCTION && con->kind != BODY) {
-        note_solids(s, con, rows, k, x, &pushed, sweep);
-    } else if (con->kind == BODY) {
-        V centers[MAX_ROWS];
-        Ball ball;
-        ball_centers(s, i, k, x, centers);
-        for (int b = 0; b < con->balls; b++) {
-            ball_at(con, rows, b, k, centers + b * DIM, &ball);
-            note_solids(s, &ball.con, &ball.rows, k, ball.x, &pushed, sweep);
-        }
-#endif
-    } else {
-        V c[MAX_ROWS];
-        model_rows((int)i, x, u, at(rows->bound, &con->bound, place), con->shared, c);
-        for (int j = 0; j < con->rows; j++) {
-            V violated = con->equality ? tgco_fabs(c[j]) : tgco_choose(c[j] < zero, zero, c[j]);
-            if (con->radii.data) violated = past_radius(violated, at(rows->radii, &con->radii, place)[j]);
-            note(s, con, c[j], violated, lam + j, &pushed, sweep);
-        }
-    }
-    if (sweep->update) rows->pushed[place] = pushed;
-}
-
-/* What a sweep over the iterates finds, of all rows or of obstacles alone, and whether one is caught: `least` rows of
-   obstacles or more in contact at a knot, start and end left out. */
-static Sweep swept(Lanes *s, int obstacles, int update, V least, I *caught) {
-    int64_t N = s->of->N;
-    V zero = SET(0.0);
-    Sweep sweep = {zero, zero, zero, update};
-    *caught = zero != zero;
-    for (int64_t k = 0; k <= N; k++) {
-        V contacts = zero;
-        for (int64_t i = 0; i < s->of->constraints; i++) {
-            const Constraint *con = s->of->constraint + i;
-            if (con->place[k] == NOWHERE || (obstacles && !con->geometric)) continue;
-            sweep.touched = zero;
-            note_rows(s, i, k, s->X + k * NX, k < N ? s->U + k * NU : 0, &sweep);
-            if (con->geometric) contacts += sweep.touched;
-        }
-        if (k > 0 && k < N) *caught |= contacts >= least;
-    }
-    return sweep;
-}
+#include "sweep.h"
 
 /* Whether a trajectory of problem e counts as feasible and arrived. */
 static int arrived(const Outer *o, int64_t e, double violation, const double *X) {
@@ -175,42 +58,42 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
     for (int l = 0; l < LANES; l++) {
         int64_t e = number[l < count ? l : 0];
         enter(s, l, e);
-        least[l] = o->single_after >= 0 && o->base[e] + o->outer[e] + 1 >= o->single_after ? 1 : 2;
+        LANE(least, l) = o->single_after >= 0 && o->base[e] + o->outer[e] + 1 >= o->single_after ? 1 : 2;
     }
     V violation = swept(s, 0, !failed, least, &caught).violation;
     for (int l = 0; l < count && !failed; l++) {
         int64_t e = number[l];
         double growth = o->growth;
-        if (o->ends && violation[l] <= o->tolerance) growth = 1;
-        s->mu[l] *= growth;
-        if (s->mu[l] > o->penalty_max) s->mu[l] = o->penalty_max;
-        s->inverse_mu[l] = 1 / s->mu[l];
-        p->mu[e] = s->mu[l];
+        if (o->ends && LANE(violation, l) <= o->tolerance) growth = 1;
+        LANE(s->mu, l) *= growth;
+        if (LANE(s->mu, l) > o->penalty_max) LANE(s->mu, l) = o->penalty_max;
+        LANE(s->inverse_mu, l) = 1 / LANE(s->mu, l);
+        p->mu[e] = LANE(s->mu, l);
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *c = p->constraint + i;
             double *lam = c->lam + e * c->knots * c->rows;
             for (int64_t k = 0; k < c->knots; k++, lam += c->rows) {
                 const V *next = s->rows[i].lam + k * c->rows;
-                if (s->rows[i].pushed[k][l]) for (int j = 0; j < c->rows; j++) lam[j] = next[j][l];
+                if (LANE(s->rows[i].pushed[k], l)) for (int j = 0; j < c->rows; j++) lam[j] = LANE(next[j], l);
                 else memset(lam, 0, c->rows * sizeof *lam);
             }
         }
-        if (preferred(o, e, violation[l])) keep(o, e, violation[l]);
+        if (preferred(o, e, LANE(violation, l))) keep(o, e, LANE(violation, l));
         o->outer[e]++;
-        o->outcome[e] = tested(o, e, violation[l], caught[l] != 0);
+        o->outcome[e] = tested(o, e, LANE(violation, l), LANE(caught, l) != 0);
         o->last_cost[e] = p->cost[e];
     }
     int going = 0;
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];
         going |= o->outcome[e] == RUNNING;
-        if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= DBL_MAX)) keep(o, e, violation[l]);
+        if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= DBL_MAX)) keep(o, e, LANE(violation, l));
     }
     if (!going) return;
     V merit = merit_of(s, &total);
     for (int l = 0; l < count; l++) {
         int64_t e = number[l];
-        p->cost[e] = total[l]; p->merit[e] = merit[l];
+        p->cost[e] = LANE(total, l); p->merit[e] = LANE(merit, l);
         p->regularisation[e] = 0; p->inner[e] = p->rung[e] = 0;
     }
 }
@@ -267,91 +150,3 @@ int tgco_outer(const Outer *o, int64_t first, int64_t last) {
     free(running); free(some);
     return done;
 }
-
-/* The largest violation of given trajectories, into `merit`. */
-static void put_violation(Lanes *s, int64_t e, int used) {
-    I caught;
-    V violation = swept(s, 0, 0, SET(0.0), &caught).violation;
-    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
-}
-int tgco_violation(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_iterate, put_violation);
-}
-
-/* The same of rows of obstacles alone. */
-static void put_penetration(Lanes *s, int64_t e, int used) {
-    I caught;
-    V violation = swept(s, 1, 0, SET(0.0), &caught).violation;
-    for (int l = 0; l < used; l++) s->of->merit[e + l] = violation[l];
-}
-int tgco_penetration(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_iterate, put_penetration);
-}
-
-/* The sums of |lam c| over inequalities with c < 0 of given trajectories, into `merit`. */
-static void put_slack(Lanes *s, int64_t e, int used) {
-    I caught;
-    V slack = swept(s, 0, 0, SET(0.0), &caught).slack;
-    for (int l = 0; l < used; l++) s->of->merit[e + l] = slack[l];
-}
-int tgco_slack(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_slack); }
-
-#if DIM > 0
-/* Squared distance of the origin from the segment that begins at a and goes along. */
-static inline V from_segment(const V *a, const V *along) {
-    V length = SET(0.0), toward = SET(0.0), square = SET(0.0);
-    for (int i = 0; i < DIM; i++) { ADD(length, along[i], along[i]); SUBTRACT(toward, a[i], along[i]); }
-    V share = tgco_choose(length > SET(0.0), toward / length, SET(0.0));
-    share = tgco_choose(share < SET(0.0), SET(0.0), tgco_choose(share > SET(1.0), SET(1.0), share));
-    for (int i = 0; i < DIM; i++) { V gap = a[i] + share * along[i]; ADD(square, gap, gap); }
-    return square;
-}
-
-/* The smallest distance of the straight lines between knots from spheres whose radii are scaled by `gain`, into `merit`;
-   infinite without one. Here the lanes are knots: a problem alone takes as long as one of many. */
-int tgco_chords(const Problem *p, int64_t first, int64_t last) {
-    int64_t N = p->N, blocks = (N + LANES - 1) / LANES;
-    V *points = aligned_alloc(sizeof(V), 2 * DIM * blocks * sizeof(V)); /* the first and the last one of each line */
-    if (!points) return 0;
-    for (int64_t e = first; e < last; e++) {
-        V least = SET(INFINITY), knot;
-        for (int64_t i = 0; i < 2 * DIM * blocks; i++)
-            for (int l = 0; l < LANES; l++) {
-                int64_t k = i / (2 * DIM) * LANES + l, end = i / DIM % 2;
-                points[i][l] = p->X[(e * (N + 1) + (k < N ? k : N - 1) + end) * NX + POSITION + i % DIM];
-            }
-        for (int64_t i = 0; i < p->constraints; i++) {
-            const Constraint *con = p->constraint + i;
-            if (con->kind != SPHERES || con->moved) continue;
-            const double *o = con->bound.data + e * con->bound.element;
-            const double *squares = con->squares.data + e * con->squares.element;
-            const double *v = con->velocities.data ? con->velocities.data + e * con->velocities.element : NULL;
-            double stop = con->stops.data ? con->stops.data[e * con->stops.element] : INFINITY;
-            for (int64_t j = 0; j < con->rows; j++, o += DIM, v += v ? DIM : 0) {
-                if (!(squares[j] >= 0)) continue;
-                V radius = SET(p->gain * sqrt(squares[j])), a[DIM], along[DIM];
-                for (int64_t block = 0; block < blocks; block++) {
-                    const V *from = points + 2 * DIM * block, *to = from + DIM;
-                    for (int l = 0; l < LANES; l++) knot[l] = block * LANES + l < N ? block * LANES + l : N - 1;
-                    for (int d = 0; d < DIM; d++) {
-                        V b = to[d] - SET(o[d]);
-                        a[d] = from[d] - SET(o[d]);
-                        if (v) {
-                            SUBTRACT(a[d], knot * SET(con->dt), SET(v[d]));
-                            SUBTRACT(b, (knot + SET(1.0)) * SET(con->dt), SET(v[d]));
-                        }
-                        along[d] = b - a[d];
-                    }
-                    V gap = tgco_sqrt(from_segment(a, along)) - radius;
-                    I closer = ((gap < least) | (gap != gap)) & (knot + SET(1.0) <= SET(stop)); /* NaN stays */
-                    least = tgco_choose(closer, gap, least);
-                }
-            }
-        }
-        p->merit[e] = least[0];
-        for (int l = 1; l < LANES; l++) if (least[l] < p->merit[e] || least[l] != least[l]) p->merit[e] = least[l];
-    }
-    free(points);
-    return 1;
-}
-#endif

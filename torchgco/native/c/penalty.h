@@ -11,7 +11,7 @@ static inline V worth(const Lanes *s, int equality, V c, V lam) {
         return tgco_choose(idle, -half * lam * lam * s->inverse_mu, tgco_fused(half * mu, c, lam) * c);
     }
     I idle = (c < SET(0.0)) & (lam == SET(0.0));
-    return tgco_fused(half * tgco_if(~idle, mu), c, lam) * c;
+    return tgco_fused(half * tgco_if(NOT(idle), mu), c, lam) * c;
 }
 
 /* First and second derivative of `worth` by c; where `optimality` is set, of lam c with the penalty's curvature. */
@@ -26,9 +26,9 @@ static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
     }
     if (equality) { *rho = mu; return tgco_fused(mu, c, lam); }
     I idle = p->phr ? tgco_fused(mu, c, lam) < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
-    *rho = tgco_if(~idle, mu);
+    *rho = tgco_if(NOT(idle), mu);
     V g = tgco_fused(*rho, c, lam);
-    return p->phr ? tgco_if(~idle, g) : g;
+    return p->phr ? tgco_if(NOT(idle), g) : g;
 }
 
 /* Adds the derivatives of the term of a row c with its slopes by position. */

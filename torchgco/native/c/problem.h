@@ -34,6 +34,15 @@ typedef struct {
     V *memory;
 } Lanes;
 
+/* Bits of the kinds of rows that there may be; where a text serves one problem, of its own alone. */
+#ifndef KINDS
+#define KINDS (-1)
+#endif
+static inline int is_kind(const Constraint *con, int kind) { return (KINDS >> kind & 1) && con->kind == kind; }
+static inline int is_solid(const Constraint *con) {
+    return is_kind(con, SPHERES) || is_kind(con, BOXES) || is_kind(con, FIELD);
+}
+
 static inline int any(I where) { return tgco_any(where); }
 static inline I tgco_finite(V a) { return (a - a) == SET(0.0); }
 

@@ -38,7 +38,7 @@ static inline int spheres(
     for (int64_t j = first; j < last; j++) {
         V away[DIM];
         c[j - first] = sphere(con, rows, j, k, x, away);
-        matters |= ~(c[j - first] <= SET(0.0)); /* NaN matters */
+        matters |= NOT(c[j - first] <= SET(0.0)); /* NaN matters */
     }
     return any(matters);
 }

@@ -53,10 +53,12 @@ typedef struct {
     double *X, *U, *cost, *merit, *regularisation; /* (E, ...) in and out */
     double *alpha, *used; /* (E): step length and mu_r of the last iteration */
     double *gains; /* (E, N, NU, NZ): what tgco_gains writes */
-    double *slopes, *curvatures; /* (E, N+1, S), (E, N+1, S, S): what tgco_expand writes */
+    double *slack, *violation; /* (E): the same; NULL: not asked for */
+    double *slopes, *curvatures; /* (E, N+1, S), (E, N+1, S, S): what tgco_expand writes; (E, N+1, NX) of tgco_costates */
     double *mu;
     int64_t *inner, *iterations, *rung;
-    int32_t *status, *converged, *refused, *lost;
+    int32_t *status, *converged, *refused, *lost, *sensitive; /* sensitive: of tgco_gains; NULL: not asked for */
+    const int64_t *numbers; /* (E): at which place each problem's parameters, cost and constraints are; NULL: at its own */
     Array parameters; /* of the model: (E, N, count) */
     /* Numbers w that all problems share, of the model, and of stages and the last knot of a traced cost. */
     const double *shared, *stage_shared, *last_shared;
@@ -66,6 +68,8 @@ typedef struct {
     Array center, radius, weight;
     Options options;
     double gain; /* share of L_M by which tgco_lift must lower it */
+    double nudge; /* share of the controls by which tgco_gains changes them; times `gain` states may change by it */
+    void *arena; /* of an exported solver, where its memory comes from (export/c/arena.h); else NULL */
 } Problem;
 
 /* The outer loop of the augmented Lagrangian (see solvers.augmented_lagrangian). */

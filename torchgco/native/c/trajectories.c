@@ -1,72 +1,28 @@
-/* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions, gains,
+/* Functions that Python calls on the problems first, ..., last - 1 with given trajectories: values, expansions,
    rollouts, `lift`, and inner solves. They return 0 without memory. */
 #include "lifted.h"
+#include "rollout.h"
 
 /* J_var and L_M of given trajectories. */
 static void put_values(Lanes *s, int64_t e, int used) {
     V total, merit = merit_of(s, &total);
     for (int l = 0; l < used; l++) {
-        s->of->cost[e + l] = total[l];
-        s->of->merit[e + l] = merit[l];
+        s->of->cost[e + l] = LANE(total, l);
+        s->of->merit[e + l] = LANE(merit, l);
     }
 }
 int tgco_value(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_values); }
-
-/* One backward pass along given trajectories: gains (E, N, NU, NZ) and the two sums of the expected change. */
-static void put_gains(Lanes *s, int64_t e, int used) {
-    const Problem *p = s->of;
-    int64_t size = p->N * NU * NZ;
-    V linear, squares, lowest;
-    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
-    V quadratic = -linear - s->mu_r * squares;
-    for (int l = 0; l < used; l++) {
-        p->cost[e + l] = linear[l];
-        p->merit[e + l] = quadratic[l];
-        p->status[e + l] = lowest[l] > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
-        for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = s->G[i][l];
-    }
-}
-int tgco_gains(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_gains); }
-
-/* Rollout from the first knot of X, in place: of U, or with feedback of U + K (x - X), in place of U, too. */
-TGCO_INLINE int roll_out(const Problem *p, int64_t first, int64_t last, int feedback) {
-    int64_t N = p->N;
-    V parameters[NP ? NP : 1], x[2 * NX], u[NU];
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) {
-            int64_t element = e + l < last ? e + l : e;
-            fill_stage(parameters, &p->parameters, 0, l, element);
-            for (int i = 0; i < NX; i++) x[i][l] = p->X[element * (N + 1) * NX + i];
-        }
-        for (int64_t k = 0; k < N; k++) {
-            for (int l = 0; l < LANES; l++) {
-                int64_t element = e + l < last ? e + l : e;
-                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, element);
-                double *X = p->X + (element * (N + 1) + k) * NX, *U = p->U + (element * N + k) * NU;
-                const double *K = feedback ? p->gains + (element * N + k) * NU * NZ : NULL;
-                for (int j = 0; j < NU; j++) {
-                    u[j][l] = U[j];
-                    for (int i = 0; feedback && i < NX; i++) u[j][l] += K[j * NZ + i] * (x[i][l] - X[i]);
-                }
-            }
-            for (int l = 0; l < LANES && e + l < last; l++) {
-                for (int j = 0; feedback && j < NU; j++) p->U[((e + l) * N + k) * NU + j] = u[j][l];
-                for (int i = 0; i < NX; i++) p->X[((e + l) * (N + 1) + k) * NX + i] = x[i][l];
-            }
-            model_step(x, u, parameters, p->shared, x + NX);
-            memcpy(x, x + NX, NX * sizeof(V));
-        }
-        for (int l = 0; l < LANES && e + l < last; l++)
-            for (int i = 0; i < NX; i++) p->X[((e + l) * (N + 1) + N) * NX + i] = x[i][l];
-    }
-    return 1;
-}
 
 /* Rollout of U from the first knot of X. */
 int tgco_open_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 0); }
 
 /* Rollout of U + K (x - X) from the first knot of X, in place of X and U; gains (E, N, NU, NZ), of which K is used. */
 int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 1); }
+
+/* The same, and J_var and L_M along it. */
+int tgco_begin(const Problem *p, int64_t first, int64_t last) {
+    return roll_out(p, first, last, 0) && tgco_value(p, first, last);
+}
 
 /* Gradients (E, N+1, S) and upper triangles of the Hessians (E, N+1, S, S) of all terms. */
 static void put_expansion(Lanes *s, int64_t e, int used) {
@@ -79,8 +35,8 @@ static void put_expansion(Lanes *s, int64_t e, int used) {
         knot_expand(s, k, x, u, g, H);
         for (int l = 0; l < used; l++) {
             int64_t at = (e + l) * (p->N + 1) + k;
-            for (int i = 0; i < S; i++) p->slopes[at * S + i] = g[i][l];
-            for (int i = 0; i < S * S; i++) p->curvatures[at * S * S + i] = H[i][l];
+            for (int i = 0; i < S; i++) p->slopes[at * S + i] = LANE(g[i], l);
+            for (int i = 0; i < S * S; i++) p->curvatures[at * S * S + i] = LANE(H[i], l);
         }
     }
 }
@@ -92,6 +48,23 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
     int64_t *number = in_order(first, last);
     if (!number || !start(s, p)) { free(number); return 0; }
     inner_solves(s, number, last - first);
+    free(number);
+    finish(s);
+    return 1;
+}
+
+/* The same from the rollout of U, where that is finite. */
+int tgco_descend(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    int64_t size = (p->N + 1) * NX, count = 0, *number = in_order(first, last);
+    if (!number || !tgco_begin(p, first, last) || !start(s, p)) { free(number); return 0; }
+    for (int64_t e = first; e < last; e++) {
+        double sum = 0 * p->merit[e];
+        for (int64_t i = 0; i < size; i++) sum += 0 * p->X[e * size + i];
+        if (sum == 0) number[count++] = e;
+        else p->status[e] = NON_FINITE;
+    }
+    if (count) inner_solves(s, number, count);
     free(number);
     finish(s);
     return 1;

@@ -125,7 +125,7 @@ def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | No
         arguments, passed, outputs = f"{arguments}, V *f", f"{passed}, f", [slopes, column]
     lines = [
         calls.emit_staged(f"{name}_entries", inputs, outputs, stages),
-        f"__attribute__((noinline)) static void {name}({arguments}, V *H) {{",
+        f"TGCO_APART void {name}({arguments}, V *H) {{",
         f"    V e[{max(1, len(upper))}];",
         f"    {name}_entries({passed}, e);",
         *(f"    H[{i * size + j}] += e[{k}];" for k, (i, j, _) in enumerate(upper)),

@@ -164,7 +164,7 @@ _OPERATORS = {
     "ASSIGN": "{0}", "LIFT": "{0}", "ADD": "{0} + {1}", "SUB": "{0} - {1}", "MUL": "{0} * {1}", "DIV": "{0} / {1}",
     "NEG": "-{0}", "SQ": "{0} * {0}", "TWICE": "{0} + {0}", "INV": "SET(1.0) / {0}",
     "LT": "tgco_truth({0} < {1})", "LE": "tgco_truth({0} <= {1})", "EQ": "tgco_truth({0} == {1})",
-    "NE": "tgco_truth({0} != {1})", "NOT": "tgco_truth(~tgco_is({0}))",
+    "NE": "tgco_truth({0} != {1})", "NOT": "tgco_truth(NOT(tgco_is({0})))",
     "AND": "tgco_truth(tgco_is({0}) & tgco_is({1}))", "OR": "tgco_truth(tgco_is({0}) | tgco_is({1}))",
     "IF_ELSE_ZERO": "tgco_if(tgco_is({0}), {1})", "CONSTPOW": "tgco_pow({0}, {1})",
     "FMIN": "tgco_minimum({0}, {1})", "FMAX": "tgco_maximum({0}, {1})", "REMAINDER": "tgco_single({0})",

@@ -267,12 +267,12 @@ def _derived(layer: Neurons) -> Derivatives:
 
 
 _LANES_VALUE = """
-__attribute__((noinline)) static void tgco_net_KEY(const double *w, const V *z, V *o) {
-    for (I left = SET(0.0) == SET(0.0), same; tgco_any(left); left &= ~same) {
+TGCO_APART void tgco_net_KEY(const double *w, const V *z, V *o) {
+    for (I left = SET(0.0) == SET(0.0), same; tgco_any(left); left &= NOT(same)) {
         int l = net_first(left);
         REAL a[NET_SIZE(COUNT_K)], out[COUNT_R];
         same = left;
-        for (int i = 0; i < COUNT_K; i++) { same &= net_alike(z[i], l); a[i] = z[i][l]; }
+        for (int i = 0; i < COUNT_K; i++) { same &= net_alike(z[i], l); a[i] = LANE(z[i], l); }
         tgco_net_KEY_one(w, a, out);
         for (int i = 0; i < COUNT_R; i++) o[i] = tgco_choose(same, SET(out[i]), o[i]);
     }
@@ -280,16 +280,16 @@ __attribute__((noinline)) static void tgco_net_KEY(const double *w, const V *z, 
 
 _LANES_DERIVED = """
 typedef struct { V of[1]; tgco_net_KEY_point at[LANES]; } tgco_net_KEY_kept;
-__attribute__((noinline)) static void tgco_net_KEY_ahead(
+TGCO_APART void tgco_net_KEY_ahead(
     const double *w, const V *z, const V *T, V *o, V *to, tgco_net_KEY_kept *kept) {
-    for (I left = SET(0.0) == SET(0.0), same; tgco_any(left); left &= ~same) {
+    for (I left = SET(0.0) == SET(0.0), same; tgco_any(left); left &= NOT(same)) {
         int l = net_first(left);
         REAL a[NET_SIZE(COUNT_K)], t[COUNT_E * NET_SIZE(COUNT_K)], out[COUNT_R], made[COUNT_D * COUNT_R];
         same = left;
-        for (int i = 0; i < COUNT_K; i++) { same &= net_alike(z[i], l); a[i] = z[i][l]; }
+        for (int i = 0; i < COUNT_K; i++) { same &= net_alike(z[i], l); a[i] = LANE(z[i], l); }
         for (int c = 0; c < COUNT_D; c++) for (int i = 0; i < COUNT_K; i++) {
             if (T) same &= net_alike(T[c * COUNT_K + i], l);
-            t[c * NET_SIZE(COUNT_K) + i] = T ? T[c * COUNT_K + i][l] : i == c;
+            t[c * NET_SIZE(COUNT_K) + i] = T ? LANE(T[c * COUNT_K + i], l) : i == c;
         }
         tgco_net_KEY_ahead_one(w, a, t, out, made, kept->at + l);
         kept->of[0] = tgco_choose(same, SET(l), kept->of[0]);
@@ -297,14 +297,14 @@ __attribute__((noinline)) static void tgco_net_KEY_ahead(
         for (int i = 0; i < COUNT_D * COUNT_R; i++) to[i] = tgco_choose(same, SET(made[i]), to[i]);
     }
 }
-__attribute__((noinline)) static void tgco_net_KEY_back(
+TGCO_APART void tgco_net_KEY_back(
     const double *w, const tgco_net_KEY_kept *kept, const V *y, V *v, V *H) {
-    for (I left = SET(0.0) == SET(0.0), same; tgco_any(left); left &= ~same) {
-        int l = net_first(left), at = (int)kept->of[0][l];
+    for (I left = SET(0.0) == SET(0.0), same; tgco_any(left); left &= NOT(same)) {
+        int l = net_first(left), at = (int)LANE(kept->of[0], l);
         REAL b[COUNT_R], out[COUNT_K] = {0}, made[COUNT_E * COUNT_E] = {0};
         int counts = 0; /* all is 0 where y is, be the network's derivatives NaN: of a branch that isn't taken */
         same = left & (kept->of[0] == SET(at));
-        for (int i = 0; i < COUNT_R; i++) { same &= net_alike(y[i], l); b[i] = y[i][l]; counts |= b[i] != 0; }
+        for (int i = 0; i < COUNT_R; i++) { same &= net_alike(y[i], l); b[i] = LANE(y[i], l); counts |= b[i] != 0; }
         if (counts) tgco_net_KEY_back_one(w, kept->at + at, b, out, made);
         for (int i = 0; i < COUNT_K; i++) v[i] = tgco_choose(same, SET(out[i]), v[i]);
         for (int p = 0, e = 0; p < COUNT_D; p++) for (int q = p; q < COUNT_D; q++, e++)

@@ -4,7 +4,7 @@ the sparse Jacobian and its functions, and those of the solver, which are compil
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +13,10 @@ from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource
 from torchgco.native.codegen.emit import literal, switch
 from torchgco.native.codegen.knot import KnotSource
-from torchgco.native.compiler import Unit, lanes
+from torchgco.native.compiler import Unit, lanes, neurons
 from torchgco.native.declarations import defines
 from torchgco.native.includes import included, joined
-from torchgco.native.structures import HEADER, constants
+from torchgco.native.structures import HEADER, Kind, constants
 
 LANES = lanes()
 FEW_LANES = 2, 4  # lanes of libraries for few problems: lanes without a problem take time, too
@@ -69,13 +69,16 @@ class Library:
 
 
 PASS_SOURCES = "model.c", "passes.c"
-SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c"))
+SOLVER_LIBRARY = Library(PASS_SOURCES, (), ("trajectories.c", "outer.c", "verdict.c"))
 SAMPLER = Library(("model.c",), (), ("mppi.c",))
 # The model's unit is that of SOLVER_LIBRARY: it is compiled once for both.
 INTERIOR = Library(PASS_SOURCES, ("riccati.c",), ("interior.c", "interior_kkt.c"))
 # The same where Python computes the functions.
 CALLED = Library(("called.c",), INTERIOR.curvature, INTERIOR.shared)
-SIZES = "NX", "NU", "NP", "NJ", "MAX_ROWS"  # which model.c defines for the others
+# Sizes that the model's unit defines for the others.
+SIZES = {name: f"tgco_{name.lower()}" for name in ("NX", "NU", "NP", "NJ", "MAX_ROWS")}
+SIZES_DEFINED = f"const int {', '.join(f'{name} = {size}' for size, name in SIZES.items())};\n"
+SIZES_DECLARED = f'extern __attribute__((visibility("hidden"))) const int {", ".join(SIZES.values())};\n'
 
 
 _units: dict[tuple[Any, ...], tuple[Unit, ...]] = {}  # reading and joining files takes longer than a small solve
@@ -108,18 +111,42 @@ class Form:
         functions = tuple((i, rows.key) for i, rows in self.functions)
         return self.dynamics.key, p and (p.start, p.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
 
-    def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
-        model, position = self.dynamics, self.position
-        sizes = {
+    def alone(self, kinds: Iterable[Kind], declared: str, given: Mapping[str, str]) -> str:
+        """C of a single lane that needs no other unit: the interior point, sweeps and rollouts.
+
+        Args:
+            kinds: of the rows that there are; no code for others is left.
+            declared: what comes after the structures.
+            given: texts that stand for vectors.h and others, by their names.
+        """
+        generated = [*self._model_code(), curvature_code(self.dynamics, self.functions)]
+        texts = {"constants.h": constants(), "code.h": "\n".join(generated)}
+        kept = {"NET_WIDTH": neurons(), "REAL": "double", "LANES": 1, "KINDS": sum(1 << kind for kind in set(kinds))}
+        sizes = kept | self._sizes | _space(self.position)
+        sizes["MAX_ROWS"] = max(sizes["MAX_ROWS"], sizes["DIM"])  # of places of balls, be there none
+        files = included("model.c", self._cost_file, "riccati.c", "interior.c", "sweep.h", "rollout.h")
+        return joined(defines(sizes) + included("structures.h") + declared + files, given=texts | dict(given))
+
+    @property
+    def _sizes(self) -> dict[str, Any]:
+        model = self.dynamics
+        return {
             "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]), "QUADRATIC_FULL": int(self.dense),
         }  # fmt: skip
-        cost = "quadratic.c" if self.cost is None else "traced.c"
-        units = [Unit(_text(vectors | sizes, self._model_code(), cost, *library.model), own=True)]
+
+    @property
+    def _cost_file(self) -> str:
+        return "quadratic.c" if self.cost is None else "traced.c"
+
+    def _written(self, library: Library, vectors: dict[str, Any]) -> tuple[Unit, ...]:
+        model, sizes = self.dynamics, vectors | self._sizes
+        text = _text(sizes, self._model_code(), self._cost_file, *library.model) + SIZES_DEFINED
+        units = [Unit(text, own=True)]
         if library.curvature:
             generated = [curvature_code(model, self.functions), _products(model)]
-            units.append(Unit(_text(vectors | sizes, generated, *library.curvature), own=True))
-        return (*units, _shared_unit(vectors, position, library))
+            units.append(Unit(_text(sizes, generated, *library.curvature), own=True))
+        return (*units, _shared_unit(vectors, self.position, library))
 
     def _model_code(self) -> list[str]:
         generated = [self.dynamics.code, _products(self.dynamics), "" if self.cost is None else self.cost.code]
@@ -146,8 +173,9 @@ class CalledForm:
         }  # fmt: skip
         vectors, dense = {"REAL": "double", "LANES": lanes}, [included("dense.h")]
         cost = "called_cost.c" if self.dense is None else "quadratic.c"
-        units = [_text(vectors | sizes, dense, *files) for files in ((cost, *CALLED.model), CALLED.curvature)]
-        return (*(Unit(text, own=True) for text in units), _shared_unit(vectors, self.position, CALLED))
+        model, curvature = (_text(vectors | sizes, dense, *own) for own in ((cost, *CALLED.model), CALLED.curvature))
+        units = Unit(model + SIZES_DEFINED, own=True), Unit(curvature, own=True)
+        return (*units, _shared_unit(vectors, self.position, CALLED))
 
 
 def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
@@ -158,9 +186,12 @@ def _text(sizes: dict[str, Any], generated: list[str], *files: str) -> str:
 
 def _shared_unit(vectors: dict[str, Any], at: slice | None, library: Library) -> Unit:
     """The unit that reads sizes from the model."""
-    space = {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
-    read = {name: f"tgco_{name.lower()}" for name in SIZES} | space
-    return Unit(_text(vectors | read, [], *library.shared))
+    return Unit(SIZES_DECLARED + _text(vectors | SIZES | _space(at), [], *library.shared))
+
+
+def _space(at: slice | None) -> dict[str, int]:
+    """Where the position is among the states."""
+    return {"DIM": 0, "POSITION": 0} if at is None else {"DIM": at.stop - at.start, "POSITION": at.start}
 
 
 def _products(model: DynamicsSource) -> str:

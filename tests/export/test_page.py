@@ -1,0 +1,86 @@
+"""The manual's C and its node of ROS 2 compile and run; the command writes what `export_c` does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchgco
+from tests.export.exported import STRICT, exported, needs, needs_compiler, said
+from tests.export.kinds import car
+from torchgco import Problem, Spheres, load_c
+from torchgco.experiments.reports import export
+
+pytestmark = needs_compiler
+PAGE = Path(__file__).parents[2] / "docs" / "microcontroller.md"
+STUBS = Path(__file__).parent / "ros2"
+
+
+def block(language: str) -> str:
+    """The only block of a language on the page."""
+    (found,) = re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    problem = car(Spheres([[12.0, 1.2]], [0.8], 0.5))
+    return exported(problem, tmp_path_factory.mktemp("car"), "x_ref", "centers")
+
+
+@needs("gcc")
+def test_the_firmware_of_the_page_compiles(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "firmware.c").write_text(block("c"))
+    said("gcc", *STRICT, f"-I{folder}", "-c", tmp_path / "firmware.c", "-o", tmp_path / "firmware.o", folder=folder)
+
+
+@needs("gcc", "g++")
+def test_the_node_of_the_page_steers(folder: Path, tmp_path: Path) -> None:
+    """With stubs of rclcpp, which deliver a message of each kind and let three periods pass."""
+    text = block("cpp")
+    assert len(text.splitlines()) <= 100
+    (tmp_path / "node.cpp").write_text(text)
+    said("gcc", *STRICT, "-O2", "-c", "car.c", "-o", tmp_path / "car.o", folder=folder)
+    flags = "-std=c++17", "-Wall", "-Wextra", f"-I{STUBS}", f"-I{folder}"
+    said("g++", *flags, tmp_path / "node.cpp", tmp_path / "car.o", "-lm", "-o", tmp_path / "node", folder=folder)
+    lines = said(tmp_path / "node", folder=folder).splitlines()
+    assert len(lines) == 3 and all(re.fullmatch(r"published -?[0-3]\.\d{3} -?0\.\d{3}", line) for line in lines)
+
+
+WORDS = "model=planar", "scenario=planar_random", "study.layouts=2", "seed=3"
+
+
+def planned(layout: int) -> Problem:
+    setup = torchgco.compose(WORDS)
+    return setup.vehicle.task(setup.layouts().take(np.array([layout]))).problem
+
+
+def test_the_command_writes_the_controller_of_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    target = tmp_path / "boat"
+    words = [*WORDS, "--c", "boat", "--output", str(target), "--layout", "1", "--changes", "centers"]
+    assert export.main(words) == 0 and "boat.c" in capsys.readouterr().out
+    c, problem = load_c(target), planned(1)
+    assert set(c.numbers) == {"centers"}
+    u, v = c.step(problem.x0[0]), torchgco.compile(problem, "interior_point")(x0=problem.x0).u[0]
+    assert torch.equal(u, v)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((*WORDS, "--c", "2"), "word of C"),
+        ((*WORDS, "--c", "boat", "--layout", "0", "1"), "layout"),
+        ((*WORDS, "--c", "boat", "--rate", "10"), "--rate"),
+        ((*WORDS, "--c", "boat", "--changes", "wind"), "wind"),
+        (("nowhere", "--c", "boat"), "RUN"),
+        (("one", "two"), "RUN"),
+    ],
+)
+def test_a_wrong_command_gets_one_line(words: tuple[str, ...], told: str, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert export.main([*words]) != 0
+    assert told in capsys.readouterr().err and not list(tmp_path.iterdir())

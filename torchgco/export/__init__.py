@@ -1,0 +1,12 @@
+"""Compiled problems as C that stands alone, from a microcontroller to a server, and loaded again into Python.
+
+`exporting` checks what is asked for and writes the folder. `numbers` finds what may change, and how what C reads
+follows from it; `source` writes a problem's structures and tables as C, and joins them with the solver's own files;
+`files` has the example, the test and the README. `c` holds the controller itself and what takes the place of heap and
+clock. `loaded` compiles a folder and calls it, with the methods of `MPC`.
+"""
+
+from torchgco.export.exporting import export_c
+from torchgco.export.loaded import LoadedController, load_c
+
+__all__ = ["LoadedController", "export_c", "load_c"]

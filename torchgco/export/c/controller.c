@@ -1,0 +1,454 @@
+/* The controller ------------------------------------------------------------------------------------------------ */
+
+static double seconds_of(const void *arena) {
+    double (*seconds)(void) = ((const Arena *)arena)->seconds;
+    return seconds ? seconds() : 0.0;
+}
+
+static int all_finite(const double *values, int count) {
+    double sum = 0;
+    for (int i = 0; i < count; i++) sum += 0 * values[i];
+    return sum == 0;
+}
+
+/* The place of the numbers of knot k `by` stages later: the last one beyond the end, the knot's own where there is none. */
+static int later_place(const int32_t *place, int last, int k, int by) {
+    if (k + by > last) return place ? place[last] : last;
+    if (!place) return k + by;
+    return place[k + by] == NOWHERE ? place[k] : place[k + by];
+}
+
+/* Numbers at `count` knots, or at those that `place` says, begin `by` stages later; parts of a stage take the straight line
+   between what whole stages give. */
+static void shift(double *values, const int32_t *place, int count, int width, double by) {
+    int last = count - 1, whole = by < count ? (int)by : count;
+    double share = by - floor(by);
+    while (place && last > 0 && place[last] == NOWHERE) last--;
+    for (int k = 0; k <= last; k++) { /* what is read has a later place: nothing is overwritten too early */
+        if (place && place[k] == NOWHERE) continue;
+        double *to = values + (place ? place[k] : k) * width;
+        memmove(to, values + later_place(place, last, k, whole) * width, width * sizeof *values);
+    }
+    for (int k = 0; share > 0 && k <= last; k++) {
+        if (place && place[k] == NOWHERE) continue;
+        double *now = values + (place ? place[k] : k) * width, *next = values + later_place(place, last, k, 1) * width;
+        for (int i = 0; i < width; i++) {
+            double later = next[i] * share, before = (1 - share) * now[i];
+            now[i] = later + before;
+        }
+    }
+}
+
+/* A whole number of stages where it is one but for rounding. */
+static double rounded(double stages) {
+    double whole = floor(stages + 0.5), size = stages > 1 ? stages : 1;
+    return fabs(stages - whole) <= 1e-6 * size ? whole : stages;
+}
+
+/* u within the bounds of controls at knot k; what is no number becomes 0 first. */
+static void clamp(const Solve *b, int64_t k, double *u) {
+    const Problem *p = &b->problem;
+    for (int j = 0; j < NU; j++) if (u[j] != u[j]) u[j] = 0;
+    for (int side = -1; side <= 1; side += 2)
+        for (int64_t i = 0; i < p->constraints; i++) {
+            const Constraint *con = p->constraint + i;
+            if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
+            const double *limit = con->bound.data + (con->bound.knot ? con->place[k] * con->bound.size : 0);
+            for (int j = 0; j < con->rows; j++) {
+                if (con->variable[j] < NX || con->sign[j] != side) continue;
+                double *own = u + con->variable[j] - NX;
+                if (side < 0 ? *own < limit[j] : *own > limit[j]) *own = limit[j];
+            }
+        }
+}
+
+/* Whether one of the numbers is one that the problem can't have. */
+static int has_bad_number(const NAME_workspace *w, const Solve *b) {
+    const double *numbers = (const double *)(const void *)&w->numbers;
+    for (int i = 0; i < (int)(sizeof checks / sizeof *checks); i++)
+        for (int j = checks[i].first; j < checks[i].first + checks[i].count; j++) {
+            int kind = checks[i].kind, is_finite_number = numbers[j] - numbers[j] == 0;
+            if (numbers[j] != numbers[j] || (kind < 3 && !is_finite_number)) return 1;
+            if ((kind == 1 && numbers[j] < 0) || (kind == 2 && numbers[j] <= 0)) return 1;
+        }
+    for (int64_t i = 0; i < b->problem.constraints; i++) {
+        const Constraint *con = b->problem.constraint + i;
+        if (!is_kind(con, BOUNDS)) continue;
+        for (int64_t k = 0; k < (con->bound.knot ? con->knots : 1); k++) {
+            const double *limit = con->bound.data + k * con->bound.knot;
+            for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++)
+                if (are_a_pair(con, j, l) && limit[j] < limit[l]) return 1;
+        }
+    }
+    return 0;
+}
+
+/* The bounds of variable v by constraint `con` at knot k; infinite where there are none. */
+static void bounds_at(const Constraint *con, int64_t k, int v, double *lower, double *upper) {
+    const double *limit = con->bound.data + (con->bound.knot ? con->place[k] * con->bound.size : 0);
+    *lower = -INFINITY; *upper = INFINITY;
+    for (int j = 0; j < con->rows; j++) {
+        if (con->variable[j] != v || fabs(limit[j]) >= LOOSE) continue;
+        *(con->sign[j] > 0 ? upper : lower) = limit[j];
+    }
+}
+
+/* What is done with a variable at a knot, z, that has bounds. */
+typedef void Within(double *z, double lower, double upper);
+
+static void each_bounded(const Problem *p, int controls_alone, Within *within, double *X, double *U) {
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *con = p->constraint + i;
+        for (int64_t k = 0; is_kind(con, BOUNDS) && k <= p->N; k++) {
+            if (con->place[k] == NOWHERE) continue;
+            for (int v = controls_alone ? NX : 0; v < NX + NU; v++) {
+                double lower, upper;
+                bounds_at(con, k, v, &lower, &upper);
+                if (lower > -INFINITY || upper < INFINITY)
+                    within(v < NX ? X + k * NX + v : U + k * NU + v - NX, lower, upper);
+            }
+        }
+    }
+}
+
+/* Moves a variable inside of its bounds, by a share of its size or range at most. */
+static void push_inside(double *z, double lower, double upper) {
+    double half = 0.5 * (upper - lower), a = fabs(lower) > 1 ? fabs(lower) : 1, c = fabs(upper) > 1 ? fabs(upper) : 1;
+    double low = lower == -INFINITY ? 0 : COLD_PUSH * (a < half ? a : half);
+    double high = upper == INFINITY ? 0 : COLD_PUSH * (c < half ? c : half);
+    if (*z < lower + low) *z = lower + low;
+    if (*z > upper - high) *z = upper - high;
+}
+
+/* The middle of two bounds, and within one. */
+static void to_middle(double *z, double lower, double upper) {
+    if (lower > -INFINITY && upper < INFINITY) *z = 0.5 * (lower + upper);
+    else if (*z < lower) *z = lower;
+    else if (*z > upper) *z = upper;
+}
+
+/* What a trajectory X, U costs, and by how much it violates the constraints; returns 0 without memory. */
+static int judge(Solve *b, double *X, double *U, double *cost, double *violation) {
+    Lanes lanes, *s = &lanes;
+    I caught;
+    b->follow.X = X; b->follow.U = U;
+    b->arena.next = b->arena_begin;
+    if (!start(s, &b->follow)) return 0;
+    enter_iterate(s, 0, 0);
+    *violation = swept(s, 0, 0, SET(0.0), &caught).violation;
+    *cost = 0;
+    for (int64_t k = 0; k <= N; k++) *cost += cost_value(s, k, s->X + k * NX, k < N ? s->U + k * NU : 0);
+    finish(s);
+    return 1;
+}
+
+/* Rollout of U, or with feedback of U + K (x - X), into b->X, b->U, from the states x. */
+static void follow(Solve *b, const double *x, const double *X, const double *U, int feedback) {
+    memcpy(b->X, X, sizeof b->X); memcpy(b->U, U, sizeof b->U);
+    memcpy(b->X, x, NX * sizeof *x);
+    b->follow.X = b->X; b->follow.U = b->U;
+    roll_out(&b->follow, 0, 1, feedback);
+}
+
+/* Whether trajectories are one, up to rounding along the stages. */
+static int is_rounding(const double *old, const double *new) {
+    for (int i = 0; i < NX; i++) {
+        double most = 0;
+        for (int k = 0; k <= N; k++) if (fabs(old[k * NX + i]) > most) most = fabs(old[k * NX + i]);
+        for (int k = 0; k <= N; k++)
+            if (!(fabs(new[k * NX + i] - old[k * NX + i]) <= ROUNDINGS * 0x1p-52 * most)) return 0;
+    }
+    return 1;
+}
+
+static int is_finite_rollout(const Solve *b) { return all_finite(b->X, (N + 1) * NX) && all_finite(b->U, N * NU); }
+
+/* How a solve is to be made. */
+typedef struct { double mu, push; int warm, minimum; } How;
+static const How FROM_PLAN = {WARM_MU, WARM_PUSH, 1, 0}, FROM_GUESS = {COLD_MU, WARM_PUSH, 1, 0};
+static const How FROM_REST = {COLD_MU, COLD_PUSH, 0, 1};
+
+/* One solve from the iterate w->x, w->u and its multipliers, in place: b->X, b->U is the rollout that it stands for, and
+   w->violation its. Returns whether it is a solution. */
+static int run(NAME_workspace *w, Solve *b, How how, double until) {
+    int left = w->max_iterations > 0 ? w->max_iterations - w->iterations : MAX_SOLVE_ITERATIONS;
+    double cost;
+    b->how.max_iter = left < MAX_SOLVE_ITERATIONS ? left : MAX_SOLVE_ITERATIONS;
+    b->how.seconds = until - seconds_of(&b->arena);
+    b->how.bound_push = how.push; b->how.warm = how.warm; b->how.minimum = how.minimum;
+    b->mu = how.mu; b->iterations = 0; b->status = RUNNING; b->falls = 0;
+    b->arena.next = b->arena_begin;
+    memset(b->gains, 0, sizeof b->gains);
+    if (!tgco_interior(&b->how, 0, 1)) b->status = NON_FINITE;
+    w->iterations += (int)b->iterations;
+    if (b->status == MAX_ITERATIONS && w->max_iterations > 0 && w->iterations >= w->max_iterations) b->status = TIME_LIMIT;
+    for (int i = 0; i < N * NU * NZ; i++) if (!(b->gains[i] - b->gains[i] == 0)) b->gains[i] = 0;
+    follow(b, w->x, w->x, w->u, 1);
+    if (!how.warm && !is_rounding(w->x, b->X)) { /* stiff rows: rounding decides on the gains */
+        follow(b, w->x, w->x, w->u, 0);
+        if (!is_rounding(w->x, b->X)) follow(b, w->x, w->x, w->u, 1);
+    }
+    if (!judge(b, b->X, b->U, &cost, &w->violation)) b->status = NON_FINITE;
+    b->cost = cost;
+    return b->status == CONVERGED && w->violation <= VIOLATION && is_finite_rollout(b);
+}
+
+static void no_multipliers(NAME_workspace *w) {
+@NO_MULTIPLIERS@
+}
+
+/* Whether no time or iteration of the step is left. */
+static int is_over(const NAME_workspace *w, const Solve *b, double until) {
+    return !(until - seconds_of(&b->arena) > 0) || (w->max_iterations > 0 && w->iterations >= w->max_iterations);
+}
+
+/* What was found is the plan from now on. */
+static void fly(NAME_workspace *w, const Solve *b) {
+    memcpy(w->X, b->X, sizeof w->X); memcpy(w->U, b->U, sizeof w->U);
+    for (int i = 0; i < N * NU; i++) for (int j = 0; j < NX; j++) w->K[i * NX + j] = b->gains[i * NZ + j];
+    w->age = 0;
+}
+
+/* Controls at rest, within their bounds, into w->u, and where they lead to from x, into w->x. */
+static void rest(NAME_workspace *w, Solve *b, const double *x) {
+    memcpy(w->u, b->rest, sizeof w->u); memcpy(b->beside, w->u, sizeof w->u);
+    each_bounded(&b->problem, 1, to_middle, w->x, b->beside);
+    int middle = 0;
+    for (int64_t k = 0; k < N; k++) {
+        double held[NU];
+        memcpy(held, w->u + k * NU, sizeof held);
+        clamp(b, k, held);
+        for (int j = 0; j < NU; j++) middle |= held[j] != w->u[k * NU + j];
+    }
+    follow(b, x, w->x, w->u, 0);
+    if (middle || !is_finite_rollout(b)) {
+        memcpy(w->u, b->beside, sizeof w->u);
+        follow(b, x, w->x, w->u, 0);
+    }
+    memcpy(w->x, b->X, sizeof w->x);
+}
+
+/* A solve from the controls w->u without multipliers, whose rollout is w->x. */
+static int cold(NAME_workspace *w, Solve *b, const double *x, double until) {
+    no_multipliers(w);
+    each_bounded(&b->problem, 0, push_inside, w->x, w->u);
+    memcpy(w->x, x, NX * sizeof *x);
+    return run(w, b, FROM_REST, until);
+}
+
+#if DIM > 0
+/* By how far the states x lie deeper in the obstacles of constraint i than may be at a start; above 0: too far. */
+static double too_deep(const Lanes *s, int64_t i, const V *x) {
+    const Constraint *con = s->of->constraint + i;
+    double worst = -INFINITY;
+    int64_t k = con->place[0] == NOWHERE && (con->moved || is_kind(con, BODY)) ? 1 : 0;
+    Ball ball;
+    V centers[MAX_ROWS];
+    if (con->place[k] == NOWHERE && k) return worst;
+    if (is_kind(con, BODY)) ball_centers(s, i, k, x, centers);
+    for (int part = 0; part < (is_kind(con, BODY) ? con->balls : 1); part++) {
+        const Constraint *own = con;
+        const Rows *rows = s->rows + i;
+        const V *at_x = x;
+        if (is_kind(con, BODY)) {
+            ball_at(con, rows, part, k, centers + part * DIM, &ball);
+            own = &ball.con; rows = &ball.rows; at_x = ball.x;
+        }
+        for (int j = 0; j < own->rows; j++) {
+            V away[DIM];
+            double deep = -INFINITY;
+            if (is_kind(own, SPHERES)) {
+                double square = square_at(own, rows, j, k), gap = square - sphere(own, rows, j, k, at_x, away);
+                if (square >= 0) deep = CONTACT * sqrt(square) - sqrt(gap);
+            } else if (is_kind(own, BOXES)) {
+                deep = solid(own, rows, j, k, at_x, 0) / (rows->bound + own->rows * 2 * DIM)[j] - contact_depth[i];
+            } else if (is_kind(own, FIELD)) {
+                V c = field_row(own, rows, k, at_x, 0, 0);
+                if (c > 0) deep = depth_of(rows, c) - contact_depth[i];
+            }
+            if (deep > worst) worst = deep;
+        }
+    }
+    return worst;
+}
+#endif
+
+/* Whether the vehicle touches an obstacle at the start. */
+static int starts_inside(Solve *b, const double *x) {
+#if DIM > 0
+    Lanes lanes, *s = &lanes;
+    int inside = 0;
+    memcpy(b->X, x, NX * sizeof *x);
+    b->follow.X = b->X; b->follow.U = b->U;
+    b->arena.next = b->arena_begin;
+    if (!start(s, &b->follow)) return 0;
+    enter_problem(s, 0, 0);
+    for (int64_t i = 0; i < s->of->constraints; i++) {
+        const Constraint *con = s->of->constraint + i;
+        if (is_solid(con) || is_kind(con, BODY)) inside |= too_deep(s, i, s->X) > 0;
+    }
+    finish(s);
+    return inside;
+#else
+    (void)b; (void)x;
+    return 0;
+#endif
+}
+
+/* Controls beside a saddle point, by an uneven share of their size or range. */
+static void step_beside(const Solve *b, double share, double *u) {
+    for (int j = 0; j < NU; j++) {
+        double size = 1, lower, upper, range = -INFINITY;
+        for (int k = 0; k < N; k++) if (fabs(u[k * NU + j]) > size) size = fabs(u[k * NU + j]);
+        for (int64_t i = 0; i < b->problem.constraints; i++) {
+            const Constraint *con = b->problem.constraint + i;
+            for (int64_t k = 0; is_kind(con, BOUNDS) && k < N; k++) {
+                if (con->place[k] == NOWHERE) continue;
+                bounds_at(con, k, NX + j, &lower, &upper);
+                if (upper - lower > range) range = upper - lower;
+            }
+        }
+        double half = range >= 0 && range < INFINITY ? 0.5 * range : size;
+        for (int k = 0; k < N; k++) {
+            double part = GOLDEN * (k * NU + j + 1);
+            u[k * NU + j] += share * half * (2 * (part - floor(part)) - 1);
+        }
+    }
+}
+
+/* From rest; where the conditions of first order hold but the cost falls to second order, from beside, too. Returns the
+   status of what is found, in b->X and b->U. */
+static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until) {
+    static const double shares[] = {1e-3, 1e-1};
+    double guess_cost, guess_violation, cost, largest = 0;
+    if (starts_inside(b, x)) return INVALID_START;
+    rest(w, b, x);
+    if (!judge(b, w->x, w->u, &guess_cost, &guess_violation)) return NON_FINITE;
+    int solved = cold(w, b, x, until), again = 0;
+    cost = b->cost;
+    for (int i = 0; i < 2 && solved && b->falls > 0; i++) {
+        memcpy(b->beside, b->U, sizeof b->U);
+        step_beside(b, shares[i], b->beside);
+        memcpy(w->u, b->beside, sizeof w->u);
+        follow(b, x, w->x, w->u, 0);
+        memcpy(w->x, b->X, sizeof w->x);
+        again = !(cold(w, b, x, until) && b->cost < cost - STATIONARY * fabs(cost));
+        if (!again) { cost = b->cost; continue; }
+        rest(w, b, x); /* the first solution once more: to solve again takes no memory */
+        solved = cold(w, b, x, until);
+    }
+    if (solved) return CONVERGED;
+    for (int i = 0; i < N * NU; i++) if (fabs(b->U[i]) > largest) largest = fabs(b->U[i]);
+    double violation = w->violation <= 0x1p-52 * largest ? 0 : w->violation;
+    int sound = b->cost - b->cost == 0 && violation - violation == 0 && is_finite_rollout(b), status = b->status;
+    int fits = sound && violation <= VIOLATION, guess_fits = guess_violation <= VIOLATION;
+    int better = guess_fits ? !fits || guess_cost < b->cost : !fits && guess_violation < violation;
+    if (guess_cost - guess_cost == 0 && guess_violation - guess_violation == 0 && (better || !sound)) {
+        rest(w, b, x);
+        no_multipliers(w);
+        memset(b->gains, 0, sizeof b->gains);
+        w->violation = guess_violation;
+        fits = guess_fits;
+    } else if (!sound) return NON_FINITE;
+    if (status == CONVERGED) status = MAX_ITERATIONS; /* but for its violation */
+    return fits && CONSTRAINED ? FEASIBLE : status;
+}
+
+/* Again from what the plan before leads to now, as far as it keeps the constraints. */
+static int from_plan_before(NAME_workspace *w, Solve *b, const double *x, double until) {
+    double cost, violation, age = rounded(w->age);
+    if (age < 0) return 0;
+    for (int i = 0; i < N * NU; i++) for (int j = 0; j < NX; j++) b->gains[i * NZ + j] = w->K[i * NX + j];
+    memcpy(w->x, w->X, sizeof w->x); memcpy(w->u, w->U, sizeof w->u);
+    shift(w->x, 0, N + 1, NX, age); shift(w->u, 0, N, NU, age); shift(b->gains, 0, N, NU * NZ, age);
+    follow(b, x, w->x, w->u, 1);
+    memcpy(w->u, b->U, sizeof w->u);
+    for (int64_t k = 0; k < N; k++) clamp(b, k, w->u + k * NU);
+    follow(b, x, w->x, w->u, 0);
+    memcpy(w->x, b->X, sizeof w->x);
+    no_multipliers(w);
+    if (!judge(b, w->x, w->u, &cost, &violation) || !(violation <= ADMITTED)) return 0;
+    return run(w, b, FROM_GUESS, until);
+}
+
+/* The controls of the plan before with feedback on x, where x is known; without a plan, those at rest. */
+static void hold(const NAME_workspace *w, const Solve *b, const double *x, double *u) {
+    double age = rounded(w->age), share = age - (int)age;
+    int k = age < N - 1 ? (int)age : N - 1, later = k + 1 < N ? k + 1 : N - 1;
+    int knot = age < N ? (int)age : N, next = knot + 1 < N + 1 ? knot + 1 : N;
+    for (int j = 0; j < NU; j++) {
+        u[j] = b->rest[j];
+        if (w->age < 0) continue;
+        u[j] = share > 0 ? w->U[later * NU + j] * share + (1 - share) * w->U[k * NU + j] : w->U[k * NU + j];
+        for (int i = 0; x && i < NX; i++) {
+            double K = w->K[(k * NU + j) * NX + i], X = w->X[knot * NX + i];
+            if (share > 0) {
+                K = w->K[(later * NU + j) * NX + i] * share + (1 - share) * K;
+                X = w->X[next * NX + i] * share + (1 - share) * X;
+            }
+            u[j] += K * (x[i] - X);
+        }
+    }
+    if (w->age >= 0) clamp(b, k, u);
+    clamp(b, 0, u);
+}
+
+void NAME_reset(NAME_workspace *w) {
+    memset(w->X, 0, sizeof w->X); memset(w->U, 0, sizeof w->U); memset(w->K, 0, sizeof w->K);
+    memset(w->x, 0, sizeof w->x); memset(w->u, 0, sizeof w->u);
+    no_multipliers(w);
+    w->age = -1;
+    w->begun = w->able = 0;
+    w->status = RUNNING; w->held = w->warm = w->iterations = 0; w->violation = 0;
+}
+
+void NAME_init(NAME_workspace *w) {
+    memset(w, 0, sizeof *w);
+    memcpy(&w->numbers, &exported_numbers, sizeof w->numbers);
+    NAME_reset(w);
+}
+
+void NAME_guess(NAME_workspace *w, const double *X, const double *U) {
+    memcpy(w->x, X, sizeof w->x); memcpy(w->u, U, sizeof w->u);
+    no_multipliers(w);
+    w->able = 2;
+}
+
+int NAME_step(NAME_workspace *w, const double x[NX], double stages, double max_seconds, double u[NU]) {
+    Solve *b = (Solve *)(void *)w->room;
+    bind(w, b);
+    double until = seconds_of(&b->arena) + max_seconds;
+    int good = 0, late = 0, guessed = w->able == 2, fits = stages >= 0 && stages - stages == 0;
+    int status = !fits || !all_finite(x, NX) ? NAME_BAD_STATE : has_bad_number(w, b) ? NAME_BAD_NUMBER : RUNNING;
+    w->warm = w->iterations = 0;
+    if (fits && w->age >= 0) w->age += stages;
+    if (fits && w->begun && !guessed && stages > 0) {
+        double by = rounded(stages);
+        shift(w->x, 0, N + 1, NX, by); shift(w->u, 0, N, NU, by);
+@SHIFTS@
+    }
+    if (status < 0) {
+        hold(w, b, status == NAME_BAD_STATE ? 0 : x, u);
+        w->held = 1;
+        return w->status = status;
+    }
+    memcpy(w->x, x, NX * sizeof *x);
+    if (w->able) {
+        w->warm = good = run(w, b, guessed ? FROM_GUESS : FROM_PLAN, until);
+        status = good ? CONVERGED : b->status;
+        late = status == TIME_LIMIT && is_finite_rollout(b);
+    }
+    if (!good && !late && w->begun && from_plan_before(w, b, x, until)) { good = 1; status = CONVERGED; }
+    if (!good && !late && w->begun && is_over(w, b, until)) status = TIME_LIMIT;
+    else if (!good && !late) {
+        status = from_rest(w, b, x, until);
+        good = status == CONVERGED || status == FEASIBLE;
+        memcpy(w->x, b->X, sizeof w->x); memcpy(w->u, b->U, sizeof w->u);
+    }
+    w->begun = 1;
+    w->able = good || status == TIME_LIMIT;
+    w->held = !good;
+    if (good) { fly(w, b); memcpy(u, w->U, NU * sizeof *u); clamp(b, 0, u); }
+    else hold(w, b, x, u);
+    return w->status = status;
+}

@@ -1,0 +1,4 @@
+/* The time of an exported solver, by its user's clock. */
+#pragma once
+static double seconds_of(const void *arena);
+#define SECONDS_NOW(how) seconds_of((how)->of->arena)

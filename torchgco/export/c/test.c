@@ -1,0 +1,29 @@
+/* Compares @PERIODS@ periods with those that torchgco found in Python: all bits of the controls, statuses and iterations. */
+#include "NAME.h"
+#include <math.h>
+#include <stdio.h>
+
+#define PERIODS @PERIODS@
+@TABLES@
+
+static NAME_workspace workspace;
+
+int main(void) {
+    double u[NAME_NU], worst = 0;
+    int same = 0, close = 0;
+    NAME_init(&workspace);
+    for (int k = 0; k < PERIODS; k++) {
+        int status = NAME_step(&workspace, states + k * NAME_NX, k ? NAME_STAGES : 0, INFINITY, u), equal = 1;
+        for (int j = 0; j < NAME_NU; j++) {
+            double away = fabs(u[j] - controls[k * NAME_NU + j]);
+            equal &= away == 0;
+            if (away > worst) worst = away;
+        }
+        same += equal && status == NAME_CONVERGED && workspace.iterations == iterations[k];
+        close += status == NAME_CONVERGED;
+    }
+    printf("%d of %d periods have the same bits, status and iterations; %d converged; largest difference %g\n", same,
+        PERIODS, close, worst);
+    if (same < PERIODS) printf("The bits are those of a processor with fused products, and of -ffp-contract=off.\n");
+    return same < PERIODS;
+}

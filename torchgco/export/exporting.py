@@ -1,0 +1,114 @@
+"""export_c: a folder of C for a compiled problem."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_value
+from torchgco.compiled import Compiled, compile
+from torchgco.compiled.in_free_time import KeptInTime
+from torchgco.constraints.norms import within_norms
+from torchgco.export.files import Exported, write_files
+from torchgco.export.numbers import changing
+from torchgco.export.source import solver_source
+from torchgco.kernels import current, interior_of
+from torchgco.native.interior import InteriorEngine
+from torchgco.native.kept import Kept
+from torchgco.problem.horizons import for_solvers
+from torchgco.problem.problem import Problem
+
+C_WORDS = (
+    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
+    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while"
+)
+
+
+def export_c(
+    problem: Problem | Compiled,
+    folder: str | Path,
+    name: str = "controller",
+    receding: bool = True,
+    changes: Sequence[str] | None = None,
+) -> Path:
+    """Write a problem's interior point as C99 that stands alone: no heap, no global state, no library but libm.
+
+        torchgco.export_c(problem, "car_c", name="car", changes=["x_ref"])
+
+    NAME.h has the workspace and four functions, NAME.c all else in one file; NAME_main.c is an example, NAME_test.c
+    makes 40 periods and compares all bits with Python's, CMakeLists.txt builds both, and README.md says how large it is
+    and which numbers may change. A step does what a step of `MPC` with `solver="interior_point"` does: it continues
+    from the plan before, else begins again from what that leads to now, else from rest, and where all fail it holds the
+    plan before with feedback. It doesn't search for other ways, nor for ways to come to rest.
+
+    Args:
+        problem: one vehicle, or a compiled problem with one.
+        folder: is made if it isn't there; files of these names are overwritten.
+        name: of files, types and functions: a word of C.
+        receding: each step's horizon begins a stage after that of the step before; the example and the test move so.
+        changes: names of the numbers that steps may change; the others are constants. None: all that C reads as they
+            are or copies of.
+
+    Returns:
+        the folder.
+
+    Raises:
+        InputError: a name that is no word of C, or a problem that C can't serve: several vehicles, a free time or
+            start, horizons, `RateBounds` or `Link`, single precision, code that can't be compiled; a number that can't
+            change. No file is written then.
+    """
+    check_value(receding, bool, "receding")
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in re.findall(r"\w+", C_WORDS):
+        raise InputError("name", "a word of C, such as controller", shown(name))
+    if isinstance(problem, Compiled):
+        changes = problem.changes if changes is None else changes
+        compiled = compile(problem.now, "interior_point", tolerance=problem.interior.tolerance)
+    else:
+        compiled = compile(_checked(problem), "interior_point")
+    kept = _served(compiled)
+    problem = kept.problem
+    some = changing(kept, compiled.numbers, changes)
+    with torch.no_grad():
+        rest = _guess_at_rest(problem)
+    solver = solver_source(kept, some, compiled.interior, rest)
+    exported = Exported(compiled, kept, solver, some, name, receding)
+    return write_files(exported, Path(folder))
+
+
+def _checked(problem: Problem) -> Problem:
+    if not isinstance(problem, Problem):
+        raise InputError("problem", "a Problem, or what torchgco.compile makes of one", type(problem).__name__)
+    if problem.B != 1:
+        raise InputError("problem", "one vehicle: export problem.take([b]) of each", f"{problem.B} problems")
+    if problem.x0.dtype != torch.float64:
+        raise InputError("problem.x0", "double precision", str(problem.x0.dtype))
+    if problem.x0.device.type != "cpu":
+        raise InputError("problem", "one on the CPU", str(problem.x0.device))
+    for field, found in (("time", problem.time), ("free_start", problem.free_start), ("horizon", problem.horizon)):
+        if found is not None:
+            raise InputError(f"problem.{field}", "None in exported C", type(found).__name__)
+    for i, part in enumerate(problem.constraints):
+        if part.joins_knots:
+            raise InputError(f"constraints[{i}]", "one without RateBounds and Link in exported C", type(part).__name__)
+    return problem
+
+
+def _served(compiled: Compiled) -> Kept:
+    """The packed problem, or what keeps C from serving it."""
+    problem = _checked(compiled.problem)
+    kept = compiled._kept
+    if kept is None or isinstance(kept, KeptInTime):
+        kernels = interior_of(current(for_solvers(problem)))  # raises, or warns, what is missing
+        told = "code that reads a problem's numbers in Python" if isinstance(kernels, InteriorEngine) else "functions"
+        raise InputError("problem", "functions that C compiles, of its numbers as tensors", told)
+    return kept
+
+
+def _guess_at_rest(problem: Problem) -> torch.Tensor:
+    """Controls (N, m) at rest, within bounds of norms and cones, before those of single controls count."""
+    rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
+    return within_norms(rest, problem.constraints)[0].contiguous()

@@ -1,0 +1,201 @@
+"""load_c: an exported controller, compiled for this machine and called as `MPC` is."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base import clock
+from torchgco.base.errors import InputError, shown
+from torchgco.base.numbers import Floats, as_floats, measured
+from torchgco.base.options import PositiveOrInfinite, Seconds, check_value
+from torchgco.base.status import Status
+from torchgco.native.compiler import Unit, build
+from torchgco.native.declarations import NUMBERS
+from torchgco.receding.plan import stages_between
+
+BAD_STATE, BAD_NUMBER = -1, -2
+WITHOUT_ERRNO = "-fno-math-errno"
+_MEMBER = re.compile(r"^    (double|int) ([^;]+);(?: /\* ([\d x]+): (\S+) \*/)?", re.MULTILINE)
+_ONE, _CLOCK = re.compile(r"(\w+)(?:\[(\d+)\])?"), "double (*clock)(void);"
+_SIZE = re.compile(r"^#define \w+_(NX|NU|N|STAGES) ([\d.]+)(?:.* ([\d.e-]+) s \*/)?", re.MULTILINE)
+_CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double)
+_DOUBLES = ctypes.POINTER(ctypes.c_double)
+
+
+def load_c(folder: str | Path, name: str | None = None, period: float | None = None) -> LoadedController:
+    """The controller of a folder that `export_c` has written, compiled by this machine's compiler.
+
+        controller = torchgco.load_c("car_c")
+        u = controller.step(x, x_ref=reference)
+
+    Its bits are those of `MPC` on this machine, as products and sums are fused alike.
+
+    Args:
+        name: of the controller; None: the only one in the folder.
+        period: s, from one step to the next; None: what the horizon moves by at each step.
+
+    Raises:
+        InputError: no folder with such a controller, or several.
+        NativeError: there is no compiler, or it refuses the code.
+    """
+    folder = Path(folder)
+    found = sorted(path.stem for path in folder.glob("*.h") if (folder / f"{path.stem}.c").is_file())
+    if name is None and len(found) == 1:
+        name = found[0]
+    if name not in found:
+        raise InputError("folder", "one with a controller of `export_c`", f"{', '.join(found) or 'none'} in {folder}")
+    return LoadedController((folder / f"{name}.h").read_text(), (folder / f"{name}.c").read_text(), name, period)
+
+
+class LoadedController:
+    """An exported controller; `load_c` makes it.
+
+    Attributes:
+        n, m, N: numbers of states, controls and stages; dt: of a stage, s.
+        t: time of the last step, s.
+    """
+
+    def __init__(self, header: str, code: str, name: str, period: float | None) -> None:
+        sizes = {size: (float(value), unit) for size, value, unit in _SIZE.findall(header)}
+        self.n, self.m, self.N = (int(sizes[size][0]) for size in ("NX", "NU", "N"))
+        self.dt, self._stages = float(sizes["N"][1]), sizes["STAGES"][0]
+        self.period = self._stages * self.dt if period is None else check_value(period, Seconds, "period")
+        self._shapes, kinds = _layout(header)
+        source = code.replace(f'#include "{name}.h"', header)
+        source += f'\n_Static_assert(sizeof({name}_workspace) == {ctypes.sizeof(kinds)}, "layout");\n'
+        library = build((Unit(source, own=True),), (WITHOUT_ERRNO,))
+        self._functions = {word: getattr(library, f"{name}_{word}") for word in ("init", "reset", "guess", "step")}
+        self._functions["step"].restype = ctypes.c_int
+        self._workspace = kinds()
+        self._functions["init"](ctypes.byref(self._workspace))
+        self._workspace.clock = self._clock = _CALLBACK(clock.seconds)
+        self._numbers = _views(self._workspace, self._shapes)
+        self.t, self._begun = 0.0, False
+
+    @property
+    def numbers(self) -> dict[str, Floats]:
+        """What steps may change, by name: the memory that C reads."""
+        return self._numbers
+
+    @property
+    def workspace(self) -> ctypes.Structure:
+        """The C workspace: `status`, `held`, `warm`, `iterations`, `violation`, the plan `X`, `U`, `K`, `age`, ..."""
+        return self._workspace
+
+    @property
+    def status(self) -> Status:
+        """How the last step's solve ended.
+
+        Raises:
+            InputError: no step yet, or numbers that the problem can't have.
+        """
+        if self._workspace.status == BAD_NUMBER:
+            raise InputError("numbers", "numbers that the problem can have", "others")
+        return Status(self._workspace.status)
+
+    @property
+    def held(self) -> bool:
+        """Whether the last controls aren't of a plan that was found for their time."""
+        return bool(self._workspace.held)
+
+    @property
+    def plan(self) -> tuple[Tensor, Tensor, Tensor]:
+        """States (N+1, n), controls (N, m) and gains (N, m, n) of what is flown, from its first knot on."""
+        shapes = {"X": (self.N + 1, self.n), "U": (self.N, self.m), "K": (self.N, self.m, self.n)}
+        arrays = (np.array(getattr(self._workspace, name)).reshape(shape) for name, shape in shapes.items())
+        X, U, K = map(torch.from_numpy, arrays)
+        return X, U, K
+
+    def reset(self) -> None:
+        """Forget the plan; numbers stay."""
+        self._functions["reset"](ctypes.byref(self._workspace))
+        self.t, self._begun = 0.0, False
+
+    def guess(self, X: Any, U: Any) -> None:
+        """Begin the next step with a plan of states X (N+1, n) and controls U (N, m).
+
+        Raises:
+            InputError: another shape.
+        """
+        arrays = []
+        for name, value, shape in (("X", X, (self.N + 1, self.n)), ("U", U, (self.N, self.m))):
+            array = np.ascontiguousarray(as_floats(value, name))
+            if array.shape != shape:
+                raise InputError(name, f"shape {shape}", array.shape)
+            arrays.append(array)
+        self._functions["guess"](ctypes.byref(self._workspace), *(array.ctypes.data_as(_DOUBLES) for array in arrays))
+
+    def step(
+        self,
+        x: Any,
+        *,
+        t: float | None = None,
+        max_seconds: float | None = None,
+        numbers: Mapping[str, Any] | None = None,
+        **named: Any,
+    ) -> Tensor:
+        """The controls (m,) for the next period, from states x (n,) measured now; as of `MPC.step`.
+
+        Raises:
+            InputError: states, a time or numbers that don't fit.
+        """
+        state = np.ascontiguousarray(measured(x, 1, self.n).reshape(self.n))
+        later = self.period if t is None else t - self.t
+        if t is not None and (not math.isfinite(t) or (self._begun and t <= self.t)):
+            raise InputError("t", f"a time after {self.t:g} s", shown(t))
+        limit = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
+        for name, value in {**(numbers or {}), **named}.items():
+            self._write(name, value)
+        stages = stages_between(later / self.dt) if self._begun else 0.0
+        u = np.zeros(self.m)
+        self.raw_step(state, stages, math.inf if limit is None else limit, u)
+        self.t = (self.t + self.period if self._begun else 0.0) if t is None else t
+        self._begun = True
+        return torch.from_numpy(u)
+
+    def raw_step(self, x: Floats, stages: float, max_seconds: float, u: Floats) -> int:
+        """`NAME_step` itself, with states x (n,) and room for controls u (m,); returns what C returns."""
+        pointers = (array.ctypes.data_as(_DOUBLES) for array in (x, u))
+        state, controls = pointers
+        seconds = ctypes.c_double(stages), ctypes.c_double(max_seconds)
+        return int(self._functions["step"](ctypes.byref(self._workspace), state, *seconds, controls))
+
+    def _write(self, name: str, value: Any) -> None:
+        if name not in self._numbers:
+            raise InputError("numbers", f"one of {', '.join(self._numbers) or 'none'}", name)
+        floats, there = as_floats(value, name), self._numbers[name]
+        if floats.shape not in (there.shape, (1, *there.shape)):
+            raise InputError(name, f"shape {there.shape}", floats.shape)
+        there[...] = floats
+
+
+def _layout(header: str) -> tuple[dict[str, tuple[int, ...]], Any]:
+    """Shapes of the numbers by name, and the workspace as a structure of ctypes, from the header."""
+    numbers, workspace = header.split("_numbers;", 1)[0], header.split("_numbers;", 1)[1].split("_workspace;", 1)[0]
+    shapes, fields = dict[str, tuple[int, ...]](), list[tuple[str, Any]]()
+    for kind, names, shape, _ in _MEMBER.findall(numbers[numbers.index("typedef struct") :]):
+        for name, count in _ONE.findall(names):
+            fields.append((name, NUMBERS[kind] * int(count) if count else NUMBERS[kind]))
+            if shape:
+                shapes[name] = tuple(map(int, shape.split(" x ")))
+    own: list[tuple[str, Any]] = [("numbers", type("Numbers", (ctypes.Structure,), {"_fields_": fields}))]
+    own.append(("clock", _CALLBACK))
+    for kind, names, *_ in _MEMBER.findall(workspace.split(_CLOCK, 1)[1]):
+        ctype = ctypes.c_int if kind == "int" else ctypes.c_double
+        for name, count in _ONE.findall(names):
+            own.append((name, ctype * int(count) if count else ctype))
+    return shapes, type("Workspace", (ctypes.Structure,), {"_fields_": own})
+
+
+def _views(workspace: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Floats]:
+    views = {name: np.ctypeslib.as_array(getattr(workspace.numbers, name)) for name in shapes}
+    return {name: view.reshape(shapes[name]) for name, view in views.items()}

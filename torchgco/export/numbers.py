@@ -1,0 +1,207 @@
+"""What may change of an exported problem, and how the arrays that C reads follow from it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchgco.base import numbers as checks
+from torchgco.base.errors import InputError
+from torchgco.base.numbers import Number
+from torchgco.compiled.numbers import Numbers
+from torchgco.native.kept import Kept
+from torchgco.native.structures import Array
+
+# What is checked of a number in C: finite, at least 0, above 0, or a bound, which may be infinite.
+FINITE, AT_LEAST_ZERO, ABOVE_ZERO, BOUND = range(4)
+KINDS = {checks.lengths: AT_LEAST_ZERO, checks.at_least_zero: AT_LEAST_ZERO, checks.above_zero: ABOVE_ZERO}
+RADII, RADIUS = "radii", "vehicle_radius"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A number of the problem as a member of the structure `NAME_numbers`.
+
+    Attributes:
+        name: of the member.
+        full: its name in the problem, such as "constraints[1].centers".
+        first: its place among all numbers of the structure.
+        shape: without the axis of problems.
+        value: as it is exported, of this shape.
+        kind: of its check.
+        unit: of its entries, in words; empty where the parts don't say.
+    """
+
+    name: str
+    full: str
+    first: int
+    shape: tuple[int, ...]
+    value: np.ndarray
+    kind: int
+    unit: str = ""
+
+    @property
+    def size(self) -> int:
+        return int(np.prod(self.shape))
+
+
+@dataclass
+class Copies:
+    """Entries of an array that C reads which are copies of numbers: entry `to` is number `source` of the structure."""
+
+    to: list[int] = field(default_factory=list)
+    source: list[int] = field(default_factory=list)
+    squares: bool = False  # they are squares of a radius and the vehicle's, of which `source` has pairs
+    bounds: bool = False
+
+
+@dataclass(frozen=True)
+class Changing:
+    """The members, and what follows from them.
+
+    Attributes:
+        members: in the order of the structure.
+        shared: where C reads members as they are: the place in the structure, by address.
+        copied: arrays of which entries are copies of members, by address.
+    """
+
+    members: Sequence[Member]
+    shared: dict[int, int]
+    copied: dict[int, Copies]
+
+
+def changing(kept: Kept, numbers: Numbers, asked: Sequence[str] | None) -> Changing:
+    """The numbers that may change.
+
+    Args:
+        kept: the packed problem.
+        numbers: all of it.
+        asked: their names; None: all that can.
+
+    Raises:
+        InputError: a name that isn't there, x0, or a number from which what C reads is computed in Python.
+    """
+    every = [numbers.find(name) for name in (numbers if asked is None else asked)]
+    members, shared, copied, first = list[Member](), dict[int, int](), dict[int, Copies](), 0
+    arrays = {tensor.data_ptr(): tensor for tensor in _read(kept)}
+    for number in every:
+        if number.part == "x0":
+            if asked is not None:
+                raise InputError("changes", "other numbers than x0, which the states of each step are", "x0")
+            continue
+        ways = _ways(kept, number, first, arrays)
+        if ways is None:
+            if asked is not None:
+                raise InputError("changes", "numbers that C reads, or copies of them", number.name)
+            continue
+        name = re.sub(r"\W+", "_", numbers.short(number.name)).strip("_")
+        value = number.value[0]
+        kind = BOUND if number.none is not None else KINDS.get(number.check, FINITE)  # type: ignore[arg-type]
+        members.append(Member(name, number.name, first, value.shape, value, kind))
+        shared |= ways[0]
+        for address, own in ways[1].items():
+            together = copied.setdefault(address, Copies(bounds=own.bounds))
+            together.to += own.to
+            together.source += own.source
+        first += members[-1].size
+    _add_radii(kept, members, copied)
+    return Changing(members, shared, copied)
+
+
+def _read(kept: Kept, part: str | int | None = None) -> Iterator[Tensor]:
+    """The tensors of the arrays that C reads, of one part or of all."""
+    groups: dict[str | int, list[Array]] = {"cost": list(kept._cost), "dynamics": [kept._model]}
+    for i, own in enumerate(kept._numbers):
+        groups[i] = [value for value in own.values() if isinstance(value, Array)]
+    for name, group in groups.items():
+        if part is None or part == name:
+            for array in group:
+                yield from array.kept
+
+
+def _ways(
+    kept: Kept, number: Number, first: int, arrays: dict[int, Tensor]
+) -> tuple[dict[int, int], dict[int, Copies]] | None:
+    """Where C reads a number as it is, and the copies of it, from its place in the structure on; None: neither."""
+    places, at = dict[int, int](), first
+    for view in number.views:
+        places[view.__array_interface__["data"][0]] = at
+        at += view[0].size
+    if set(places) <= set(arrays):
+        return places, {}
+    if number.name.rpartition(".")[2] in (RADII, RADIUS) and _is_of_spheres(kept, number):
+        return {}, {}  # see _add_radii
+    copies = _probed(kept, number, first)
+    return None if copies is None else ({}, copies)
+
+
+def _probed(kept: Kept, number: Number, first: int) -> dict[int, Copies] | None:
+    """The entries that change with a number, where all of them become one of its entries; None where they don't."""
+    view, draws = number.views[0], np.random.default_rng(0)
+    old, probe = view.copy(), draws.uniform(1.0, 2.0, view.shape)
+    before = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, number.part)}
+    try:
+        _write(kept, number, probe)
+        after = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, number.part)}
+    finally:
+        _write(kept, number, old)
+    places = {value: i for i, value in enumerate(probe[0].ravel().tolist())}
+    found = dict[int, Copies]()
+    for address, tensor in after.items():
+        changed = (tensor != before[address]).flatten().nonzero().flatten().tolist()
+        values = tensor.flatten()[changed].tolist()
+        if any(value not in places for value in values):
+            return None
+        if changed:
+            found[address] = Copies(
+                changed, [first + places[value] for value in values], bounds=number.none is not None
+            )
+    return found or None
+
+
+def _write(kept: Kept, number: Number, values: np.ndarray) -> None:
+    number.views[0][...] = values
+    if number.after is not None:
+        number.after()
+    if number.part == "dynamics":
+        kept.refresh_model()
+    elif number.part == "cost":
+        kept.refresh_cost()
+    else:
+        assert isinstance(number.part, int)
+        kept.refresh_constraint(number.part)
+
+
+def _is_of_spheres(kept: Kept, number: Number) -> bool:
+    """Whether C reads squares of inflated radii of the obstacles whose number it is."""
+    return isinstance(number.part, int) and kept.problem.constraints[number.part].kernel == "spheres"
+
+
+def _add_radii(kept: Kept, members: list[Member], copied: dict[int, Copies]) -> None:
+    """Squares of radii and the vehicle's radius, where one of the two may change."""
+    for i, part in enumerate(kept.problem.constraints):
+        own = {m.full.rpartition(".")[2]: m for m in members if m.full.startswith(f"constraints[{i}].")}
+        radii, radius = own.get(RADII), own.get(RADIUS)
+        if (radii is None and radius is None) or part.kernel != "spheres":
+            continue
+        (squares,) = kept._numbers[i]["squares"].kept
+        count = squares.numel()
+        pairs = list[int]()
+        for j in range(count):
+            pairs += [-1 if radii is None else radii.first + j, -1 if radius is None else radius.first]
+        copied[squares.data_ptr()] = Copies(list(range(count)), pairs, squares=True)
+
+
+def fixed_radii(kept: Kept, address: int) -> tuple[Tensor, Tensor]:
+    """Radii (M,) of spheres and that of the vehicle (1,), of the squares at an address."""
+    parts: Sequence[Any] = kept.problem.constraints
+    for part, own in zip(parts, kept._numbers, strict=True):
+        if "squares" in own and own["squares"].kept[0].data_ptr() == address:
+            radius = part.vehicle_radius[:1]
+            return part.inflated_radii[0] - radius, radius
+    raise AssertionError("squares of spheres")

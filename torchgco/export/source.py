@@ -1,0 +1,351 @@
+"""A packed problem as C: its structures, its tables, and the solver's own files in one text."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
+from torchgco.constraints.bounds import LOOSE
+from torchgco.export.numbers import Changing, Copies, fixed_radii
+from torchgco.native import structures as c
+from torchgco.native.codegen.emit import literal
+from torchgco.native.declarations import Structure, defines
+from torchgco.native.kept import Kept
+from torchgco.native.packing import kind_of
+from torchgco.solvers.ending import STATIONARY
+from torchgco.solvers.interior import InteriorPoint
+
+HERE = Path(__file__).parent / "c"
+TYPES = {
+    torch.float64: "double", torch.float32: "float", torch.int64: "int64_t", torch.int32: "int32_t",
+    torch.bool: "uint8_t",
+}  # fmt: skip
+# Files of the kernels, and what takes their places.
+REPLACED = {
+    "vectors.h": "scalar.h", "wide.h": "wide_scalar.h", "allocation.h": "arena.h", "clock.h": "seconds.h",
+}  # fmt: skip
+POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane
+SCALARS = 16  # numbers of the structure Solve beside its arrays, and what structures are padded with
+
+
+@dataclass
+class Writer:
+    """Structures as initialisers of C; what they point to is a table, or has a place in the workspace.
+
+    Attributes:
+        places: expressions by address.
+        tables: definitions of constant arrays.
+    """
+
+    tensors: dict[int, Tensor]
+    places: dict[int, str]
+    tables: list[str] = field(default_factory=list)
+    flash: int = 0  # bytes of tables
+
+    def table(self, tensor: Tensor) -> str:
+        """The name of a constant array with these numbers."""
+        name = f"table_{len(self.tables)}"
+        self.flash += tensor.numel() * tensor.element_size()
+        self.tables.append(table(f"static const {TYPES[tensor.dtype]} {name}[]", tensor))
+        return name
+
+    def body(self, structure: Structure, **given: str) -> str:
+        """An initialiser; `given` are expressions of fields."""
+        rows = []
+        for name, declared in structure.declared.items():
+            value = getattr(structure, name)
+            if name in given:
+                rows.append(f".{name} = {given[name]}")
+            elif isinstance(value, Structure):
+                inner = self.body(value)
+                rows += [] if inner == "{0}" else [f".{name} = {inner}"]
+            elif isinstance(value, ctypes.Array):
+                rows.append(f".{name} = {{{', '.join(self.body(one) for one in value)}}}")
+            elif declared.pointer:
+                rows += [f".{name} = {self._pointer(value)}"] if value else []
+            elif value != 0:
+                rows.append(f".{name} = {literal(value) if isinstance(value, float) else value}")
+        return f"{{{', '.join(rows) or '0'}}}"
+
+    def _pointer(self, address: int) -> str:
+        if address not in self.places:
+            self.places[address] = self.table(self.tensors[address])
+        return self.places[address]
+
+
+def table(declared: str, values: Tensor | Iterable[float]) -> str:
+    """The definition of a constant array."""
+    numbers = values.flatten().tolist() if isinstance(values, Tensor) else list(values)
+    texts = [literal(number) if isinstance(number, float) else str(int(number)) for number in numbers]
+    lines, line = [], "   "
+    for text in texts or ["0"]:
+        if len(line) + len(text) > 116:
+            lines.append(line)
+            line = "   "
+        line += f" {text},"
+    return "\n".join([f"{declared} = {{", *lines, line, "};"])
+
+
+def kept_by(structure: Structure) -> dict[int, Tensor]:
+    """All tensors that a structure and those in it point to, by address."""
+    todo: list[Any] = list(structure.kept)
+    found = dict[int, Tensor]()
+    while todo:
+        one = todo.pop()
+        if isinstance(one, Tensor):
+            found.setdefault(one.data_ptr(), one)
+        elif isinstance(one, list):
+            todo += one
+        elif isinstance(one, Structure):
+            todo += one.kept
+    return found
+
+
+@dataclass(frozen=True)
+class Solver:
+    """The C of a problem's solver.
+
+    Attributes:
+        solver: what serves problems of this form.
+        controller: tables and structures of this one, and the controller, with marks (see `replaced`).
+        room: numbers of a workspace that only a step needs.
+        multipliers: of each constraint that has rows, by its place: how many there are.
+        flash: bytes of constant tables.
+    """
+
+    solver: str
+    controller: str
+    room: int
+    multipliers: dict[int, int]
+    flash: int
+
+
+def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest: Tensor) -> Solver:
+    """The C of a packed problem.
+
+    Args:
+        rest: controls (N, m) with which a solve without a guess begins.
+    """
+    problem, how = kept.problem, kept.how
+    multipliers = {i: lam.numel() for i, lam in enumerate(kept.lam) if lam.numel() > 0}
+    writer = Writer(kept_by(how), _places(kept, changing, multipliers))
+    made = [_made(kept, j, address, copies) for j, (address, copies) in enumerate(changing.copied.items())]
+    K = len(problem.constraints)
+    rows = [writer.body(row) for row in _constraints(kept)]
+    fields = writer.body(kept.packed, constraint="b->constraints", arena="&b->arena")
+    lines = _bound(
+        rows, fields, writer.body(how, of="&b->problem"), changing, made, _rest(kept, changing, writer, rest)
+    )
+    count = _count(kept)
+    need = count + 2 + (K + 1) * (POINTERS_OF_ROWS + 2)
+    sizes = problem.N + 1, problem.N, problem.n, problem.m
+    room = need + _solve_size(K, sizes, [len(kept_by(how)[address].flatten()) for address in changing.copied])
+    texts = {name: (HERE / own).read_text() for name, own in REPLACED.items()}
+    declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
+    declared += "static int64_t tgco_room(const Interior *how);\n"
+    own = [
+        _constants(interior, bool(K)), "enum { N = NAME_N };", *writer.tables, *(part.tables for part in made),
+        _numbers_table(changing), _depths(kept), _structure(K, [part.declared for part in made]),
+        _assertion(count, K), lines, _checks(changing), (HERE / "controller.c").read_text(),
+    ]  # fmt: skip
+    flash = writer.flash + 8 * sum(m.size for m in changing.members) + sum(part.flash for part in made)
+    return Solver(kept.engine.form.alone(_kinds(kept), declared, texts), "\n".join(own), room, multipliers, flash)
+
+
+def _constraints(kept: Kept) -> list[c.Constraint]:
+    """The constraints that a packed problem points to."""
+    lists = (one for one in kept.packed.kept if isinstance(one, list) and one and isinstance(one[0], c.Constraint))
+    return next(lists, [])
+
+
+def _kinds(kept: Kept) -> set[c.Kind]:
+    """The kinds of the constraints, and of the balls of bodies."""
+    parts: Sequence[Any] = kept.problem.constraints
+    balls = (part.balls[0] for part in parts if kind_of(part) is c.Kind.BODY)
+    return {kind_of(part) for part in (*parts, *balls)}
+
+
+def _count(kept: Kept) -> int:
+    """How many numbers a solve has room for."""
+    function = kept.library.tgco_room
+    function.restype = ctypes.c_int64
+    return int(function(ctypes.byref(kept.how)))
+
+
+def _solve_size(K: int, sizes: tuple[int, int, int, int], made: list[int]) -> int:
+    """The size of the structure Solve in numbers, at most."""
+    knots, N, n, m = sizes
+    size = lambda kind: -(-ctypes.sizeof(kind) // 8)
+    structures = size(c.Interior) + 2 * size(c.Problem) + max(1, K) * size(c.Constraint)
+    return structures + knots * n + 2 * N * m + N * m * (n + 1) + sum(made) + SCALARS
+
+
+def _places(kept: Kept, changing: Changing, multipliers: dict[int, int]) -> dict[int, str]:
+    """Where what C reads and writes lies, by address."""
+    at = lambda tensor: tensor.data_ptr()
+    places = {at(kept.lam[i]): f"w->lam_{i}" for i in multipliers}
+    places |= {address: f"numbers + {first}" for address, first in changing.shared.items()}
+    places |= {address: f"b->made_{j}" for j, address in enumerate(changing.copied)}
+    scalars = {"mu": kept.barrier, "status": kept.status, "iterations": kept.iterations}
+    places |= {at(tensor): f"&b->{name}" for name, tensor in scalars.items()}
+    places |= {int(getattr(kept.how, name)): f"&b->{name}" for name in ("error", "theta", "falls")}
+    return places | {at(kept.X): "w->x", at(kept.U): "w->u", at(kept.gains): "b->gains"}
+
+
+@dataclass(frozen=True)
+class Made:
+    """An array that follows from numbers: constant tables, its member of the structure, and lines that fill it."""
+
+    tables: str
+    declared: str
+    lines: list[str]
+    flash: int
+
+
+def _made(kept: Kept, j: int, address: int, copies: Copies) -> Made:
+    (base,) = (tensor for place, tensor in kept_by(kept.how).items() if place == address)
+    size = base.numel()
+    tables = [table(f"static const double base_{j}[]", base)]
+    places = {"source": copies.source} | ({} if copies.squares else {"to": copies.to})
+    tables += [table(f"static const int32_t {name}_{j}[]", map(int, values)) for name, values in places.items()]
+    lines = [f"    memcpy(b->made_{j}, base_{j}, sizeof base_{j});"]
+    if copies.squares:
+        radii, radius = fixed_radii(kept, address)
+        tables += [table(f"static const double fixed_{j}[]", torch.cat((radii, radius)))]
+        lines.append(f"    for (int i = 0; i < {size}; i++)")
+        lines.append(
+            f"        fill_square(b->made_{j} + i, numbers, source_{j} + 2 * i, fixed_{j}[i], fixed_{j}[{size}]);"
+        )
+    else:
+        to = f"b->made_{j}[to_{j}[i]]"
+        lines.append(f"    for (int i = 0; i < {len(copies.to)}; i++) {to} = numbers[source_{j}[i]];")
+        if copies.bounds:
+            lines.append(f"    for (int i = 0; i < {size}; i++) b->made_{j}[i] = limited(b->made_{j}[i]);")
+    flash = 8 * base.numel() + 4 * (len(copies.to) + len(copies.source))
+    return Made("\n".join(tables), f"    double made_{j}[{size}];", lines, flash)
+
+
+def _rest(kept: Kept, changing: Changing, writer: Writer, rest: Tensor) -> str:
+    """Where the controls lie with which a solve without a guess begins: the cost's reference, where it may change."""
+    u_ref = next((m for m in changing.members if m.full == "cost.u_ref"), None)
+    if u_ref is not None and u_ref.size == rest.numel() and bool((torch.from_numpy(u_ref.value) == rest).all()):
+        return f"numbers + {u_ref.first}"
+    return writer.table(rest)
+
+
+def _bound(rows: list[str], problem: str, how: str, changing: Changing, made: list[Made], rest: str) -> str:
+    """The function `bind`, which fills the structures that the solver reads."""
+    lines = [
+        SQUARES if any(copies.squares for copies in changing.copied.values()) else "",
+        LIMITED if any(copies.bounds for copies in changing.copied.values()) else "",
+        "static void bind(NAME_workspace *w, Solve *b) {",
+        "    const double *numbers = (const double *)(const void *)&w->numbers;",
+        "    (void)numbers;",
+        "    memset(b, 0, sizeof *b);",
+        *(line for part in made for line in part.lines),
+        *(f"    b->constraints[{i}] = (Constraint){row};" for i, row in enumerate(rows)),
+        f"    b->problem = (Problem){problem};",
+        f"    b->how = (Interior){how};",
+        "    b->follow = b->problem;",
+        "    b->follow.gains = b->gains;",
+        f"    b->rest = {rest};",
+        "    b->arena_begin = (unsigned char *)(b + 1);",
+        "    b->arena.next = b->arena_begin;",
+        "    b->arena.end = (unsigned char *)w->room + sizeof w->room;",
+        "    b->arena.seconds = w->clock;",
+        "}",
+    ]
+    return "\n".join(line for line in lines if line)
+
+
+SQUARES = """
+/* The square of a radius and the vehicle's, of which one may change; what was exported stays to the last bit. */
+static void fill_square(double *square, const double *numbers, const int32_t *source, double radius, double vehicle) {
+    const double *exported = (const double *)(const void *)&exported_numbers;
+    double r = source[0] < 0 ? radius : numbers[source[0]], v = source[1] < 0 ? vehicle : numbers[source[1]];
+    int same = (source[0] < 0 || r == exported[source[0]]) && (source[1] < 0 || v == exported[source[1]]);
+    if (!same) *square = (r + v) * (r + v);
+}
+"""
+LIMITED = """
+static double limited(double bound) { return bound > LOOSE ? LOOSE : bound < -LOOSE ? -LOOSE : bound; }
+"""
+
+
+def _constants(interior: InteriorPoint, constrained: bool) -> str:
+    values: dict[str, Any] = {
+        "WARM_MU": interior.warm_barrier, "WARM_PUSH": interior.warm_barrier, "COLD_MU": interior.initial_barrier,
+        "COLD_PUSH": interior.bound_push, "VIOLATION": interior.violation_tolerance, "ADMITTED": ADMITTED,
+        "MAX_SOLVE_ITERATIONS": interior.max_iterations, "LOOSE": LOOSE, "CONTACT": CONTACT_FACTOR,
+        "STATIONARY": STATIONARY, "CONSTRAINED": int(constrained),
+    }  # fmt: skip
+    return defines(values)
+
+
+def _numbers_table(changing: Changing) -> str:
+    inner = "".join(
+        f"    .{member.name} = {{{', '.join(literal(value) for value in member.value.ravel().tolist())}}},\n"
+        for member in changing.members
+    )
+    return f"static const NAME_numbers exported_numbers = {{\n{inner or '    0'}\n}};"
+
+
+def _depths(kept: Kept) -> str:
+    """How deep beneath the full surface bodies touch, m, of each constraint."""
+    depths = []
+    for part in kept.problem.constraints:
+        own = getattr(part, "contact_depths", None) if part.geometric else None
+        depths.append(float(own.min()) if own is not None and own.numel() else 0.0)
+    return table("static const double contact_depth[]", depths or [0.0])
+
+
+def _structure(K: int, made: list[str]) -> str:
+    return "\n".join(
+        [
+            "/* What a step works with, at the beginning of a workspace's room. */",
+            "typedef struct {",
+            "    Arena arena;",
+            "    unsigned char *arena_begin;",
+            "    Interior how;",
+            "    Problem problem, follow; /* follow: of rollouts, and of what they are worth */",
+            f"    Constraint constraints[{max(1, K)}];",
+            "    const double *rest; /* (N, NU) */",
+            "    double mu, error, theta, falls, cost;",
+            "    int64_t iterations;",
+            "    int32_t status;",
+            "    double X[(N + 1) * NX], U[N * NU], gains[N * NU * NZ], beside[N * NU];",
+            *made,
+            "} Solve;",
+        ]
+    )
+
+
+def _assertion(count: int, K: int) -> str:
+    need = f"{count + 2} * sizeof(double) + {K + 1} * (sizeof(Rows) + 2 * sizeof(int64_t))"
+    return f"typedef char NAME_has_room[sizeof(Solve) + {need} <= sizeof(((NAME_workspace *)0)->room) ? 1 : -1];"
+
+
+def _checks(changing: Changing) -> str:
+    """What is checked of the numbers."""
+    spans = [f"{{{m.first}, {m.size}, {m.kind}}}" for m in changing.members] or ["{0, 0, 0}"]
+    return "\n".join(
+        [
+            "/* Of numbers the first, how many, and whether they are finite, at least 0, above 0, or bounds. */",
+            f"static const struct {{ int first, count, kind; }} checks[] = {{{', '.join(spans)}}};\n",
+        ]
+    )
+
+
+def replaced(text: str, name: str, **parts: str) -> str:
+    """A text with its marks @PART@ and the word NAME replaced."""
+    for part, value in parts.items():
+        text = text.replace(f"@{part}@", value)
+    return re.sub(r"\bNAME(?=_|\b)", name, text)

@@ -1,0 +1,56 @@
+"""Problems of a GPU that C solves on the CPU, by copies.
+
+PyTorch's kernels start hundreds of small operations for each stage: on a GPU a solve takes some hundred times as long
+as in C on one core.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import DeviceWarning
+from torchgco.base.shapes import CPU, computing_on
+from torchgco.base.tree import field_names, mapped
+from torchgco.kernels.choice import native, serves
+from torchgco.problem.problem import Problem
+
+
+def on_cpu(problem: Problem) -> Problem | None:
+    """The problem on the CPU in float64, where it lies on another device and C serves it on the CPU; else None.
+
+    A DeviceWarning says so once in a process. A problem stays where the process has chosen PyTorch's kernels
+    (`use_native`), and where code can't be traced on the CPU, as that of a function which holds a tensor of its device.
+    """
+    device = problem.x0.device
+    if device.type == CPU.type or problem.B == 0 or not native():
+        return None
+    there = _held_on_cpu(problem)
+    with computing_on(CPU):
+        if not serves(there):
+            return None
+    global _said
+    if not _said:
+        _said = True
+        told = f"problems on {device} are solved by C on the CPU, with copies: PyTorch's kernels take far longer there"
+        warnings.warn(told, DeviceWarning, stacklevel=4)
+    return there
+
+
+def _held_on_cpu(problem: Problem) -> Problem:
+    """The problem without gradients; what users' functions hold stays where it is."""
+    change = lambda leaf: leaf.detach().to(CPU, torch.float64 if leaf.is_floating_point() else leaf.dtype)
+    parts = {name: mapped(getattr(problem, name), change) for name in field_names(type(problem))}
+    return problem._with(parts)
+
+
+def copied_to(tree: Any, like: Tensor) -> Any:
+    """The same with every tensor on the device of another, numbers in its precision."""
+    change = lambda leaf: leaf.to(like.device, like.dtype if leaf.is_floating_point() else leaf.dtype)
+    return mapped(tree, change)
+
+
+_said = False
