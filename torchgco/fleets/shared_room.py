@@ -33,7 +33,7 @@ from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 
 ROUNDS = 16  # of planes, at most
-LEAST_GAIN = 1e-3  # share of the cost: rounds that gain less are the last
+LEAST_GAIN = 1e-4  # share of the cost: rounds that gain less are the last
 FLAT = 100.0  # radius of the balls whose surfaces stand for planes, as a multiple of the distance that two keep
 NEAR = 1.0  # as such a multiple, how much farther apart two may be whose forces are looked for
 MORE = 1e-4  # m, by which pairs stay farther apart between the knots than where they touch
