@@ -12,8 +12,19 @@ import torch
 
 import torchgco
 from tests.export.exported import exported, needs_compiler
-from tests.export.kinds import DT, car, car_rates, point, reference
-from torchgco import ControlBounds, InputError, LoadedController, Problem, Spheres, StateBounds, Status, load_c
+from tests.export.kinds import DT, car, car_rates, reference
+from torchgco import (
+    ControlBounds,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    LoadedController,
+    Problem,
+    Spheres,
+    StateBounds,
+    Status,
+    load_c,
+)
 
 pytestmark = needs_compiler
 WARM = {Status.CONVERGED}
@@ -167,13 +178,14 @@ def test_numbers_that_the_problem_cannot_have_are_refused(folder: Path, name: st
 
 
 def test_from_a_saddle_point_it_goes_on_beside(tmp_path: Path) -> None:
-    """A disc right ahead: going straight fulfils the conditions of first order, as Python's solve sees, too."""
-    cost = torchgco.QuadraticCost([1.0, 1.0, 0.1, 0.1], [0.1, 0.1], [50.0, 50.0, 1.0, 1.0], x_ref=[1.5, 0.0, 0.0, 0.0])
-    parts, x = [ControlBounds(-8.0, 8.0), Spheres([[0.0, 0.0]], [0.3], 0.1)], [-1.0, 0.0, 0.0, 0.0]
-    straight = Problem(point().dynamics, cost, parts, x, 24)
-    c, mpc = pair(exported(straight, tmp_path), problem=straight)
-    u, v = mpc.step(x), c.step(x)
-    assert torch.equal(u, v) and c.status == mpc.statuses[0] and abs(float(v[1])) > 0.1
+    """On the top between two valleys staying fulfils the conditions of first order, and neither C nor Python stays."""
+    hill = lambda x: (x[..., 0].square() - 1.0).square()
+    cost = FunctionCost(lambda x, u: hill(x) + 0.1 * u[..., 0].square(), lambda x: 5.0 * hill(x))
+    model = FunctionDynamics(lambda x, u: u, 1, 1, DT)
+    problem = Problem(model, cost, [ControlBounds(-2.0, 2.0)], [0.0], 12)
+    c, mpc = pair(exported(problem, tmp_path), problem=problem)
+    u, v = mpc.step([0.0]), c.step([0.0])
+    assert torch.equal(u, v) and c.status == mpc.statuses[0] == Status.CONVERGED and abs(float(v[0])) > 0.1
     assert mpc.answer is not None and c.workspace.iterations == int(mpc.answer.iterations[0])
 
 

@@ -27,7 +27,7 @@ HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, 
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
-#define int64_t int32_t /* counters: no array is so long, and small processors take half the time and a tenth less code */
+#define int64_t int32_t /* counters: no array is so long, and small processors take a tenth less code */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #pragma GCC diagnostic ignored "-Wunused-parameter"

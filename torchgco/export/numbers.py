@@ -100,7 +100,7 @@ def changing(kept: Kept, numbers: Numbers, asked: Sequence[str] | None) -> Chang
                 raise InputError("changes", "numbers that C reads, or copies of them", number.name)
             continue
         name = re.sub(r"\W+", "_", numbers.short(number.name)).strip("_")
-        value = number.value[0]
+        value = np.atleast_1d(number.value[0])
         kind = BOUND if number.none is not None else KINDS.get(number.check, FINITE)  # type: ignore[arg-type]
         members.append(Member(name, number.name, first, value.shape, value, kind))
         shared |= ways[0]
